@@ -97,7 +97,7 @@ UP = {
     ("surface/limit_surface.py", "kernels"),
 }
 # Modules that import by names which are no constants: of modules of their own package, or of a user.
-BY_NAME = {"deferred.py", "schemes/__init__.py", "files/formats.py", "files/usd_process.py", "images/tiers.py"}
+BY_NAME = {"deferred.py", "schemes/scheme_table.py", "files/formats.py", "files/usd_process.py", "images/tiers.py"}
 BY_NAME |= {"figures/__init__.py"}
 # Packages that may import a library that the numpy packages do without.
 MAY_IMPORT = {
@@ -118,6 +118,7 @@ MAY_IMPORT = {
     "plyfile": {"files"},
     "pxr": {"files", "usd"},
     "MaterialX": {"usd"},
+    "PIL": {"usd"},
 }
 
 

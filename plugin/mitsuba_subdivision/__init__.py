@@ -23,6 +23,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from . import fit as fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
+    from .evaluation.limit_stencil import limit_stencil
     from .evaluation.scheme_check import register_scheme
     from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
     from .studio import studio_scene
-    from .surface import LimitSurface, SurfaceSamples, limit_stencil
+    from .surface import LimitSurface, SurfaceSamples
     from .tessellation import Tessellation, VertexMatrices
     from .usd import usd_scene
 
@@ -66,7 +67,7 @@ __all__ = [
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
-_PLACES = {
+_MODULES = {
     "AreaSamples": "patches",
     "Attribute": "cage",
     "CageError": "cage",
@@ -84,7 +85,7 @@ _PLACES = {
     "VariableSharpness": "refinement.variable_sharpness",
     "VertexMatrices": "tessellation",
     "example_file": "examples",
-    "limit_stencil": "surface",
+    "limit_stencil": "evaluation.limit_stencil",
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "evaluation.scheme_check",
@@ -93,7 +94,7 @@ _PLACES = {
 }
 
 
-_deferred = deferred(__name__, _PLACES)
+_deferred = deferred(__name__, _MODULES)
 
 
 def __getattr__(name: str) -> object:

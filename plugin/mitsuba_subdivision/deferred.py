@@ -7,24 +7,24 @@ import sys
 from collections.abc import Callable, Mapping
 
 
-def deferred(package: str, places: Mapping[str, str]) -> Callable[[str], object]:
+def deferred(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
     """Make the ``__getattr__`` of a package, which imports a name's module when the name is first used.
 
     A scene then waits for the modules only that it needs. No name may be that of a module of the package: importing
-    that module, from wherever, would put it in the name's place.
+    that module would then replace the name.
 
     Parameters
     ----------
     package : str
         Its ``__name__``.
-    places : dict of str to str
+    modules : dict of str to str
         The module, within the package, of each name.
     """
 
     def __getattr__(name: str) -> object:
-        if name not in places:
+        if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f".{places[name]}", package), name)
+        value = getattr(importlib.import_module(f".{modules[name]}", package), name)
         setattr(sys.modules[package], name, value)
         return value
 

@@ -25,9 +25,9 @@ def example_file(name: str) -> str:
     FileNotFoundError
         If there is none.
     """
-    places = [PACKAGE / "scenes", PACKAGE.parents[1] / "scenes"]
-    for place in places:
-        if (place / name).is_file():
-            return str(place / name)
-    folders = " nor in ".join(f'"{place}"' for place in places)
+    candidates = [PACKAGE / "scenes", PACKAGE.parents[1] / "scenes"]
+    for folder in candidates:
+        if (folder / name).is_file():
+            return str(folder / name)
+    folders = " nor in ".join(f'"{folder}"' for folder in candidates)
     raise FileNotFoundError(f'there is no example "{name}", neither in {folders}')

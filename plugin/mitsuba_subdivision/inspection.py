@@ -14,7 +14,7 @@ from .cage import ControlCage
 from .cage.rules import RULES
 from .mesh.connectivity import IntArray, VertexRule
 from .mesh.seams import seams
-from .schemes.members import optional_member
+from .schemes.scheme_members import optional_member
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each

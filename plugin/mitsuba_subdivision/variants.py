@@ -6,8 +6,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
+# The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
+Variant: TypeAlias = Any
 # A scene or an entry of one, as `mi.load_dict` takes it.
 SceneNode = dict[str, Any]
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'

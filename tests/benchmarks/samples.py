@@ -29,7 +29,7 @@ def main(arguments=None):
     for path in options.cages:
         surface, rng = msub.LimitSurface(msub.ControlCage.from_file(path)), np.random.default_rng(0)
         classes = surface.patches.class_count
-        places = [random_places(surface, rng, options.samples) for _ in range(options.repeats)]
+        places = [random_locations(surface, rng, options.samples) for _ in range(options.repeats)]
         first = seconds(lambda where=places[0], own=surface: own.evaluate(*where))
         again = min(seconds(lambda at=where, own=surface: own.evaluate(*at)) for where in places)
         table = surface.sampling(options.rate)
@@ -42,7 +42,7 @@ def main(arguments=None):
         )
 
 
-def random_places(surface, rng, count):
+def random_locations(surface, rng, count):
     """Element, parameters and corner."""
     elements, domain = surface.patches.elements, surface.scheme.domain
     element = rng.choice(np.flatnonzero(elements.face_sizes), count)

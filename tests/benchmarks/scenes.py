@@ -1,11 +1,12 @@
 """What a scene costs with exact shading, against vertex shading in the same run.
 
-python tests/benchmarks/scenes.py [hits shapes instances growth gradients] [--cages rook human star] [--repeats 3]
+python tests/benchmarks/scenes.py [hits shapes instances growth copies gradients] [--cages rook human] [--repeats 3]
 
 hits       one shape, 256 by 256 pixels, 64 samples, paths of 4 segments, rough metal: rate 2 exact, rate 8 vertex
 shapes     6 shapes and 42 of the same six cages: what a further one costs
 instances  7 shapes and 64 instances of one cage, 64 by 64 pixels, 4 samples
 growth     shapes and instances in growing numbers, of one group and of several, 64 by 64 pixels, 1 sample
+copies     a stage with copies of a rook of 182 faces from a point instancer: file to picture, 640 by 480 pixels
 gradients  prb, 3 segments, 128 by 128 pixels, 16 samples: one step of a fit of control points
 
 Every row of a table is measured in a process of its own for each shading, twice: in the first, Dr.Jit has no compiled
@@ -34,6 +35,7 @@ RATES = {"vertex": 8, "exact": 2}
 SIX_CAGES = ("rook", "human", "star", "jar", "barrel", "propeller")
 # Of shapes outside groups, instances, and groups of one shape.
 GROWTH = ((50, 50, 1), (100, 100, 1), (200, 200, 1), (100, 100, 10), (100, 200, 10), (100, 200, 20), (200, 400, 20))
+COPIES = (400, 1_000, 5_000, 20_000)
 FEW, MANY = 6, 42
 STEPS = ("load", "first", "next")
 
@@ -58,6 +60,7 @@ def _parsed(arguments):
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; all of them")
     parser.add_argument("--cages", nargs="+", default=["rook", "human", "star"], help="of scenes/cages")
     parser.add_argument("--growth", nargs="+", type=_counts, default=GROWTH, metavar="SHAPES,INSTANCES,GROUPS")
+    parser.add_argument("--copies", nargs="+", type=int, default=COPIES)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--process", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
@@ -171,6 +174,42 @@ def growth(shading, repeats, shape_count, instance_count, group_count):
     return instances(shading, repeats, shape_count, instance_count, group_count, 1)
 
 
+def copies(shading, repeats, count):
+    """A stage of so many copies in a square, turned at random."""
+    import mitsuba as mi
+    import mitsuba_subdivision as msub
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "copies.usdc"
+        _write_copies(path, msub.ControlCage.from_file(ROOT / "scenes/cages/rook.obj"), count)
+        laps = _Laps()
+        scene = msub.usd_scene(path, mi, spp=4, shading=shading)
+        laps.end("read")
+        return _pictures(scene, repeats, laps)
+
+
+def _write_copies(path, cage, count):
+    from pxr import Usd, UsdGeom, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    instancer = UsdGeom.PointInstancer.Define(stage, "/copies")
+    mesh = UsdGeom.Mesh.Define(stage, "/copies/rook")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(cage.positions.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(cage.face_sizes.astype(np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(cage.face_vertices.astype(np.int32)))
+    instancer.CreatePrototypesRel().SetTargets([mesh.GetPath()])
+    instancer.CreateProtoIndicesAttr(Vt.IntArray.FromNumpy(np.zeros(count, np.int32)))
+    side = int(np.ceil(np.sqrt(count)))
+    places = np.stack([*np.divmod(np.arange(count), side), np.zeros(count)], axis=1) * np.ptp(cage.positions) * 1.25
+    instancer.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(places.astype(np.float32)))
+    half = np.random.default_rng(0).uniform(0, np.pi, count)
+    # Imaginary parts first.
+    turns = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    instancer.CreateOrientationsAttr(Vt.QuathArray.FromNumpy(turns.astype(np.float16)))
+    stage.Save()
+
+
 def gradients(shading, repeats, cage):
     """A step of a fit: render, differentiate by control points, update."""
     import drjit as dr
@@ -202,16 +241,17 @@ TASKS = {
     "shapes": (shapes, lambda _: [[FEW], [MANY]]),
     "instances": (instances, lambda _: [[]]),
     "growth": (growth, lambda options: options.growth),
+    "copies": (copies, lambda options: [[count] for count in options.copies]),
     "gradients": (gradients, lambda options: [[cage] for cage in options.cages]),
 }
 
 
-def _pictures(scene, repeats):
+def _pictures(scene, repeats, laps=None):
     """A scene, loaded, and pictures of it."""
     import drjit as dr
     import mitsuba as mi
 
-    laps = _Laps()
+    laps = laps or _Laps()
     loaded = mi.load_dict(scene)
     dr.sync_thread()
     laps.end("load")

@@ -128,9 +128,9 @@ def blocks(page):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A working folder with the repository's scenes; schemes that examples register are forgotten."""
-    from mitsuba_subdivision import schemes
+    from mitsuba_subdivision.schemes import scheme_table
 
-    monkeypatch.setattr(schemes, "_SCHEMES", dict(schemes._SCHEMES))
+    monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     monkeypatch.chdir(tmp_path)
     return tmp_path

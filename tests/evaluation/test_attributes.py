@@ -35,7 +35,7 @@ CAGES = {
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
 
 
-def random_places(surface, rng, count=150):
+def random_locations(surface, rng, count=150):
     t = surface.cage.topology
     element = rng.integers(0, t.face_count, count)
     corner = rng.integers(0, t.face_sizes[element])
@@ -135,7 +135,7 @@ def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode)
     surface = LimitSurface(coarse, scheme)
     channel, child = refined(as_channel(coarse), scheme)
     finer = LimitSurface(as_cage(channel), scheme)
-    element, uv, corner = random_places(surface, rng)
+    element, uv, corner = random_locations(surface, rng)
     here = surface.evaluate_attribute("texcoords", element, uv, corner)
     # A whole element's corner is an element at twice the parameters; that of another polygon is at its own.
     halved = (cage.face_sizes[element] == surface.scheme.domain.corner_count)[:, None]
@@ -168,7 +168,7 @@ def test_semi_sharp_features_decay_at_seams_as_in_the_reference(scheme, cage, mo
     finer, surface = LimitSurface(as_cage(twice), scheme), LimitSurface(coarse, scheme)
 
     domain = surface.scheme.domain
-    element, _, corner = random_places(surface, rng)
+    element, _, corner = random_locations(surface, rng)
     second = rng.integers(0, domain.corner_count, len(element))
     uv = rng.random((len(element), 2)) / (2 if domain.corner_count == 3 else 1)
     inner = np.stack([domain.rotation(k)(place / 2) for k, place in zip(second, uv, strict=True)])
@@ -204,7 +204,7 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, n
         ),
         scheme,
     )
-    places = random_places(surface, np_rng)
+    places = random_locations(surface, np_rng)
     expected = surface.evaluate(*places).p
     for name in ("vertex", "face_varying", "renamed"):
         np.testing.assert_array_equal(surface.evaluate_attribute(name, *places), expected)
@@ -231,7 +231,7 @@ def test_flat_islands_keep_their_coordinates(triangles, mode, np_rng):
         ),
         "loop" if triangles else "catmull_clark",
     )
-    element, uv, corner = random_places(surface, np_rng)
+    element, uv, corner = random_locations(surface, np_rng)
     found = surface.evaluate_attribute("texcoords", element, uv, corner)
     at = flat_place(cage, element, uv, corner)
     second = island[t.face_offsets[element]][:, None]
@@ -276,7 +276,7 @@ def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
         ),
         scheme,
     )
-    element, uv, corner = random_places(alone, np_rng)
+    element, uv, corner = random_locations(alone, np_rng)
     found = surface.evaluate_attribute("p", faces[element], uv, corner)
     np.testing.assert_allclose(found, alone.evaluate(element, uv, corner).p, rtol=0, atol=2 * ROUNDING)
 
@@ -292,7 +292,7 @@ def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
     on_seams = np.flatnonzero(plain.channel("texcoords").seam & (t.twin > np.arange(t.half_edge_count)))
     creases = [(t.face_vertices[h], t.face_vertices[t.next[h]], np_rng.choice([0.5, 1.75])) for h in on_seams]
     sharp = LimitSurface(tagged(cage, texcoords=values, face_varying=mode, creases=creases, crease_method=method))
-    places = random_places(plain, np_rng)
+    places = random_locations(plain, np_rng)
     expected = plain.evaluate_attribute("texcoords", *places)
     np.testing.assert_allclose(sharp.evaluate_attribute("texcoords", *places), expected, rtol=0, atol=ROUNDING)
     assert np.abs(sharp.evaluate(*places).p - plain.evaluate(*places).p).max() > 1e-3
@@ -328,7 +328,7 @@ def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np
         LimitSurface(tagged(cage, face_varying=mode, creases=tags, attributes={"p": values}))
         for tags in ([], semi, semi + on_seam)
     ]
-    places = random_places(as_values[0], np_rng, 400)
+    places = random_locations(as_values[0], np_rng, 400)
     beyond = ~first[cage.topology.face_offsets[places[0]]]
     plain, sharp, sharper = (surface.evaluate_attribute("p", *places) for surface in as_values)
     np.testing.assert_allclose(sharper, sharp, rtol=0, atol=2 * ROUNDING)
@@ -352,7 +352,7 @@ def test_values_at_a_semi_sharp_vertex_do_not_depend_on_each_other(mode, np_rng)
         LimitSurface(tagged(cage, face_varying=mode, creases=creases, corners=tags, attributes={"p": values}))
         for creases, tags in (([], corners), (semi, corners), ([], []))
     )
-    places = random_places(plain, np_rng, 400)
+    places = random_locations(plain, np_rng, 400)
     beyond = ~first[cage.topology.face_offsets[places[0]]]
     plain, sharp, without = (surface.evaluate_attribute("p", *places) for surface in (plain, sharp, without))
     np.testing.assert_allclose(sharp[beyond], plain[beyond], rtol=0, atol=2 * ROUNDING)
@@ -412,7 +412,7 @@ def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
         ),
         scheme,
     )
-    element, uv, corner = random_places(surface, np_rng)
+    element, uv, corner = random_locations(surface, np_rng)
     expected = []
     for face, i, (u, v) in zip(element, corner, uv, strict=True):
         ring = np.roll(values[cage.face_vertices[t.face_offsets[face] : t.face_offsets[face + 1]]], -i, axis=0)
@@ -434,7 +434,7 @@ def test_a_constant_stays_one(np_rng):
     indices = random_indices(cage, np_rng, "islands")
     constant = np.full((indices.max() + 1, 1), 0.1)
     surface = LimitSurface(tagged(cage, attributes={"one": Attribute(constant, "face_varying", indices)}))
-    assert (surface.evaluate_attribute("one", *random_places(surface, np_rng)) == 0.1).all()
+    assert (surface.evaluate_attribute("one", *random_locations(surface, np_rng)) == 0.1).all()
 
 
 # Doo-Sabin

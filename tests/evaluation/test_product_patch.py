@@ -27,7 +27,7 @@ def test_products_are_the_stencils_from_every_corner(scheme, corner, np_rng):
         np.einsum("sj,si->sji", v, u)
         for v, u in ((along_v, along_u), (along_v, along_u_slope), (along_v_slope, along_u))
     )
-    places = patch.places[corner]
+    places = patch.lattice_index[corner]
     np.testing.assert_allclose(point, stencils[0][:, places], rtol=0, atol=ROUNDING)
     # Seen from another corner, tangents are turned; the normal is their cross product, for each pair of weights.
     found = crossed(du.reshape(50, -1), dv.reshape(50, -1))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
+from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
-from mitsuba_subdivision.evaluation.ring_symmetry import LEAST_VALENCE, ring_orbits, symmetric_eigenbasis
+from mitsuba_subdivision.evaluation.ring_symmetry import LEAST_VALENCE, fan_ring, ring_orbits, symmetric_eigenbasis
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
@@ -80,3 +81,33 @@ def test_matrices_of_unlike_sectors_are_left_to_the_general_method():
     matrix = structure.matrix.copy()
     matrix[orbits[0, 3], [0, orbits[0, 3]]] += (0.01, -0.01)
     assert symmetric_eigenbasis(matrix, orbits) is None
+
+
+@pytest.mark.parametrize("scheme", SCHEMES[:2], ids=lambda scheme: scheme.name)
+@pytest.mark.parametrize("rule", VertexRule, ids=lambda rule: rule.name.lower())
+@pytest.mark.parametrize("valence", [LEAST_VALENCE, 45])
+def test_faces_of_an_open_fan_share_the_basis_of_its_ring(scheme, rule, valence):
+    size, rest = scheme.regular_face_size, isolated_signature(scheme, 3).fans[1:]
+    for behind in (5, valence // 2):
+        fan = TaggedFan((size,) * (valence - behind), (size,) * behind, rule)
+        structure = irregular_structure(scheme, Signature("face", (fan, *rest)))
+        assert fan_ring(structure.signature) is not None
+        found, expected = irregular_patch(scheme, structure).basis, eigenbasis(structure.matrix)
+        matrix = found.vectors @ found.block_matrix() @ found.inverse
+        np.testing.assert_allclose(matrix, structure.matrix, rtol=0, atol=ROUNDED)
+        np.testing.assert_allclose(found.inverse @ found.vectors, np.eye(len(matrix)), rtol=0, atol=ROUNDED)
+        np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=0, atol=SAME_EIGENVALUE)
+        for members in (slice(0, 1), slice(1, 2), slice(2, 3)):
+            projections = [basis.vectors[:, members] @ basis.inverse[members] for basis in (found, expected)]
+            np.testing.assert_allclose(*projections, rtol=0, atol=SAME_SPACE)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES[:2], ids=lambda scheme: scheme.name)
+def test_a_corner_amid_faces_has_the_symmetry_of_its_ring(scheme):
+    size, rest = scheme.regular_face_size, isolated_signature(scheme, 3).fans[1:]
+    fan = TaggedFan((size,) * 40, (), VertexRule.CORNER, is_closed=True)
+    structure = irregular_structure(scheme, Signature("face", (fan, *rest)))
+    found, expected = basis_of(structure), eigenbasis(structure.matrix)
+    matrix = found.vectors @ found.block_matrix() @ found.inverse
+    np.testing.assert_allclose(matrix, structure.matrix, rtol=0, atol=ROUNDED)
+    np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=0, atol=SAME_EIGENVALUE)

@@ -66,9 +66,9 @@ class Bilinear:
 @pytest.fixture
 def known(monkeypatch):
     """Forget registered schemes after the test."""
-    from mitsuba_subdivision import schemes
+    from mitsuba_subdivision.schemes import scheme_table
 
-    monkeypatch.setattr(schemes, "_SCHEMES", dict(schemes._SCHEMES))
+    monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
 
 
 def refined_limit(scheme, cage, levels):

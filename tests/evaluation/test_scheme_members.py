@@ -11,8 +11,8 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.inspection import inspect
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, Unsupported
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE, AffineMap, ParameterDomain
-from mitsuba_subdivision.schemes.members import optional_member, require_members
 from mitsuba_subdivision.schemes.scheme import OptionalMembers, PhantomPoint
+from mitsuba_subdivision.schemes.scheme_members import optional_member, require_members
 from reference.refined_cages import sheet, tagged
 
 REQUIRED = (
@@ -46,9 +46,9 @@ class Members:
 
 @pytest.fixture(autouse=True)
 def _forget_registered(monkeypatch):
-    from mitsuba_subdivision import schemes
+    from mitsuba_subdivision.schemes import scheme_table
 
-    monkeypatch.setattr(schemes, "_SCHEMES", dict(schemes._SCHEMES))
+    monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
 
 
 def use(cage):

@@ -269,7 +269,7 @@ def test_counts_that_the_file_cannot_hold_are_errors_at_once(read, form, propert
         read(text)
 
 
-def test_every_count_that_a_file_has_room_for_is_read(read):
+def test_every_count_that_fits_the_file_is_read(read):
     # The shortest ASCII rows that there are, and no line break at the end.
     text = SHEET.replace("end_header\n", "element junk 3\nproperty list uchar int a\nend_header\n") + "0\n0\n0"
     with pytest.raises(CageError, match=r'line 10: element "junk" is said to have 30 rows, .*; expected a PLY file'):

@@ -79,7 +79,7 @@ def test_any_differentiable_integrator_will_do(views, integrator):
     assert 1e-3 < np.abs(moved).max() < 0.1
 
 
-def test_refining_goes_on_with_the_same_surface(views):
+def test_refining_keeps_the_surface(views):
     fit = made(cube(), views, refine=[2]).run(2)
     before = fit.cage
     fit.step()
@@ -195,7 +195,7 @@ def test_masked_pixels_do_not_count(views):
     assert losses[0] == losses[1]
 
 
-def test_a_checkpoint_goes_on(views, tmp_path):
+def test_a_checkpoint_resumes_the_fit(views, tmp_path):
     """Adam's averages and the refinement go on as well."""
     options = {"refine": [2], "smoothing": 1.0}
     whole = made(cube(), views, **options).run(5)

@@ -94,7 +94,7 @@ def test_a_mesh_becomes_a_cage(target):
     assert distance(LimitSurface(found), target) < 2 * triangles / size
 
 
-def test_a_checkpoint_goes_on(target, tmp_path):
+def test_a_checkpoint_resumes_the_fit(target, tmp_path):
     """The same steps follow, whether or not the fit was interrupted."""
     points = target.sample(300, 1).p
 

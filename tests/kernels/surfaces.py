@@ -1,4 +1,4 @@
-"""Surfaces that between them have every kind of piece, and places on them."""
+"""Surfaces that between them have every kind of piece, and locations on them."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def kernel_named(name, variant, evaluator="stabilized"):
     return surface_named(name).on_device(variant, evaluator)
 
 
-def random_places(surface, rng, count, deepest=23):
+def random_locations(surface, rng, count, deepest=23):
     """Element, parameters and corner: all over the elements, and down to 2^-deepest at every corner."""
     elements, domain = surface.patches.elements, surface.scheme.domain
     element = rng.choice(np.flatnonzero(elements.face_sizes), count)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 import pytest
-from kernels.surfaces import random_places
+from kernels.surfaces import random_locations
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary
@@ -88,10 +88,10 @@ def differences(surface, name, element, uv, corner):
 
 @pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
 def test_values_are_the_channels(surface, variant, np_rng):
-    places = random_places(surface, np_rng, 600)
+    locations = random_locations(surface, np_rng, 600)
     for name in surface.attribute_names:
-        found, *_ = evaluated(surface, name, variant, *places)
-        expected = surface.evaluate_attribute(name, *places)
+        found, *_ = evaluated(surface, name, variant, *locations)
+        expected = surface.evaluate_attribute(name, *locations)
         assert found.shape == expected.shape
         np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING[variant])
 
@@ -100,28 +100,28 @@ def test_values_by_linear_rules_are_the_channels(surface, np_rng):
     if surface.scheme.element == "vertex":
         pytest.skip("a scheme without linear interpolation")
     surface = all_linear(surface)
-    places = random_places(surface, np_rng, 600)
+    locations = random_locations(surface, np_rng, 600)
     for name, kind in (("varying 1", LinearChannelKernel), ("seams 2", LinearChannelKernel)):
         kernel = surface.on_device(DOUBLE)
         assert isinstance(channel_kernel(surface.channel(name), kernel.walk, kernel.types.float), kind)
-        found, *_ = evaluated(surface, name, DOUBLE, *places)
-        np.testing.assert_allclose(found, surface.evaluate_attribute(name, *places), rtol=0, atol=ROUNDING[DOUBLE])
+        found, *_ = evaluated(surface, name, DOUBLE, *locations)
+        np.testing.assert_allclose(found, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
 
 
 def test_derivatives_are_differences(surface, np_rng):
-    element, uv, corner = random_places(surface, np_rng, 300, deepest=1)
+    element, uv, corner = random_locations(surface, np_rng, 300, deepest=1)
     # Away from the sides of the domain and from lines on which pieces meet.
     domain = surface.scheme.domain
     kept = (domain.inside(uv) > 0.01) & (np.abs(uv % 0.25 - 0.125).max(axis=1) < 0.12)
-    places = element[kept], uv[kept], corner[kept]
+    locations = element[kept], uv[kept], corner[kept]
     for name in surface.attribute_names:
-        _, *found = evaluated(surface, name, DOUBLE, *places)
-        for derivative, expected in zip(found, differences(surface, name, *places), strict=True):
+        _, *found = evaluated(surface, name, DOUBLE, *locations)
+        for derivative, expected in zip(found, differences(surface, name, *locations), strict=True):
             np.testing.assert_allclose(derivative, expected, rtol=0, atol=DIFFERENCES)
 
 
 def test_scalar_variants_compute_the_same_one_by_one(surface, np_rng):
-    element, uv, corner = random_places(surface, np_rng, 10, deepest=6)
+    element, uv, corner = random_locations(surface, np_rng, 10, deepest=6)
     kernel = surface.on_device("scalar_rgb")
     for name in surface.attribute_names:
         channel = channel_kernel(surface.channel(name), kernel.walk, float)

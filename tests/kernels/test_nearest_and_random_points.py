@@ -87,12 +87,12 @@ def test_derivatives_follow_nearest_points(name, np_rng):
     types, count = kernel.types, 30
     _, points = points_near(surface, count, np_rng, 0.1)
     expected = surface.closest_point(points)
-    places = on_device(types, expected.element, expected.uv, expected.corner)
+    locations = on_device(types, expected.element, expected.uv, expected.corner)
     moves, ways = np_rng.normal(size=positions.shape), np_rng.normal(size=points.shape)
 
     def found_at(step):
         kernel.set_control_points(types.float((positions + step * moves).ravel()))
-        found = kernel.closest(device_points(types, points + step * ways), *places)
+        found = kernel.closest(device_points(types, points + step * ways), *locations)
         # In one kernel.
         dr.eval(found)
         return [vectors(found.p), vectors(found.n), np.array(found.distance)]
@@ -103,7 +103,7 @@ def test_derivatives_follow_nearest_points(name, np_rng):
     dr.set_grad(control_points, types.float(moves.ravel()))
     dr.set_grad(targets, device_points(types, ways))
     kernel.set_control_points(control_points)
-    found = kernel.closest(targets, *places)
+    found = kernel.closest(targets, *locations)
     # Derivatives are taken off what is on the way to others.
     p, n, distance = dr.forward_to([found.p * 1, found.n * 1, found.distance * 1])
     dr.eval(p, n, distance)
@@ -164,11 +164,11 @@ def test_densities_are_those_of_the_moved_surface(np_rng):
     assert abs(weight.mean() - expected) <= ERRORS * weight.std() / COUNT**0.5
 
 
-def test_a_kernel_without_places_draws_none():
+def test_a_kernel_without_cells_draws_none():
     from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 
     surface = surface_named("torus")
     table: PieceTable = surface.pieces()
     kernel = SurfaceKernel(table, float)
-    with pytest.raises(ValueError, match="the kernel was made without places to draw from"):
+    with pytest.raises(ValueError, match="the kernel was made without cells to draw from"):
         kernel.sample(0.5, dr.scalar.Array2f64(0.5, 0.5))

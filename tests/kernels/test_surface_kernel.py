@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import drjit as dr
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, kernel_named, on_device, random_places, surface_named, vectors
+from kernels.surfaces import SURFACES, kernel_named, on_device, random_locations, surface_named, vectors
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
@@ -61,8 +61,8 @@ def computed(found):
     return found
 
 
-def evaluated(kernel, *places, derivatives=1):
-    return computed(kernel.evaluate(*places, derivatives=derivatives))
+def evaluated(kernel, *locations, derivatives=1):
+    return computed(kernel.evaluate(*locations, derivatives=derivatives))
 
 
 def unequal(found, expected):
@@ -81,7 +81,7 @@ def sine(samples):
 @pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
 def test_points_tangents_and_normals_are_the_surfaces(name, variant, np_rng):
     surface, kernel, bars = surface_named(name), kernel_named(name, variant), BARS[variant]
-    element, uv, corner = random_places(surface, np_rng, 1500)
+    element, uv, corner = random_locations(surface, np_rng, 1500)
     uv[:100] = 0
     found, expected = (
         evaluated(kernel, *on_device(kernel.types, element, uv, corner)),
@@ -106,10 +106,10 @@ def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(nam
     """Where the derivatives become parallel, level by level."""
     surface, kernel = surface_named(name), kernel_named(name, SINGLE)
     elements, cut = surface.patches.elements, surface.patches.topology
-    element, uv, corner = random_places(surface, np_rng, 4000, deepest=22)
+    element, uv, corner = random_locations(surface, np_rng, 4000, deepest=22)
     beside = cut.is_border_vertex[cut.face_vertices[elements.face_offsets[element] + corner]] & (uv.max(axis=1) < 0.1)
-    places = element[beside], uv[beside], corner[beside]
-    found, expected = evaluated(kernel, *on_device(kernel.types, *places)), surface.evaluate(*places)
+    locations = element[beside], uv[beside], corner[beside]
+    found, expected = evaluated(kernel, *on_device(kernel.types, *locations)), surface.evaluate(*locations)
     assert expected.level.max() > 18
     np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BORDER_NORMAL)
 
@@ -118,9 +118,9 @@ def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(nam
 @pytest.mark.parametrize("name", ["hexagon", "valence 50", "sheet", "loop corner", "doo_sabin mixed torus"])
 def test_derivatives_of_normals_are_those_of_the_surface(name, np_rng):
     surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
-    places = random_places(surface, np_rng, 500, deepest=4)
-    found = evaluated(kernel, *on_device(kernel.types, *places), derivatives=2)
-    s = surface.evaluate(*places, derivatives=2)
+    locations = random_locations(surface, np_rng, 500, deepest=4)
+    found = evaluated(kernel, *on_device(kernel.types, *locations), derivatives=2)
+    s = surface.evaluate(*locations, derivatives=2)
     area = np.linalg.norm(np.cross(s.dp_du, s.dp_dv), axis=1)[:, None]
     for derivative, of_u, of_v in ((found.dn_du, s.d2p_duu, s.d2p_duv), (found.dn_dv, s.d2p_duv, s.d2p_dvv)):
         change = (np.cross(of_u, s.dp_dv) + np.cross(s.dp_du, of_v)) / area
@@ -138,7 +138,7 @@ def test_scalar_variants_compute_the_same_one_by_one(name, np_rng):
         surface_named(name).on_device("scalar_rgb"),
     )
     # Deeper, derivatives of normals are small differences of large numbers.
-    element, uv, corner = random_places(surface, np_rng, 25, deepest=5)
+    element, uv, corner = random_locations(surface, np_rng, 25, deepest=5)
     uv[0] = 0
     expected = evaluated(kernel, *on_device(kernel.types, element, uv, corner), derivatives=2)
     for k, place in enumerate(zip(element, uv, corner, strict=True)):
@@ -154,7 +154,7 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     refine_first(monkeypatch)
     refined = LimitSurface(surface.cage)
     assert refined.patches.refined is not None
-    element, uv, corner = random_places(surface, np_rng, 500)
+    element, uv, corner = random_locations(surface, np_rng, 500)
     # On the lines between quarters, too.
     uv[:20, 0] = 0.5
     kernel, expected = refined.on_device(DOUBLE), surface.evaluate(element, uv, corner)
@@ -170,13 +170,13 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
 @pytest.mark.parametrize("name", ["valence 50", "corner", "chaikin", "loop half disc of 6", "doo_sabin mixed torus"])
 def test_levels_of_tips_are_the_same_surface_as_pieces_and_as_sums(name, levels, np_rng):
     surface, bars = surface_named(name), BARS[DOUBLE]
-    places = random_places(surface, np_rng, 600)
-    places[1][:60] = 0
+    locations = random_locations(surface, np_rng, 600)
+    locations[1][:60] = 0
     rows = surface.cage.cut_mesh.vertex, surface.cage.vertex_count
     float_type = kernel_named(name, DOUBLE).types.float
     kernel = SurfaceKernel(PieceTable.build(surface.patches, *rows, levels), float_type)
     kernel.set_control_points(float_type(surface.cage.positions.ravel()))
-    found, expected = evaluated(kernel, *on_device(kernel.types, *places)), surface.evaluate(*places)
+    found, expected = evaluated(kernel, *on_device(kernel.types, *locations)), surface.evaluate(*locations)
     has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
     np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
     lost = np.linalg.norm(vectors(found.n) - expected.n, axis=1) * np.where(has_derivatives, sine(expected), 1)
@@ -191,9 +191,9 @@ class OfAUser(CatmullClark):
 
 def test_a_scheme_of_a_user_is_evaluated(np_rng):
     surface = LimitSurface(surface_named("hexagon").cage, OfAUser())
-    places = random_places(surface, np_rng, 200)
-    kernel, expected = surface.on_device(DOUBLE), surface_named("hexagon").evaluate(*places)
-    found = evaluated(kernel, *on_device(kernel.types, *places))
+    locations = random_locations(surface, np_rng, 200)
+    kernel, expected = surface.on_device(DOUBLE), surface_named("hexagon").evaluate(*locations)
+    found = evaluated(kernel, *on_device(kernel.types, *locations))
     np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[DOUBLE]["point"])
 
 
@@ -202,11 +202,11 @@ def test_a_scheme_of_a_user_is_evaluated(np_rng):
 
 def test_stams_form_is_the_same_but_for_rounding(np_rng):
     surface = surface_named("valence 3")
-    places = random_places(surface, np_rng, 500, deepest=5)
-    expected = surface.evaluate(*places)
+    locations = random_locations(surface, np_rng, 500, deepest=5)
+    expected = surface.evaluate(*locations)
     for variant, bar in ((DOUBLE, FIRST_TERM), (SINGLE, 1e-4)):
         kernel = kernel_named("valence 3", variant, "stam")
-        found = evaluated(kernel, *on_device(kernel.types, *places))
+        found = evaluated(kernel, *on_device(kernel.types, *locations))
         np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=bar)
 
 
@@ -277,7 +277,7 @@ def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
     surface = small_surface("polygons")
     kernel = surface.on_device(DOUBLE)
     types, positions = kernel.types, surface.cage.positions
-    element, uv, corner = random_places(surface, np_rng, 40, deepest=3)
+    element, uv, corner = random_locations(surface, np_rng, 40, deepest=3)
     # Away from lines between pieces, across which third derivatives jump.
     uv = 0.3 + 0.1 * np.abs(uv - np.round(uv))
     s = surface.evaluate(element, uv, corner)
@@ -310,11 +310,11 @@ def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
 def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(name, np_rng):
     surface = small_surface(name)
     kernel = surface.on_device(DOUBLE)
-    places = random_places(surface, np_rng, 60, deepest=10)
+    locations = random_locations(surface, np_rng, 60, deepest=10)
     positions, direction = surface.cage.positions, np_rng.normal(size=surface.cage.positions.shape)
 
     def samples(step):
-        s = LimitSurface(surface.cage.with_positions(positions + step * direction), surface.scheme).evaluate(*places)
+        s = LimitSurface(surface.cage.with_positions(positions + step * direction), surface.scheme).evaluate(*locations)
         return s.p, s.n, s.dp_du
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(samples(STEP), samples(-STEP), strict=True)]
@@ -323,7 +323,7 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
 
     def outputs():
         kernel.set_control_points(points)
-        found = kernel.evaluate(*on_device(kernel.types, *places))
+        found = kernel.evaluate(*on_device(kernel.types, *locations))
         return [found.p, found.n, found.dp_du]
 
     change = kernel.types.float(direction.ravel())
@@ -340,7 +340,7 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
 def test_derivatives_by_parameters_are_the_tangents_and_those_of_the_normal(name, np_rng):
     surface = small_surface(name)
     kernel = surface.on_device(DOUBLE)
-    element, uv, corner = on_device(kernel.types, *random_places(surface, np_rng, 200, deepest=6))
+    element, uv, corner = on_device(kernel.types, *random_locations(surface, np_rng, 200, deepest=6))
     for axis in (0, 1):
         own = kernel.types.vector2(uv)
         dr.enable_grad(own)
@@ -357,7 +357,7 @@ def test_derivatives_by_parameters_are_the_tangents_and_those_of_the_normal(name
 
 def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
     """Rays at points of the surface, which are not too flat there, and places near these points to begin at."""
-    element, uv, corner = random_places(surface, rng, count, deepest)
+    element, uv, corner = random_locations(surface, rng, count, deepest)
     target = surface.evaluate(element, uv, corner)
     d = rng.normal(size=(count, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
@@ -460,7 +460,7 @@ def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(depth, 
 def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):
     surface = LimitSurface(cube())
     kernel = surface.on_device(variant)
-    element, uv, corner = random_places(surface, np_rng, 500, deepest=4)
+    element, uv, corner = random_locations(surface, np_rng, 500, deepest=4)
     s = surface.evaluate(element, uv, corner)
     along = np_rng.normal(size=(500, 2, 1))
     d = along[:, 0] * s.dp_du + along[:, 1] * s.dp_dv
@@ -489,7 +489,7 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
     found = computed(kernel.intersect(rays_of(types, o, d), *on_device(types, *start)).location)
     half_edge, first = np.array(found.half_edge), surface.patches.elements.face_offsets
     element = np.searchsorted(first, half_edge, side="right") - 1
-    places = on_device(types, element, np.array([found.u, found.v]).T, half_edge - first[element])
+    locations = on_device(types, element, np.array([found.u, found.v]).T, half_edge - first[element])
     values = surface.cage.positions, o, d
     directions = [np_rng.normal(size=each.shape) for each in values]
 
@@ -497,7 +497,7 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
         points, *ray = (each + step * direction for each, direction in zip(values, directions, strict=True))
         kernel.set_control_points(types.float(points.ravel()))
         rays = rays_of(types, *ray)
-        found = computed(kernel.intersect(rays, *places))
+        found = computed(kernel.intersect(rays, *locations))
         return vectors(found.p), vectors(found.n), np.array(found.t)
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(met(STEP), met(-STEP), strict=True)]
@@ -506,7 +506,7 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
 
     def hits():
         kernel.set_control_points(inputs[0])
-        found = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *places)
+        found = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *locations)
         return found.p, found.n, found.t
 
     changes = [types.float(directions[0].ravel()), *(vector3(*each.T) for each in directions[1:])]

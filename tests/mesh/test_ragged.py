@@ -13,7 +13,7 @@ def test_ragged_arrays_are_the_rows_one_after_the_other(lengths):
     offsets = ragged.offsets(counts)
     assert [flat[begin:end] for begin, end in pairwise(offsets)] == rows
     np.testing.assert_array_equal(ragged.starts(counts), offsets[:-1])
-    np.testing.assert_array_equal(ragged.places(counts), [place for row in rows for place in range(len(row))])
+    np.testing.assert_array_equal(ragged.index_in_row(counts), [place for row in rows for place in range(len(row))])
     np.testing.assert_array_equal(ragged.ranges(10 * np.arange(len(rows)), counts), flat)
 
 

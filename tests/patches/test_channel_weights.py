@@ -7,7 +7,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.patches import LinearChannel, SubdividedChannel, channel
 from patches.closed_cages import mixed_torus
-from patches.places import grid_places
+from patches.locations import grid_locations
 from reference.refined_cages import refine_first
 
 # Sums of some tens of terms of order one, in double precision.
@@ -47,7 +47,7 @@ def test_values_are_weights_times_the_cages(name, refines, np_rng, monkeypatch):
         refine_first(monkeypatch)
     made, options = CAGES[name]
     surface = LimitSurface(with_attributes(made(), np_rng, **options), "loop" if name == "triangles" else None)
-    start, uv = grid_places(surface, 4)
+    start, uv = grid_locations(surface, 4)
     for attribute in surface.attribute_names:
         channel = surface.channel(attribute)
         weights = channel.weights(start, uv)
@@ -62,9 +62,9 @@ def test_values_of_doo_sabin_are_weights_times_the_cages(np_rng):
     surface = LimitSurface(
         ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), attributes=values), "doo_sabin"
     )
-    channel, places = surface.channel("heat"), grid_places(surface, 3)
+    channel, locations = surface.channel("heat"), grid_locations(surface, 3)
     np.testing.assert_allclose(
-        channel.weights(*places) @ channel.values, channel.evaluate(*places), rtol=0, atol=ROUNDING
+        channel.weights(*locations) @ channel.values, channel.evaluate(*locations), rtol=0, atol=ROUNDING
     )
 
 
@@ -83,7 +83,7 @@ def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monk
     made, options = CAGES[name]
     cage = with_attributes(made(), np_rng, face_varying=mode, **options)
     surface = LimitSurface(cage, "loop" if name == "triangles" else None)
-    start, uv = grid_places(surface, 4)
+    start, uv = grid_locations(surface, 4)
     direct = surface.channel("islands")
     assert isinstance(direct, LinearChannel)
     assert not isinstance(surface.channel("seam"), LinearChannel)

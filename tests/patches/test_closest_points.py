@@ -12,7 +12,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.patches import closest_points
 from patches.closed_cages import bumpy, cage_of
-from patches.places import grid_places
+from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 from scipy.spatial import cKDTree
 
@@ -48,13 +48,13 @@ def distances_by_evaluation(surface, points, samples, start, uv, spacing):
     distance, nearest = cKDTree(samples.p).query(points)
     start, uv = start[nearest], uv[nearest]
     for _ in range(REFINED):
-        places = np.clip(uv[:, None] + spacing * STEPS, 0, 1)
+        locations = np.clip(uv[:, None] + spacing * STEPS, 0, 1)
         if surface.scheme.domain.corner_count == 3:
-            places = np.clip(places - np.maximum(places.sum(axis=2, keepdims=True) - 1, 0) / 2, 0, 1)
-        found = surface._evaluate_from(np.repeat(start, len(STEPS)), places.reshape(-1, 2), "stabilized", np.float64)
-        away = np.linalg.norm(found.p.reshape(*places.shape[:2], 3) - points[:, None], axis=2)
+            locations = np.clip(locations - np.maximum(locations.sum(axis=2, keepdims=True) - 1, 0) / 2, 0, 1)
+        found = surface._evaluate_from(np.repeat(start, len(STEPS)), locations.reshape(-1, 2), "stabilized", np.float64)
+        away = np.linalg.norm(found.p.reshape(*locations.shape[:2], 3) - points[:, None], axis=2)
         best = away.argmin(axis=1)
-        uv = places[np.arange(len(points)), best]
+        uv = locations[np.arange(len(points)), best]
         distance, spacing = np.minimum(distance, away.min(axis=1)), spacing / 2
     return distance
 
@@ -69,8 +69,8 @@ def along_tangents(points, found):
 @EVERY_SURFACE
 def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np_rng):
     surface = surface_named(name)
-    segments = max(3, round((SAMPLES / len(grid_places(surface, 1)[0]) * 4) ** 0.5))
-    start, uv = grid_places(surface, segments)
+    segments = max(3, round((SAMPLES / len(grid_locations(surface, 1)[0]) * 4) ** 0.5))
+    start, uv = grid_locations(surface, segments)
     samples = surface._evaluate_from(start, uv, "stabilized", np.float64)
     size, points = points_around(samples, np_rng)
     found = surface.closest_point(points)

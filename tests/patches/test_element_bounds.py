@@ -8,7 +8,7 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from patches.closed_cages import bumpy, cage_of
-from patches.places import grid_places
+from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
@@ -65,7 +65,7 @@ def test_boxes_of_surfaces_that_bend_much_are_tight(scheme):
 
 def assert_tight(surface):
     bounds = surface.bounds()
-    start, uv = grid_places(surface, GRID)
+    start, uv = grid_locations(surface, GRID)
     points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
     lower, upper = np.full((2, len(surface.patches.elements.face_sizes), 3), np.inf)
     element = surface.patches.elements.face_of(start)

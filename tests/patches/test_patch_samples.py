@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, random_places, surface_named
+from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
 from mitsuba_subdivision.evaluation import element
@@ -18,9 +18,9 @@ EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 ROUNDED, NORMAL = 1e-13, 1e-10
 
 
-def places(surface, rng, count=600):
+def locations(surface, rng, count=600):
     """All over the surface, near corners down to 1e-12 of an element and below, and at them."""
-    found, uv, corner = random_places(surface, rng, count)
+    found, uv, corner = random_locations(surface, rng, count)
     third = count // 3
     uv[:third] *= 10.0 ** rng.uniform(-12, 0, (third, 1))
     uv[:20], uv[20:30] = 0, uv[20:30] * 1e-200
@@ -35,7 +35,7 @@ def close(found, expected, size, atol=ROUNDED):
 @EVERY_SURFACE
 def test_samples_are_limit_stencils_applied(name, np_rng):
     surface = surface_named(name)
-    where = places(surface, np_rng)
+    where = locations(surface, np_rng)
     found, weights, points = surface.evaluate(*where), surface.matrix(*where), surface.cage.positions
     close(found.p, weights.p @ points, np.abs(points).max())
     for own, matrix in ((found.dp_du, weights.dp_du), (found.dp_dv, weights.dp_dv)):
@@ -45,7 +45,7 @@ def test_samples_are_limit_stencils_applied(name, np_rng):
 @EVERY_SURFACE
 def test_first_levels_are_as_eigencoordinates_have_them(name, np_rng):
     surface = surface_named(name)
-    where = places(surface, np_rng)
+    where = locations(surface, np_rng)
     # With second derivatives, no level is a piece.
     found, expected = surface.evaluate(*where), surface.evaluate(*where, derivatives=2)
     np.testing.assert_array_equal(found.level, expected.level)
@@ -57,7 +57,7 @@ def test_first_levels_are_as_eigencoordinates_have_them(name, np_rng):
 @EVERY_SURFACE
 def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
     surface = surface_named(name)
-    where = places(surface, np_rng, 90)
+    where = locations(surface, np_rng, 90)
     expected, size = surface.evaluate(*where), np.abs(surface.cage.positions).max()
     for chosen in (slice(None, None, -1), slice(0, 1), slice(5, 6), slice(40, 43)):
         found = surface.evaluate(*(each[chosen] for each in where))

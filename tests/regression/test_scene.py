@@ -26,7 +26,7 @@ for seed in range(3):
 """
 
 
-def test_rendering_goes_on_after_errors_that_are_kept(variant_llvm_ad_rgb):  # noqa: ARG001 - skips where there is no LLVM
+def test_rendering_works_after_errors_that_are_kept(variant_llvm_ad_rgb):  # noqa: ARG001 - skips where there is no LLVM
     command = [sys.executable, "-c", SCRIPT, str(SCENES / "valence3.xml")]
     found = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr

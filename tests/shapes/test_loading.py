@@ -14,7 +14,7 @@ from mitsuba_subdivision import CageWarning, ControlCage
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.shapes import cage_files, nesting
-from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -135,7 +135,7 @@ def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
         mi.load_dict({"type": "scene", **scene})
 
 
-def test_a_constructor_too_deep_goes_on_in_a_thread_of_its_own():
+def test_a_constructor_too_deep_runs_in_its_own_thread():
     threads, depths = [], []
 
     @nesting.on_shallow_stack

@@ -13,7 +13,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
-from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
 from mitsuba_subdivision.studio.look import Look
@@ -209,6 +209,7 @@ def test_times_of_a_usd_file_are_frames(folder):
         (["f_%04d.obj", "-o", "a.png", "--frames", "1:2"], '"f_0001.obj": there is no such file (2 such files)'),
         (["cube.obj", "-o", "a.png", "--prim", "/a"], "expected it for USD files only"),
         (["cube.obj", "-o", "a.png", "--checker"], "has no texture coordinates"),
+        (["cube.obj", "-o", "a.png", "--texture-size", "8"], "expected it for a whole USD file"),
         (["cube.obj", "-o", "a.png", "-D", "a=1"], "-D was given for the model"),
         (["cube.obj", "-o", "a.png", "-s", "0"], "--sensor was given for the model"),
         (["cube.obj", "-o", "a.png", "--fps", "5"], "--fps is for videos"),

@@ -44,7 +44,8 @@ def _scene(*shapes, groups=(), instances=()):
 
 
 def _segments(contents, sensor, shading):
-    return segments_of(contents, Surfaces(), outline_for(sensor), sensor["near_clip"], shading)
+    found = segments_of(contents, Surfaces(), outline_for(sensor), sensor["near_clip"], shading)
+    return {shape: of_copies.max() for shape, of_copies in found.items()}
 
 
 def _rate(shape, sensor, shading):
@@ -53,7 +54,9 @@ def _rate(shape, sensor, shading):
 
 def _triangles(contents, sensor, shading="exact", **parameters):
     parameters = {"shading": shading, "tessellation_rate": 8, **parameters}
-    return triangles_for_picture(contents, Surfaces(), sensor, parameters)
+    outline = outline_for(sensor)
+    segments = segments_of(contents, Surfaces(), outline, sensor["near_clip"], shading)
+    return triangles_for_picture(contents, segments, outline, parameters)
 
 
 def _moved(*offset, scale=1.0):

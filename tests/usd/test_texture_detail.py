@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
+from mitsuba_subdivision.studio.picture import outline_for
 from mitsuba_subdivision.usd.contents import (
     InstanceContents,
     MaterialContents,
@@ -15,7 +16,9 @@ from mitsuba_subdivision.usd.contents import (
     ShapeContents,
     TextureContents,
 )
-from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, reduced, texels_for_picture
+from mitsuba_subdivision.usd.image_reduction import halvings, reduced
+from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, texels_for_picture
+from mitsuba_subdivision.usd.texture_image import read_texture_image
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -24,6 +27,8 @@ WIDTH, FOV, DISTANCE = 640, 30.0, 10.0
 LEVEL = 1.01 / 255
 # The depth of a flat square is known but for single precision.
 ROUNDED = 1e-5
+# Of 255. Chroma of neighbouring pixels is interpolated before a full image is halved.
+JPEG_LEVELS = 4
 
 
 def texture(file="a.png", **changes):
@@ -62,6 +67,11 @@ def sensor(distance=DISTANCE):
     }
 
 
+def needed_for(contents):
+    entry = sensor()
+    return texels_for_picture(contents, outline_for(entry), entry["near_clip"])
+
+
 def pixels_of_unit(distance=DISTANCE):
     return WIDTH / (2 * distance * np.tan(np.radians(FOV / 2)))
 
@@ -69,7 +79,7 @@ def pixels_of_unit(distance=DISTANCE):
 @pytest.mark.parametrize("side", [0.1, 2.0])
 @pytest.mark.parametrize("uv_side", [1.0, 4.0])
 def test_texels_follow_from_pixels(side, uv_side):
-    found = texels_for_picture(scene(square(side, uv_side), inputs={"base_color": texture()}), sensor())
+    found = needed_for(scene(square(side, uv_side), inputs={"base_color": texture()}))
     assert found == {"a.png": pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit() * side / uv_side, rel=ROUNDED)}
 
 
@@ -79,17 +89,17 @@ def test_the_copy_that_is_largest_in_the_picture_decides():
     shapes = scene(
         square(), inputs={"base_color": texture()}, groups=[[square()]], instances=[InstanceContents("/i", 0, near)]
     )
-    found = texels_for_picture(shapes, sensor())["a.png"]
+    found = needed_for(shapes)["a.png"]
     assert found == pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit(DISTANCE / 2), rel=ROUNDED)
 
 
 def test_where_the_detail_is_unknown_nothing_is_reduced():
     without = scene(square(has_texcoords=False), inputs={"base_color": texture()})
-    assert texels_for_picture(without, sensor()) == {"a.png": np.inf}
+    assert needed_for(without) == {"a.png": np.inf}
     elsewhere = NodeContents(
         "image", "color3", {"file": texture(), "texcoord": NodeContents("texcoord", "vector2", {})}
     )
-    assert texels_for_picture(scene(square(), inputs={"base_color": elsewhere}), sensor()) == {}
+    assert needed_for(scene(square(), inputs={"base_color": elsewhere})) == {}
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 3, 4]), st.booleans())
@@ -122,8 +132,56 @@ def test_images_keep_as_many_pixels_as_are_needed(needed, side):
     assert (found == 200).all()
 
 
-def test_odd_sides_and_other_types_stay():
-    odd = np.zeros((63, 64, 3), dtype=np.uint8)
-    assert reduced(odd, 1, is_srgb=True) is odd
-    half = np.zeros((64, 64, 3), dtype=np.float32)
-    assert reduced(half, 1, is_srgb=False) is half
+def test_a_picture_that_repeats_needs_fewer_texels():
+    """Where two uses of a file repeat it differently, the one that shows most of it decides."""
+    often, once = (texture(to_uv=np.diag([repeats, repeats, 1.0])) for repeats in (4, 1))
+    of_both = needed_for(scene(square(), inputs={"base_color": often, "emission": once}))["a.png"]
+    assert of_both == pytest.approx(4 * needed_for(scene(square(), inputs={"base_color": often}))["a.png"])
+
+
+@pytest.mark.parametrize(("size", "most", "side"), [((63, 64), 33, 32), ((64, 64), 64, 64), ((5, 3), 1, 1)])
+def test_a_limit_holds_for_all_sizes(size, most, side):
+    pixels = np.full((*size, 3), 200, dtype=np.uint8)
+    found = reduced(pixels, np.inf, most, is_srgb=True)
+    assert max(found.shape[:2]) == side
+    assert (found == 200).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float16, np.float32])
+@pytest.mark.parametrize("is_srgb", [True, False])
+def test_images_of_other_types_are_halved_as_bytes_are(dtype, is_srgb):
+    pixels = np.random.default_rng(0).integers(0, 256, (16, 8, 4), dtype=np.uint8)
+    others = pixels * np.uint16(257) if dtype == np.uint16 else (pixels / 255).astype(dtype)
+    found = reduced(others, 4, is_srgb=is_srgb)
+    np.testing.assert_allclose(
+        found / (65535 if dtype == np.uint16 else 1), reduced(pixels, 4, is_srgb=is_srgb) / 255, rtol=0, atol=LEVEL
+    )
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_jpeg_files_are_decoded_at_a_scale(tmp_path, channels):
+    """As files that are decoded in full and halved then, but for what a scaled transform leaves out."""
+    x, y = np.meshgrid(np.linspace(0, 9, 256), np.linspace(0, 5, 128))
+    waves = np.stack([np.sin(x), np.cos(y), np.sin(x + y)][:channels], axis=-1)
+    path = str(tmp_path / "a.jpg")
+    mi.Bitmap(np.uint8(127 + 120 * waves)).write(path, quality=95)
+    full = read_texture_image(path).pixels
+    assert full.shape == (128, 256, channels)
+    for needed in (64, 17, 8):
+        found = read_texture_image(path, "auto", needed).pixels
+        expected = reduced(full, needed, is_srgb=channels == 3)
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found.astype(float), expected, rtol=0, atol=JPEG_LEVELS)
+
+
+def test_tiles_are_read_smaller_each(tmp_path):
+    for number in (1001, 1002):
+        mi.Bitmap(np.full((64, 64, 3), number - 1000, np.uint8)).write(str(tmp_path / f"a.{number}.png"))
+    found = read_texture_image(str(tmp_path / "a.<UDIM>.png"), "raw", 20)
+    assert found.pixels.shape == (32, 64, 3)
+    assert read_texture_image(str(tmp_path / "a.<UDIM>.png"), "raw", 20, 16).pixels.shape == (16, 32, 3)
+
+
+def test_halves_are_counted():
+    assert [halvings((2048, 1024), needed) for needed in (513, 512, 1)] == [0, 1, 10]
+    assert [halvings((2048, 1024), np.inf, most) for most in (2048, 2047, 1)] == [0, 1, 11]

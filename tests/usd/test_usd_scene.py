@@ -484,6 +484,29 @@ def test_numbers_come_from_the_channel_that_is_connected(stage, tmp_path):
     np.testing.assert_allclose(found[1], 0.2159, atol=1e-4)
 
 
+def test_textures_have_a_limit_that_can_be_set(stage, tmp_path):
+    """The square is 32 pixels wide in the picture, so that 64 texels show."""
+    mi.Bitmap(np.full((256, 256, 3), 128, np.uint8)).write(str(tmp_path / "a.png"))
+    colored = material("color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>", texture("a.png"))
+    smooth = SQUARE.replace("none", "catmullClark")
+    path = stage(CAMERA + colored + mesh("square", smooth + BOUND))
+    for limit, side in ((None, 64), (100, 64), (24, 16)):
+        paint = msub.usd_scene(path, mi, size=(32, 32), texture_size=limit)["paint"]
+        assert np.array(paint["bsdf"]["base_color"]["bitmap"]).shape == (side, side, 3)
+    with pytest.raises(ValueError, match="texture_size 0; expected 1 or more"):
+        msub.usd_scene(path, mi, texture_size=0)
+
+
+def test_materials_that_differ_by_their_names_only_are_one(stage):
+    paint = material("color3f inputs:diffuseColor = (0.2, 0.4, 0.8)")
+    other = paint.replace("paint", "other")
+    smooth = SQUARE.replace("none", "catmullClark")
+    squares = mesh("a", smooth + BOUND) + mesh("b", smooth + BOUND.replace("paint", "other"))
+    scene = msub.usd_scene(stage(CAMERA + paint + other + squares), mi)
+    assert scene["a"]["bsdf"] == scene["b"]["bsdf"] == {"type": "ref", "id": "paint"}
+    assert "other" not in scene
+
+
 def test_textures_read_the_coordinates_that_they_name(stage, tmp_path):
     mi.Bitmap(QUADRANTS.repeat(8, axis=0).repeat(8, axis=1)).write(str(tmp_path / "quadrants.png"))
     glow = (

@@ -272,7 +272,7 @@ class ControlCage:
         CageError
             If the format is unknown.
         OSError
-            If the file cannot be written. A file that was there before is then unchanged.
+            If the file cannot be written. An existing file is then unchanged.
 
         Warns
         -----
@@ -312,12 +312,12 @@ class ControlCage:
         Parameters
         ----------
         scheme : str or Scheme, optional
-            As for `LimitSurface`. If it is given, the refined cage asks for it.
+            As for `LimitSurface`. If given, the refined cage names it.
         """
         return self.refinement(scheme).cage
 
     def refinement(self, scheme: str | Scheme | None = None) -> CageRefinement:
-        """Refine once, and say how the refined cage follows from this one.
+        """Refine once, with the maps from this cage to the refined one.
 
         Sharpness between 0 and 10 is lowered as the cage's ``crease_method`` says. ``face_varying`` becomes another
         rule where that keeps the same corners and the cage's own does not.
@@ -325,7 +325,7 @@ class ControlCage:
         Parameters
         ----------
         scheme : str or Scheme, optional
-            As for `LimitSurface`. If it is given, the refined cage asks for it.
+            As for `LimitSurface`. If given, the refined cage names it.
 
         Returns
         -------

@@ -30,12 +30,12 @@ def triangles_of(topology: Topology) -> IndexArray:
     """``(n, 3)`` int32 vertices of triangles that fan out from each face's first vertex, in the order of the faces."""
     counts = topology.face_sizes - 2
     first = np.repeat(topology.face_offsets[:-1], counts)
-    step = first + ragged.places(counts)
+    step = first + ragged.index_in_row(counts)
     return read_only(topology.face_vertices[np.stack([first, step + 1, step + 2], axis=1)])
 
 
 def laplacian_of(edges: IndexArray, vertex_count: int) -> sparse.csr_array:
-    """``(n_v, n_v)`` Laplacian of a graph: how many neighbours each vertex has, less one for each of them."""
+    """``(n_v, n_v)`` Laplacian of a graph: the number of neighbours on the diagonal, -1 for each neighbour."""
     from scipy import sparse
 
     one, other = edges[edges[:, 0] != edges[:, 1]].T

@@ -151,7 +151,7 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
         [number(circle, here + step), number(circle + 1, beyond + step + 1), number(circle, here + step + 1)], axis=1
     )[inward]
 
-    circle, step = np.repeat(np.arange(1, rows + 1), lengths), ragged.places(lengths)
+    circle, step = np.repeat(np.arange(1, rows + 1), lengths), ragged.index_in_row(lengths)
     # Straight along the sector's side of the polygon first, then out to the sphere.
     side, along = np.divmod(step, circle)
     angle = 2 * np.pi / valence * np.stack([side, side + 1])

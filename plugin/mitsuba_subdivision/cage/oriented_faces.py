@@ -85,7 +85,7 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
 
 
 def _raise_first(topology: Topology, source: CageSource) -> None:
-    """Raise an error about the first thing that keeps the faces from being an oriented manifold."""
+    """Raise an error about the first defect of an oriented manifold."""
     for require in (_require_distinct_corners, _require_two_faces, _require_opposite_directions, _require_single_fans):
         require(topology, source)
 

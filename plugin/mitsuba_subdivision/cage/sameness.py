@@ -13,7 +13,7 @@ from .source import CageSource
 
 
 def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
-    """Whether nested records, mappings, lists, arrays and values are equal; where they are from is not compared.
+    """Whether nested records, mappings, lists, arrays and values are equal; their sources are not compared.
 
     Parameters
     ----------

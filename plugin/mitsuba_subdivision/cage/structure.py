@@ -34,7 +34,7 @@ class CageStructure:
     holes: IntArray
 
     def shared(self) -> CageStructure:
-        """The same structure that others have; this one, if it is the first of its kind."""
+        """The shared structure that equals this one; this one itself if there is none yet."""
         t = self.topology
         names = None if t.edge_names is None else Content(t.edge_names)
         arrays = (t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)

@@ -34,7 +34,7 @@ def validated_tags(
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
     if not len(edges) and not len(vertices):
-        return Sharpness(_nowhere(topology.half_edge_count), _nowhere(topology.vertex_count))
+        return Sharpness(_zeros(topology.half_edge_count), _zeros(topology.vertex_count))
     starts, ends = edges[:, :2].astype(np.int64).T
     half_edge = _half_edges_between(topology, starts, ends)
     for row in np.flatnonzero(half_edge < 0)[:1]:
@@ -137,13 +137,13 @@ def _require(
 def _sharpness(count: int, indices: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Read-only values at some indices, and zero elsewhere."""
     if not len(indices):
-        return _nowhere(count)
+        return _zeros(count)
     found = np.zeros(count)
     found[indices] = np.minimum(values, INFINITE)
     return read_only(found)
 
 
-def _nowhere(count: int) -> NDArray[np.float64]:
+def _zeros(count: int) -> NDArray[np.float64]:
     """Read-only zeros. As in most cages nothing is sharp, they take no memory."""
     return np.broadcast_to(0.0, count)
 

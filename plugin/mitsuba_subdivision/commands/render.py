@@ -41,6 +41,7 @@ _OF_MODELS = (
     "shading",
     "checker",
     "cage",
+    "texture_size",
 )
 # Options that select one mesh of a USD file.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
@@ -111,6 +112,12 @@ def _add_model_options(render: argparse.ArgumentParser) -> None:
         type=_size,
         metavar="WxH",
         help="pixels of the picture (default: 640x480, or as the stage or its camera asks for)",
+    )
+    group.add_argument(
+        "--texture-size",
+        type=positive,
+        metavar="N",
+        help="pixels along the sides of a stage's textures at most (default: as many as the picture shows)",
     )
     group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     group.add_argument("--cage", action="store_true", help="draw the control cage")
@@ -265,6 +272,10 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}
         return StageScenes(options.scene, look, {name: v for name, v in given.items() if v is not None}, **which)
+    if options.texture_size:
+        raise ValueError(
+            f'--texture-size was given for one cage of "{options.scene}"; expected it for a whole USD file'
+        )
     from ..studio.cage_scenes import CageScenes
 
     shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
@@ -325,7 +336,7 @@ def _look(options: argparse.Namespace) -> Look:
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
-    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage")}
+    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage", "texture_size")}
     return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
 
 

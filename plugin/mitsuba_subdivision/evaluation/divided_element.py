@@ -30,14 +30,14 @@ from ..mesh.one_ring import one_ring
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.scheme_members import optional_member
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
 from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_together, ring_pattern
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
-# After so many refinements an element consists of pieces.
+# After this many refinements an element consists of pieces.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
 
 

@@ -21,7 +21,7 @@ from .bernstein import regular_bernstein, times
 from .divided_element import DividedElement, PartKind
 from .irregular_patch import IrregularPatch, level_rows, transition
 
-# Normals are bounded on the pieces after so many divisions.
+# Normals are bounded on the pieces after this many divisions.
 NORMAL_DEPTH = 3
 
 

@@ -70,22 +70,24 @@ class Eigenbasis:
     def block_matrix(self, power: int = 1) -> FloatArray:
         """T, or a power of it, dense ``(K, K)``."""
         matrix = np.diag(self.eigenvalues**power)
-        for place, block in self.blocks:
-            matrix[place, place] = np.linalg.matrix_power(block, power)
+        for block_slice, block in self.blocks:
+            matrix[block_slice, block_slice] = np.linalg.matrix_power(block, power)
         return matrix
 
     def times_blocks(self, coordinates: FloatArray) -> FloatArray:
         """T times eigen-coordinates ``(K, ..)``."""
         product = self.eigenvalues[:, None] * coordinates
-        for place, block in self.blocks:
-            product[place] = block @ coordinates[place]
+        for block_slice, block in self.blocks:
+            product[block_slice] = block @ coordinates[block_slice]
         return product
 
     def turned_over(self) -> Eigenbasis:
         """Return the basis with its third eigenvector negated, which reverses the characteristic map's orientation."""
         sign = np.ones(len(self.eigenvalues))
         sign[2] = -1
-        blocks = tuple((place, sign[place, None] * block * sign[place]) for place, block in self.blocks)
+        blocks = tuple(
+            (block_slice, sign[block_slice, None] * block * sign[block_slice]) for block_slice, block in self.blocks
+        )
         return Eigenbasis(self.vectors * sign, self.inverse * sign[:, None], self.eigenvalues, self.moduli, blocks)
 
 
@@ -136,12 +138,12 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
 
     means, blocks, begin = np.empty(size), [], 0
     for of_cluster, centre in zip(bases, centres, strict=True):
-        place = slice(begin, begin + of_cluster.shape[1])
-        block = transformed[place, place]
-        means[place] = centre
+        block_slice = slice(begin, begin + of_cluster.shape[1])
+        block = transformed[block_slice, block_slice]
+        means[block_slice] = centre
         if np.abs(block - centre * np.eye(len(block))).max() >= DIAGONAL:
-            blocks.append((place, block))
-        begin = place.stop
+            blocks.append((block_slice, block))
+        begin = block_slice.stop
     means[0] = 1
     basis = Eigenbasis(vectors, inverse, means, np.array(moduli), tuple(blocks))
     require_basis(matrix, basis, np.eye(size))
@@ -247,8 +249,8 @@ def _spans(
         alike = [number for number, members in enumerate(clusters) if len(members) == size]
         vectors = eigenvectors[:, [clusters[number] for number in alike]].transpose(1, 0, 2)
         left, singular, _ = np.linalg.svd(np.concatenate([vectors.real, vectors.imag], axis=2), full_matrices=False)
-        for place, number in enumerate(alike):
-            found[number] = left[place], singular[place]
+        for index, number in enumerate(alike):
+            found[number] = left[index], singular[index]
     return found
 
 

@@ -22,7 +22,7 @@ from .occupied_pieces import OccupiedPieces, PieceGroup, occupied_pieces
 
 # Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
 KEPT_WEIGHTS = 1 << 13
-# Samples are evaluated in runs of this many, and weights of so many of these are gathered at once: they stay in a
+# Samples are evaluated in runs of this many, and weights of this many of these are gathered at once: they stay in a
 # processor's cache.
 RUN = 1024
 GATHERED = 512
@@ -106,7 +106,7 @@ def evaluate_elements(
     scale, level = np.empty((2, count), dtype=dtype), np.empty(count, dtype=np.int64)
     curvature, weights = np.full((2, count), np.nan, dtype=dtype), np.empty((2, count), dtype=dtype)
     frames: list[tuple[slice, FloatArray]] = []
-    room = np.empty(GATHERED * max((group.coordinates[0].size for group in pieces.groups), default=0))
+    buffer = np.empty(GATHERED * max((group.coordinates[0].size for group in pieces.groups), default=0))
     use_stam = evaluator in ("power", "stam")
     for patch, run in located.runs():
         rows = located.rows(patch, run, evaluator, dtype, derivatives)
@@ -117,7 +117,7 @@ def evaluate_elements(
             if not use_stam:
                 origin[:, own] = points[0].T
                 points -= points[0].copy()
-            coordinates = group.coordinates_of(located.index[own], points, evaluator, room)
+            coordinates = group.coordinates_of(located.index[own], points, evaluator, buffer)
             found = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
             values[..., own] = found
             if rows.frame is not None:

@@ -243,10 +243,10 @@ def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, 
     powers: NDArray = ratios ** occurring.astype(real)[:, None]
     scaled = rows * powers.take(which, axis=0)
     scaled[:, :, ~kept] = 0
-    for place, block in basis.blocks:
-        if kept[place].all():
-            mean = basis.eigenvalues[place][0] / base
-            scaled[:, :, place] = times_block_powers(rows[:, :, place], level, block / base, mean)
+    for block_slice, block in basis.blocks:
+        if kept[block_slice].all():
+            mean = basis.eigenvalues[block_slice][0] / base
+            scaled[:, :, block_slice] = times_block_powers(rows[:, :, block_slice], level, block / base, mean)
     return scaled
 
 

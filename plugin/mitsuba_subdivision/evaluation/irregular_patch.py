@@ -15,6 +15,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature, TaggedFan
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.stencil_table import StencilTable
 from .bernstein import regular_bernstein
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .equations import (
@@ -29,7 +30,7 @@ from .equations import (
     stam_rows,
     times_powers,
 )
-from .ring_symmetry import ring_orbits, symmetric_eigenbasis
+from .ring_symmetry import fan_eigenbasis, fan_ring, ring_orbits, symmetric_eigenbasis
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
@@ -37,6 +38,8 @@ PARALLEL = 1e-6
 # Eigenvalues of Jordan blocks are at most a half, times some rounding: after so many levels their powers are below all
 # before.
 GROWING_LEVELS = 16
+# Control points from which on a product with sparse stencils takes less time than a dense one.
+MANY_CONTROLS = 256
 # Single precision does not distinguish points as near as this, in parameters and sizes of the patch, from the point.
 FLOAT32_SIZE = 2.0**-24
 
@@ -51,7 +54,7 @@ class IrregularStructure:
         Of the one-ring; child 0 has the same.
     slots : (K,) int64
         The vertices of the one-ring that are control points: all of them, but at a dart one that equals another.
-    matrix : (K, K) float64
+    table : StencilTable
         A: control points of child 0 from those of the parent.
     children : (3, R, K) float64
         P_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's lattice.
@@ -59,8 +62,13 @@ class IrregularStructure:
 
     signature: Signature
     slots: IntArray
-    matrix: FloatArray
+    table: StencilTable
     children: FloatArray
+
+    @property
+    def matrix(self) -> FloatArray:
+        """``(K, K)`` float64, A: made anew, as each face beside a border has its own, and nearly all of it is zero."""
+        return self.table.dense(np.arange(self.table.row_count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,17 +178,14 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         If the rules do not contract the one-ring to a point.
     """
     try:
-        orbits = ring_orbits(structure.signature)
-        basis = None if orbits is None else symmetric_eigenbasis(structure.matrix, orbits)
-        if basis is None:
-            basis = eigenbasis(structure.matrix)
+        basis = _basis(structure)
     except EigenbasisError as error:
-        place = f"a {structure.signature.kind} with fans {structure.signature.fans}"
-        raise SchemeError(f"{scheme.name}: subdivision matrix of {place}: {error}") from error
+        ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
+        raise SchemeError(f"{scheme.name}: subdivision matrix of {ring}: {error}") from error
     # Eigenvectors have an arbitrary sign. With this one, the normal of (13) is along the cross product of its tangents.
     if characteristic_jacobian(scheme, structure.children, basis.vectors) < 0:
         basis = basis.turned_over()
-    eigen_children = structure.children @ basis.vectors
+    eigen_children = _times_sparse(structure.children, basis.vectors)
     frame = limit_frame(scheme, structure.signature, basis)
     patch = IrregularPatch(scheme, structure, basis, eigen_children, edge_tangents=frame, limit_frame=frame)
     # Where the characteristic map takes (1, 0) and (0, 1): the directions of the two edges.
@@ -192,6 +197,28 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
     tangents = np.zeros_like(frame)
     tangents[:, 1:3] = ends
     return replace(patch, edge_tangents=tangents)
+
+
+def _times_sparse(stencils: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Stencils ``(n, R, K)``, most of whose weights are zero, times ``(K, K)``."""
+    if len(vectors) < MANY_CONTROLS:
+        return stencils @ vectors
+    # A first picture needs no SciPy.
+    from scipy import sparse
+
+    return (sparse.csr_array(stencils.reshape(-1, len(vectors))) @ vectors).reshape(stencils.shape)
+
+
+def _basis(structure: IrregularStructure) -> Eigenbasis:
+    """The eigenbasis, by the symmetry or the ring of a high valence if there is one."""
+    found, matrix = None, structure.matrix
+    if (orbits := ring_orbits(structure.signature)) is not None:
+        found = symmetric_eigenbasis(matrix, orbits)
+    elif (ring := fan_ring(structure.signature)) is not None:
+        # At a dart, one of its vertices is no control point, as it equals another.
+        order = np.searchsorted(structure.slots, ring[np.isin(ring, structure.slots)])
+        found = fan_eigenbasis(matrix, order)
+    return eigenbasis(matrix) if found is None else found
 
 
 @lru_cache(maxsize=4096)

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
+from ..schemes import SchemeError, scheme_named
 from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import eigenbasis
 from .patch_pieces import isolated_signature
 from .refined_rings import refined_children
@@ -35,30 +35,37 @@ class LimitStencil(NamedTuple):
     tangents: FloatArray
 
 
-def extraordinary_limit_stencil(scheme: Scheme, valence: int) -> LimitStencil:
-    """Limit stencil at a vertex, or a face, read off the left eigenvectors of its subdivision matrix.
+def limit_stencil(scheme: str, valence: int) -> LimitStencil:
+    """Weights over a one-ring that make its limit point and two tangents: left eigenvectors of its subdivision matrix.
 
     Parameters
     ----------
+    scheme : str
     valence : int
-        Of the vertex, or number of the face's corners; at least 3.
+        Of a vertex amid regular faces (true after one refinement of any cage); for Doo-Sabin, corners of a face amid
+        regular vertices. At least 3.
+
+    Returns
+    -------
+    LimitStencil
 
     Raises
     ------
     SchemeError
-        If the valence is no integer or below 3.
+        If the scheme is unknown, or the valence no integer or below 3.
     """
+    rules = scheme_named(scheme)
     if not isinstance(valence, (int, np.integer)):
         raise SchemeError(f"limit stencil of valence {valence!r}: expected an integer")
     if valence < 3:
         raise SchemeError(f"limit stencil of valence {valence}: expected 3 or more")
-    signature = isolated_signature(scheme, valence)
+    signature = isolated_signature(rules, valence)
     topology = one_ring(signature).topology
-    if scheme.element == "face":
+    if rules.element == "face":
         slots, ring = _vertex_ring(topology, valence)
     else:
         slots = ring = topology.face_vertices[:valence].tolist()
-    basis = eigenbasis(refined_children(scheme, signature)[0][2])
+    basis = eigenbasis(refined_children(rules, signature)[0][2])
 
     angles = 2 * np.pi * np.arange(valence) / valence
     target = np.stack([np.cos(angles), np.sin(angles)])

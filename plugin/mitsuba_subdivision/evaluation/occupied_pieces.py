@@ -115,7 +115,7 @@ class PieceGroup:
         return index, float(self.absolute_sums(np.array([index])).max())
 
     def coordinates_of(
-        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, room: FloatArray
+        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, buffer: FloatArray
     ) -> FloatArray:
         """The factors of `IrregularPatch.rows`, or of rows of the regular basis: ``(s, K_piece, x)``.
 
@@ -126,13 +126,13 @@ class PieceGroup:
         controls : (K, s, x)
             Control points. Sums are double precision, and rounded once.
         evaluator : "power" | "stam" | "stabilized" | "limit"
-        room : (n,) float64
+        buffer : (n,) float64
             To gather weights in: fresh memory takes several times as long.
         """
         if self._order is not None:
             return controls.take(self._order, axis=0).swapaxes(0, 1)
         rows = self.stencils if evaluator == "power" else self.coordinates
-        weights = room[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
+        weights = buffer[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
         # Without checks of the indices, which would allocate memory.
         rows.take(which, axis=0, out=weights, mode="clip")
         return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
@@ -240,6 +240,7 @@ class OccupiedPieces:
         )
         # Those that have children to be made; None for others.
         self._divisible: list[_Part | None] = []
+        self._divisible_bytes = 0
         self._mesh: RingMesh | None = None
 
     @classmethod
@@ -252,8 +253,7 @@ class OccupiedPieces:
     @property
     def byte_count(self) -> int:
         """About how much memory weights take."""
-        parts = sum(part.byte_count for part in self._divisible if part is not None)
-        return parts + sum(group.byte_count for group in self.groups)
+        return self._divisible_bytes + sum(group.byte_count for group in self.groups)
 
     def add(self, signatures: Iterable[Signature]) -> list[int]:
         """Take elements of some signatures, and return their numbers among the parts."""
@@ -342,7 +342,9 @@ class OccupiedPieces:
             self.parts["children"][index, number] = found
         for index in {index for index, _ in missing}:
             count = 1 if self.parts["kind"][index] == PartKind.ONLY_CHILD else len(self.scheme.domain.children)
-            if (self.parts["children"][index, :count] != NO_CHILD).all():
+            part = self._divisible[index]
+            if part is not None and (self.parts["children"][index, :count] != NO_CHILD).all():
+                self._divisible_bytes -= part.byte_count
                 self._divisible[index] = None
 
     def _add(self, parts: list[tuple[_Part, AffineMap]]) -> list[int]:
@@ -408,6 +410,7 @@ class OccupiedPieces:
         gain: float = 0.0,
     ) -> int:
         self._divisible.append(part)
+        self._divisible_bytes += 0 if part is None else part.byte_count
         maps = [domain @ rotation for rotation in self._rotations]
         return self.parts.append(
             kind=kind,

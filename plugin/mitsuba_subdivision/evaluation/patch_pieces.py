@@ -12,13 +12,12 @@ from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.scheme_members import optional_member
+from ..schemes.stencil_table import StencilTable
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
 from .refined_rings import refined_ring, ring_pattern
 
-# Control points from which on a product with sparse stencils takes less time than a dense one.
-MANY_CONTROLS = 256
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
 MAX_REFINEMENTS = 6
@@ -53,12 +52,13 @@ class Piece:
     def coordinates(self) -> FloatArray:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
         inverse = self.irregular_patch.basis.inverse
-        if len(inverse) < MANY_CONTROLS:
+        order = self.stencils.argmax(axis=1)
+        if not np.array_equal(self.stencils, np.eye(self.stencils.shape[1])[order]):
             return inverse @ self.stencils
-        # Stencils of a whole element only put its points into another order. A first picture needs no SciPy.
-        from scipy import sparse
-
-        return (sparse.csr_array(self.stencils.T) @ inverse.T).T
+        # Stencils of a whole element only put its points into another order.
+        found = np.zeros(self.stencils.shape)
+        found[:, order] = inverse
+        return found
 
     def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
         """The same piece as a part of a larger element.
@@ -162,7 +162,9 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
         for each in (matrix, found):
             each[..., kept] += each[..., dropped]
         matrix, found = matrix[slots][:, slots], found[..., slots]
-    return IrregularStructure(signature, slots, matrix, found)
+    rows, columns = np.nonzero(matrix)
+    table = StencilTable(len(matrix), len(matrix), rows, columns, matrix[rows, columns])
+    return IrregularStructure(signature, slots, table, found)
 
 
 def _merged_slots(signature: Signature) -> tuple[int, int] | None:
@@ -230,14 +232,14 @@ def _lattice_points(scheme: Scheme, signature: Signature) -> list[tuple[float, f
     """Lattice point at which each local vertex of a regular one-ring sits."""
     topology = one_ring(signature).topology
     start = {0: (scheme.first_edge[0], scheme.first_edge[1] - scheme.first_edge[0])}
-    place: dict[int, tuple[float, float]] = {}
+    point_of_vertex: dict[int, tuple[float, float]] = {}
     while start:
         half_edge, (point, edge) = start.popitem()
         for _ in range(scheme.regular_face_size):
             twin = int(topology.twin[half_edge])
-            place[int(topology.face_vertices[half_edge])] = tuple(point)
-            if twin >= 0 and int(topology.face_vertices[topology.prev[twin]]) not in place:
+            point_of_vertex[int(topology.face_vertices[half_edge])] = tuple(point)
+            if twin >= 0 and int(topology.face_vertices[topology.prev[twin]]) not in point_of_vertex:
                 start[twin] = (point + edge, -edge)
             point, edge = point + edge, scheme.edge_turn @ edge
             half_edge = int(topology.next[half_edge])
-    return [place[vertex] for vertex in range(topology.vertex_count)]
+    return [point_of_vertex[vertex] for vertex in range(topology.vertex_count)]

@@ -38,17 +38,17 @@ class ProductPatch:
     """The regular patch of a scheme whose basis is a product.
 
     Seen from any corner, the point at (u, v) is the sum over j and i of ``L[0, j](v) L[0, i](u)`` times the control
-    point ``places[corner, j, i]``, with ``L`` from `line_weights`.
+    point ``lattice_index[corner, j, i]``, with ``L`` from `line_weights`.
 
     Parameters
     ----------
     scheme : Scheme
-    places : (4, r, r) int64
+    lattice_index : (4, r, r) int64
         Control points of the one-ring.
     """
 
     scheme: Scheme
-    places: IntArray
+    lattice_index: IntArray
 
     def line_weights(self, parameters: FloatArray) -> FloatArray:
         """Values and derivatives of the one-dimensional basis: ``(2, s, r)``."""
@@ -88,7 +88,7 @@ class ProductPatch:
 
     def basis(self, uv: FloatArray) -> FloatArray:
         """The scheme's own weights, value and derivatives by u and v, seen from corner 0: ``(3, s, r, r)``."""
-        count = self.places.shape[1]
+        count = self.lattice_index.shape[1]
         return self.scheme.regular_basis(uv, 1)[:, :, _lattice_order(self.scheme)].reshape(3, -1, count, count)
 
 
@@ -104,14 +104,14 @@ def product_patch(scheme: Scheme, signature: Signature) -> ProductPatch | None:
     if stencils is None:
         return None
     lattice = scheme.regular_lattice[_lattice_order(scheme)]
-    places = []
+    lattice_index = []
     for corner in range(4):
         seen = scheme.domain.rotation(corner)(lattice)
         at = [np.flatnonzero(np.abs(scheme.regular_lattice - point).max(axis=1) < SAME) for point in seen]
         if any(len(found) != 1 for found in at):
             return None
-        places.append(np.argmax(stencils[np.concatenate(at)], axis=1))
-    patch = ProductPatch(scheme, np.array(places).reshape(4, count, count))
+        lattice_index.append(np.argmax(stencils[np.concatenate(at)], axis=1))
+    patch = ProductPatch(scheme, np.array(lattice_index).reshape(4, count, count))
     return patch if _is_product(patch) else None
 
 
@@ -127,13 +127,13 @@ def _is_product(patch: ProductPatch) -> bool:
     products = along_v[:, :, None] * along_u[:, None, :]
     for corner in range(4):
         basis = patch.basis(patch.scheme.domain.rotation(corner)(inside))[0]
-        if np.abs(_placed(products, patch.places[corner]) - _placed(basis, patch.places[0])).max() > SAME:
+        if np.abs(_placed(products, patch.lattice_index[corner]) - _placed(basis, patch.lattice_index[0])).max() > SAME:
             return False
     return True
 
 
-def _placed(weights: FloatArray, places: IntArray) -> FloatArray:
+def _placed(weights: FloatArray, lattice_index: IntArray) -> FloatArray:
     """Weights ``(s, r, r)`` of a lattice's points, in the order of the one-ring's vertices: ``(s, r^2)``."""
-    placed = np.zeros((len(weights), places.size))
-    placed[:, places.ravel()] = weights.reshape(len(weights), -1)
+    placed = np.zeros((len(weights), lattice_index.size))
+    placed[:, lattice_index.ravel()] = weights.reshape(len(weights), -1)
     return placed

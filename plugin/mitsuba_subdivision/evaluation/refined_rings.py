@@ -169,7 +169,7 @@ def refined_together(
     Parameters
     ----------
     mesh : RingMesh or None
-        The result of the last call; its connectivity is used again if it has room for the one-rings.
+        The result of the last call; its connectivity is used again if it has capacity for the one-rings.
 
     Returns
     -------
@@ -186,10 +186,10 @@ def refined_together(
     if len(chosen) < FEWEST_TOGETHER:
         return {}, mesh
     counts = Counter(signature.smoothed for signature in chosen)
-    if mesh is None or not mesh.has_room(counts):
+    if mesh is None or not mesh.has_capacity(counts):
         # Rounded up to a power of two, because there are often more one-rings after the next refinement.
-        room = Counter({smooth: 1 << (count - 1).bit_length() for smooth, count in counts.items()})
-        mesh = RingMesh(scheme, room if mesh is None else room | mesh.counts)
+        capacity = Counter({smooth: 1 << (count - 1).bit_length() for smooth, count in counts.items()})
+        mesh = RingMesh(scheme, capacity if mesh is None else capacity | mesh.counts)
     return dict(zip(chosen, mesh.refined(chosen), strict=False)), mesh
 
 
@@ -216,12 +216,12 @@ class RingMesh:
         self._rings: dict[Signature, tuple[IntArray, IndexArray]] | None = None
         self._weight_indices: tuple[IntArray, int] | None = None
 
-    def has_room(self, counts: Counter[Signature]) -> bool:
+    def has_capacity(self, counts: Counter[Signature]) -> bool:
         """Whether there are as many one-rings of each signature."""
         return counts <= self.counts
 
     def refined(self, signatures: list[Signature]) -> list[tuple[RefinedRings, int]]:
-        """Refine one-rings together, for which there must be room.
+        """Refine one-rings together, for which there must be capacity.
 
         Returns
         -------

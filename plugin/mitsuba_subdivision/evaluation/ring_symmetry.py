@@ -11,18 +11,23 @@ of one or two rows for each k [Doo and Sabin 1978]. What is left, the centre, wh
 all sectors, and the few points outside the ring, is a small matrix for the general method. The two parts are separated
 by Sylvester equations. Waves whose eigenvalues lie near one of the small matrix cannot be separated from it. They
 belong to it, but for combinations that have nothing to do with it.
+
+The faces of an open fan, beside a border or at a dart, have different one-rings, but the same ring of points around
+their vertex. The subdivision matrix of a face is block-triangular: the ring depends on itself only. So its eigenvectors
+are found once, and take the place of the waves; each face adds the few points outside the ring [Stam 1998].
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import Signature, TaggedFan
+from ..mesh.signature import Signature, TaggedFan, fan_face_count
 from ..schemes.domain import FloatArray
 from .eigenbasis import Eigenbasis, eigenbasis, require_basis, sorting_key
 
@@ -32,14 +37,17 @@ LEAST_VALENCE = 32
 RING_POINTS = {3: 1, 4: 2}
 # How much weights of sectors may differ: some roundings.
 SAME_WEIGHTS = 1e-13
-# Waves whose eigenvalue is nearer to one of the small matrix stay with it: vectors would lose so many digits.
+# Waves whose eigenvalue is nearer to one of the small matrix stay with it: vectors would lose this many digits.
 SEPARATE = 1e-3
 # Eigenvalues of waves nearer than this are equal.
 EQUAL = 1e-13
 # Eigenvectors of a block whose determinant is below this count as dependent.
 DEPENDENT = 1e-3
-# Random vectors with which the basis is checked.
+# Random vectors with which the basis is checked, and that of each face of an open fan.
 PROBES = 8
+PROBES_OF_FACE = 2
+# Digits of weights by which rings are recognised as equal.
+SAME_DIGITS = 12
 
 
 def ring_orbits(signature: Signature) -> IntArray | None:
@@ -53,7 +61,9 @@ def ring_orbits(signature: Signature) -> IntArray | None:
     """
     fan = signature.fans[0]
     if isinstance(fan, TaggedFan):
-        return None
+        if not fan.is_closed or fan.rule != VertexRule.CORNER or fan.sharpness is not None:
+            return None
+        fan = fan.ahead
     valence = fan[0] if signature.kind == "vertex" else len(fan)
     if valence < LEAST_VALENCE:
         return None
@@ -71,6 +81,36 @@ def ring_orbits(signature: Signature) -> IntArray | None:
         half_edges = t.following(half_edges)
         found.append(t.face_vertices[half_edges])
     return np.array(found)
+
+
+def fan_ring(signature: Signature) -> IntArray | None:
+    """Vertices of the one-ring that lie in the faces of an open fan around its first vertex, in the fan's own order.
+
+    Returns
+    -------
+    (r,) int or None
+        The vertex, and the others of each face from the first border to the last. None for a closed or a small fan.
+    """
+    fan = signature.fans[0]
+    if not isinstance(fan, TaggedFan) or fan.is_closed or fan_face_count(fan) < LEAST_VALENCE:
+        return None
+    sizes = set(fan.ahead + fan.behind)
+    if len(sizes) > 1 or not sizes <= RING_POINTS.keys():
+        return None
+    t = one_ring(signature).topology
+    turn, turn_back, _ = t.walks()
+    half_edge, around = 0, []
+    while (back := int(turn_back(half_edge))) >= 0:
+        half_edge = back
+    while half_edge >= 0:
+        around.append(half_edge)
+        half_edge = int(turn(half_edge))
+    half_edges, columns = np.array(around), []
+    for _ in range(RING_POINTS[min(sizes)]):
+        half_edges = t.following(half_edges)
+        columns.append(t.face_vertices[half_edges])
+    last = t.face_vertices[t.following(half_edges[-1:])]
+    return np.concatenate([t.face_vertices[:1], np.stack(columns, axis=1).ravel(), last])
 
 
 def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | None:
@@ -95,7 +135,72 @@ def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | N
     if np.abs(waves.dual @ (matrix @ rest)).max() > SAME_WEIGHTS:
         return None
     of_rest, to_rest = rest.T @ matrix @ rest, (rest.T @ matrix) @ waves.vectors
-    is_separate = _separate(waves, to_rest, np.linalg.eigvals(of_rest))
+    found = _completed(matrix, waves, rest, _separate(waves, to_rest, np.linalg.eigvals(of_rest)))
+    require_basis(matrix, found, _probes(len(matrix), PROBES))
+    return found
+
+
+def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
+    """Eigenbasis of a subdivision matrix of a face of a fan, by that of the fan's ring, which is found once.
+
+    None if the ring depends on other points.
+
+    Parameters
+    ----------
+    matrix : (K, K) float64
+        As for `eigenbasis`.
+    ring : (r,) int
+        Control points of the ring, in the order of `fan_ring`.
+
+    Raises
+    ------
+    EigenbasisError
+        As `eigenbasis`.
+    """
+    outside = np.setdiff1d(np.arange(len(matrix)), ring)
+    if not len(outside) or matrix[np.ix_(ring, outside)].any():
+        return None
+    of_ring = _ring_basis(_RingMatrix(matrix[np.ix_(ring, ring)]))
+    waves = _Waves(np.zeros((len(matrix), len(ring))), np.zeros((len(ring), len(matrix))), of_ring.eigenvalues.copy())
+    waves.vectors[ring], waves.dual[:, ring] = of_ring.vectors, of_ring.inverse
+    rest = np.eye(len(matrix))[:, outside]
+    of_outside = np.linalg.eigvals(matrix[np.ix_(outside, outside)])
+    is_separate = np.abs(waves.eigenvalues[:, None] - of_outside).min(axis=1) >= SEPARATE
+    is_separate[0] = False
+    for place, _ in of_ring.blocks:
+        is_separate[place] = False
+    found = _completed(matrix, waves, rest, is_separate)
+    require_basis(matrix, found, _probes(len(matrix), PROBES_OF_FACE))
+    return found
+
+
+def _probes(size: int, count: int) -> FloatArray:
+    return np.random.default_rng(0).choice([-1.0, 1.0], (size, count))
+
+
+class _RingMatrix:
+    """The subdivision matrix of a ring; equal to others but for rounding."""
+
+    def __init__(self, matrix: FloatArray) -> None:
+        self.matrix = matrix
+        self._digits = matrix.round(SAME_DIGITS).tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _RingMatrix) and self._digits == other._digits
+
+    def __hash__(self) -> int:
+        return hash(self._digits)
+
+
+# Fans of very many faces have bases of some megabytes.
+@lru_cache(maxsize=8)
+def _ring_basis(ring: _RingMatrix) -> Eigenbasis:
+    return eigenbasis(ring.matrix)
+
+
+def _completed(matrix: FloatArray, waves: _Waves, rest: FloatArray, is_separate: NDArray[np.bool_]) -> Eigenbasis:
+    """The basis made of separate waves, and of all others together with the rest."""
+    of_rest, to_rest = rest.T @ matrix @ rest, (rest.T @ matrix) @ waves.vectors
     # A wave and what it makes of the rest: (T - of_rest) Y = to_rest for its eigenvalue T.
     systems = waves.eigenvalues[is_separate, None, None] * np.eye(len(of_rest)) - of_rest
     in_rest = np.linalg.solve(systems, to_rest[:, is_separate].T[..., None])[..., 0].T
@@ -106,9 +211,7 @@ def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | N
     others = np.hstack([rest, waves.vectors[:, ~is_separate]])
     others_dual = np.vstack([rest.T - in_rest @ separate.dual, waves.dual[~is_separate]])
     small = eigenbasis(others_dual @ matrix @ others, constant=others_dual.sum(axis=1))
-    found = _joined(small, others, others_dual, separate)
-    require_basis(matrix, found, np.random.default_rng(0).choice([-1.0, 1.0], (len(matrix), PROBES)))
-    return found
+    return _joined(small, others, others_dual, separate)
 
 
 @dataclass(frozen=True, eq=False)

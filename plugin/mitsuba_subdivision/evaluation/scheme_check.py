@@ -14,8 +14,8 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes import add_scheme
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.members import has_phantom_points, in_brief, optional_member, require_members, unsupported_parts
 from ..schemes.scheme import Refinement, Scheme, SchemeError
+from ..schemes.scheme_members import has_phantom_points, in_brief, optional_member, require_members, unsupported_parts
 from ..schemes.stencil_table import StencilTable
 from .irregular_patch import irregular_patch
 from .occupied_pieces import OccupiedPieces
@@ -24,7 +24,7 @@ from .refined_rings import refined_children
 
 # Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
-# Elements of so many corners are tried as well, if the scheme states that it supports them.
+# Elements of this many corners are tried as well, if the scheme states that it supports them.
 OTHER_SIZES = (3, 4, 5)
 # Tolerance of the distance between a regular patch and its refinement.
 SAME_SURFACE = 1e-12
@@ -165,10 +165,10 @@ def _require_derivatives(scheme: Scheme) -> None:
         error = np.abs(scheme.regular_basis(inner, derivatives) - full[:count]).max()
         same = f"other weights with {derivatives} derivatives than with 2"
         _require(error <= SAME_WEIGHTS[full.dtype], scheme, "regular_basis", same, "the same")
-    for place, of, by, name in DIFFERENCES:
+    for derivative, of, by, name in DIFFERENCES:
         ahead, behind = (scheme.regular_basis(inner + step * np.eye(2)[by], 1)[of] for step in (STEP, -STEP))
         slope = (ahead - behind) / (2 * STEP)
-        error = np.abs(slope - full[place]).max()
+        error = np.abs(slope - full[derivative]).max()
         is_right = error <= SAME_SLOPE * max(1, np.abs(slope).max())
         _require(is_right, scheme, "regular_basis", f"a {name} wrong by {error:.1e}", "the derivatives of its values")
 
@@ -263,21 +263,21 @@ def _inner(scheme: Scheme) -> FloatArray:
 
 def _require_basis_to_fit(scheme: Scheme, signature: Signature) -> None:
     """Check that a regular patch, also one on a border, and its refinement are the same surface."""
-    regular, place = regular_signature(scheme), ""
+    regular, where = regular_signature(scheme), ""
     if signature != regular:
-        place = f" with the phantom points, at a face with fans {signature.fans},"
+        where = f" with the phantom points, at a face with fans {signature.fans},"
     lattice = lattice_stencils(scheme, signature)
     # The stencils of the parent's surface and of its children's, at the same points.
     inner = _inner(scheme)
     for number, (domain, child, stencils) in enumerate(refined_children(scheme, signature)):
-        fine_lattice = lattice_stencils(scheme, child) if place or child == regular else None
+        fine_lattice = lattice_stencils(scheme, child) if where or child == regular else None
         if fine_lattice is None:
-            raise SchemeError(f"{scheme.name}:{place} child {number} of a regular element is not regular")
+            raise SchemeError(f"{scheme.name}:{where} child {number} of a regular element is not regular")
         coarse = scheme.regular_basis(domain.inverse()(inner), 0)[0] @ lattice
         fine = scheme.regular_basis(inner, 0)[0] @ fine_lattice @ stencils
         error = np.abs(coarse - fine).max()
         if not error <= SAME_SURFACE:
             raise SchemeError(
-                f"{scheme.name}:{place} the regular basis does not fit the rules: child {number} of a regular patch is "
+                f"{scheme.name}:{where} the regular basis does not fit the rules: child {number} of a regular patch is "
                 f"another surface, by {error:.1e} in the weights; expected below {SAME_SURFACE:.0e}"
             )

@@ -19,8 +19,8 @@ from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 from .eigenbasis import Eigenbasis
 from .equations import limit_rows, times_powers
 
@@ -174,10 +174,10 @@ def _lone_face_frame(point: _Point) -> FloatArray:
     basis = point.basis
     inward = np.zeros(len(basis.vectors))
     inward[2] = 1
-    for place, block in basis.blocks:
-        if place.start <= 2 < place.stop:
+    for block_slice, block in basis.blocks:
+        if block_slice.start <= 2 < block_slice.stop:
             nilpotent = block - basis.eigenvalues[2] * np.eye(len(block))
-            inward[place] = nilpotent[np.argmax(np.abs(nilpotent).sum(axis=1))]
+            inward[block_slice] = nilpotent[np.argmax(np.abs(nilpotent).sum(axis=1))]
     # Towards the other vertices of the face, which is the ring's first.
     topology = point.ring.topology
     others = topology.face_vertices[1 : topology.face_sizes[0]]

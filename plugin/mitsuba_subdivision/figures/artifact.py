@@ -119,9 +119,9 @@ def draw(options: FigureOptions) -> list[Path]:
         for rule, axis in zip(RULES, row_axes, strict=True):
             vertex = vertex_normal(row, rule)
             pixels, overlay = _render(row, rule, options)
-            place, error = _caption(row, rule, vertex)
-            options.report(f"valence {row.valence}, {rule.title}: {place}; {error}")
-            _draw_panel(axis, pixels, overlay, f"{place.replace('c1', 'c$_1$')}\n{error}")
+            location, error = _caption(row, rule, vertex)
+            options.report(f"valence {row.valence}, {rule.title}: {location}; {error}")
+            _draw_panel(axis, pixels, overlay, f"{location.replace('c1', 'c$_1$')}\n{error}")
             panels.append(pixels)
             records.append({"valence": row.valence, "rule": rule.title, **vars(vertex)})
         row_axes[0].set_ylabel(f"valence {row.valence}", fontsize=11)
@@ -138,12 +138,14 @@ def draw(options: FigureOptions) -> list[Path]:
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
     """Label with the sample location of the vertex and the error of its normal."""
-    place = "u = v = 0" if vertex.level is None else f"u = v = {rule.sample_offset(row):.0e}, level n = {vertex.level}"
+    location = (
+        "u = v = 0" if vertex.level is None else f"u = v = {rule.sample_offset(row):.0e}, level n = {vertex.level}"
+    )
     if vertex.error >= 0.1:
         size = f"{vertex.error:.1f}°"
     else:
         size = f"{vertex.error:.0e}°" if vertex.error >= NEGLIGIBLE else f"below {NEGLIGIBLE:.0e}°"
-    return f"{place}, |c1| = {vertex.offset:.1f}", f"normal error at the vertex {size}"
+    return f"{location}, |c1| = {vertex.offset:.1f}", f"normal error at the vertex {size}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ CORE, SHARPNESS_OF_ARMS = 0.45, 9
 RADIUS, DIAGONAL = 0.6, 2.2
 # How often a cube is halved to be the cage, the mesh, and the target.
 COARSE, DENSE, FINE = 2, 5, 6
-# λ of large steps, and how far Adam goes at first and at last, in diagonals: of some rates, those that came nearest.
+# λ of large steps, and Adam's first and last learning rates, in diagonals: the best of several.
 SMOOTHING, MESH_SMOOTHING = 1.0, 19.0
 RATES, MESH_RATES = (0.1, 0.006), (0.25, 0.01)
 # How often distances are measured; samples of each surface.
@@ -55,7 +55,7 @@ LIGHTS = {
 
 @dataclass(eq=False)
 class Course:
-    """What a fit came through.
+    """The course of a fit.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ def ball_cage(halvings: int, radius: float) -> ControlCage:
 
 
 def integrator(spp: int, edge_spp: int) -> SceneNode:
-    """What renders with gradients, also of outlines."""
+    """The integrator, with gradients of outlines, too."""
     return {"type": "direct_projective", "sppi": 0, "sppc": spp, "sppp": edge_spp}
 
 
@@ -105,8 +105,8 @@ def views_of(shape: mi.Shape, pixels: int = PIXELS) -> list[View]:
     views = []
     for view in range(VIEWS):
         angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
-        place = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
-        to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
+        origin = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+        to_world = mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 0, 1])
         sensor = {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
         picture = mi.render(scene, sensor=mi.load_dict(sensor), spp=TARGET_SPP, seed=view)  # type: ignore[arg-type]
         views.append(View(sensor, picture))

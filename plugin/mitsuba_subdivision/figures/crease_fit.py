@@ -21,7 +21,7 @@ HIGHEST = 3
 PIXELS, SPP, EDGE_SPP = 64, 16, 2
 # Sharpness of all edges at first.
 FIRST = 0.5
-# How far Adam goes at first and at last: control points, in diagonals, and sharpness.
+# Adam's first and last learning rates: of control points, in diagonals, and of sharpness.
 RATES, SHARPNESS_RATES = (0.02, 0.001), (0.3, 0.02)
 # Segments of the cage's edges in pictures.
 RATE = 8

@@ -60,8 +60,8 @@ def draw(options: FigureOptions) -> list[Path]:
         innermost = sub_domain(scheme.domain, LEVELS - 1, 0)
         axis.fill(*innermost.T, facecolor="#d9d9d9", edgecolor="#2d3a45", linewidth=0.35)
         axis.plot(0, 0, "o", color="#c8432b", markersize=5, clip_on=False, zorder=5)
-        for place, text, align in (((0.5, -0.045), "u", "center"), ((-0.045, 0.5), "v", "center")):
-            axis.text(*place, f"${text}$", fontsize=13, ha=align, va="center")
+        for position, text, align in (((0.5, -0.045), "u", "center"), ((-0.045, 0.5), "v", "center")):
+            axis.text(*position, f"${text}$", fontsize=13, ha=align, va="center")
         for end in (0, 1):
             axis.text(end, -0.045, f"{end}", ha="center", va="center")
             axis.text(-0.035, end, f"{end}", ha="center", va="center")

@@ -1,4 +1,4 @@
-"""What all figures share: their options, the folder of the scenes, matplotlib, and how files are written."""
+"""Parts that all figures share: their options, the folder of the scenes, matplotlib, and how files are written."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class FigureOptions:
     Attributes
     ----------
     output : Path
-        Folder to write to; made if it is not there.
+        Folder to write to; created if it is missing.
     resolution : int
         Width of a rendered image in pixels.
     spp : int

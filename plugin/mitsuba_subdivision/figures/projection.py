@@ -38,9 +38,9 @@ def visible(scene: mi.Scene, points: NDArray[np.float64]) -> NDArray[np.bool_]:
 def visible_runs(scene: mi.Scene, lines: NDArray[np.float64], resolution: int) -> list[NDArray[np.float64]]:
     """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
-    places = project(scene.sensors()[0], lines, resolution)
+    positions = project(scene.sensors()[0], lines, resolution)
     runs = []
-    for line, shown in zip(places, seen, strict=True):
+    for line, shown in zip(positions, seen, strict=True):
         for run in np.split(np.arange(len(line)), 1 + np.flatnonzero(np.diff(shown))):
             if shown[run[0]] and len(run) > 1:
                 runs.append(line[run])

@@ -105,7 +105,7 @@ def _require_own_indices(mesh: CageContents) -> None:
     In the joined arrays, such an index would mean a part of another mesh, and the data of all later meshes would begin
     too early or too late.
     """
-    place, vertex_count, face_count = mesh.source.name, len(mesh.positions), len(mesh.face_sizes)
+    source, vertex_count, face_count = mesh.source.name, len(mesh.positions), len(mesh.face_sizes)
     corner_count = len(mesh.face_vertices)
     for what, indices, count in (
         ("face corners", mesh.face_vertices, vertex_count),
@@ -113,10 +113,10 @@ def _require_own_indices(mesh: CageContents) -> None:
         ("corners", mesh.corners[:, 0], vertex_count),
         ("holes", mesh.holes, face_count),
     ):
-        require_range(indices, count, f"{place}: {what} have")
+        require_range(indices, count, f"{source}: {what} have")
     data = {**mesh.attributes, **({} if mesh.texcoords is None else {"texcoords": mesh.texcoords})}
     for name, attribute in data.items():
-        where = f'{place}: attribute "{shortened(name)}" has'
+        where = f'{source}: attribute "{shortened(name)}" has'
         if attribute.indices is not None:
             require_range(attribute.indices, len(attribute.values), where)
         is_face_varying = attribute.interpolation == "face_varying"

@@ -44,7 +44,7 @@ def read_primvars(
     mesh: UsdGeom.Mesh,
     value: Callable[[Usd.Attribute], Any],
     array: Callable[[Usd.Attribute, type], NDArray],
-    place: str,
+    location: str,
     order: IntArray | None,
     choice: PrimvarChoice | None = None,
 ) -> tuple[Attribute | None, dict[str, Attribute]]:
@@ -61,7 +61,7 @@ def read_primvars(
         From a USD attribute to its value at the time that is read.
     array : function
         From a USD attribute and a type of numbers to such a value as an array.
-    place : str
+    location : str
         Beginning of messages.
     order : (n_h,) int64, optional
         If the orientation of faces is reversed: which face corner of the file becomes each face corner.
@@ -97,18 +97,18 @@ def read_primvars(
         table = _table(value(primvar.GetAttr()), primvar.GetElementSize())
         if choice and table is not None and interpolation == UsdGeom.Tokens.uniform:
             sizes = array(mesh.GetFaceVertexCountsAttr(), np.int64)
-            found[name] = _of_faces(primvar, table, array, sizes, f'{place}: primvar "{shortened(name)}"')
+            found[name] = _of_faces(primvar, table, array, sizes, f'{location}: primvar "{shortened(name)}"')
             continue
         if table is None or interpolation not in INTERPOLATIONS:
             left_out.append(f'"{name}" ({kind}, {interpolation})')
             continue
-        where = f'{place}: primvar "{shortened(name)}"'
+        where = f'{location}: primvar "{shortened(name)}"'
         indices = array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
         found[name] = _attribute(table, INTERPOLATIONS[interpolation], indices, order, where)
         types[name] = kind
     if left_out:
         shown = shortened(", ".join(left_out), 200)
-        warn(f"{place}: primvars {shown} left out; expected floats, at vertices or face corners")
+        warn(f"{location}: primvars {shown} left out; expected floats, at vertices or face corners")
     by_type = [name for name, kind in types.items() if kind.startswith("texCoord2")]
     preferred = choice.texcoords if choice else ()
     pairs = (name for name in (*preferred, *TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2)

@@ -92,12 +92,12 @@ def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: M
     with usd_errors_at(name), usd_messages_of(name):
         stage = open_stage(path, name)
         meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
-        places = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
+        locations = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
     found = []
-    for mesh, place in zip(meshes, places, strict=True):
-        # When the cage is validated, numbers that are not finite become errors that name their place.
-        with usd_errors_at(place), np.errstate(over="ignore", invalid="ignore"):
-            found.append(MeshReader(mesh, place, time, rules).contents())
+    for mesh, location in zip(meshes, locations, strict=True):
+        # When the cage is validated, numbers that are not finite become errors that name their location.
+        with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
+            found.append(MeshReader(mesh, location, time, rules).contents())
     return found
 
 
@@ -107,17 +107,17 @@ class MeshReader:
     Parameters
     ----------
     mesh : UsdGeom.Mesh
-    place : str
+    location : str
         Beginning of messages.
     time, rules
         As for `read_usd`.
     """
 
     def __init__(
-        self, mesh: UsdGeom.Mesh, place: str, time: float | None, rules: Mapping[str, str] | None = None
+        self, mesh: UsdGeom.Mesh, location: str, time: float | None, rules: Mapping[str, str] | None = None
     ) -> None:
         self.mesh = mesh
-        self.place = place
+        self.location = location
         self.time = time
         self.rules = rules or {}
 
@@ -155,7 +155,7 @@ class MeshReader:
             points = points @ matrix[:3, :3] + matrix[3, :3]
         creases, corners, holes = self.creases(), self.corners(), self.array(mesh.GetHoleIndicesAttr(), np.int64)
         rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
-        texcoords, attributes = read_primvars(mesh, self.value, self.array, self.place, order, choice)
+        texcoords, attributes = read_primvars(mesh, self.value, self.array, self.location, order, choice)
         return CageContents(
             points,
             sizes,
@@ -167,11 +167,11 @@ class MeshReader:
             attributes=attributes,
             rules=rules,
             scheme=None if is_local and self.is_flat() else self.scheme(),
-            source=CageSource(self.place),
+            source=CageSource(self.location),
         )
 
     def error(self, problem: str, expected: str) -> CageError:
-        return CageError(f"{self.place}: {problem}; expected {expected}")
+        return CageError(f"{self.location}: {problem}; expected {expected}")
 
     def value(self, attribute: Usd.Attribute) -> Any:
         """Value of an attribute at `time_of` it."""
@@ -249,7 +249,7 @@ class MeshReader:
                 )
             return SCHEMES[asked]
         if SCHEMES.get(asked) != given:
-            warn(f'{self.place}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
+            warn(f'{self.location}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
         return given
 
     def creases(self) -> NDArray[np.float64]:
@@ -312,8 +312,8 @@ class MeshReader:
 
 def reversed_order(sizes: IntArray) -> IntArray:
     """Order of face corners that reverses the orientation of all faces and keeps their first vertices."""
-    place = ragged.places(sizes)
-    return np.arange(len(place)) - place + -place % np.repeat(sizes, sizes)
+    index = ragged.index_in_row(sizes)
+    return np.arange(len(index)) - index + -index % np.repeat(sizes, sizes)
 
 
 def _first(attribute: Usd.Attribute) -> Any:

@@ -1,4 +1,4 @@
-"""Fitting: cages whose surfaces look like pictures, or lie where points do."""
+"""Fitting: control cages from pictures, points or dense meshes."""
 
 from .cage_fit import CageFit
 from .large_steps import LargeSteps

@@ -25,9 +25,9 @@ from .regularizers import device_regularizer
 from .schedule import Schedulable, Schedule
 from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 
-# What the optimiser calls the coordinates of the control points.
+# The optimiser's name of the coordinates of the control points.
 U = "u"
-# What it calls the sharpness of creases.
+# Its name of the sharpness of creases.
 SHARPNESS = "sharpness"
 # Parameters of the scene that are attributes of the cage begin with this.
 CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
@@ -46,7 +46,7 @@ class CageFit(Fit):
         Where to begin. Its topology, tags and rules stay, but for refinement.
     views : sequence of View
     scene : dict
-        What there is in the pictures besides the surface, as for ``mi.load_dict``: emitters, other shapes, and the
+        The scene besides the surface, as for ``mi.load_dict``: emitters, other shapes, and the
         integrator if it is not to be ``direct_projective``.
     shape : dict, optional
         Parameters of the shape besides its cage, such as its ``bsdf`` and ``tessellation_rate``, 4 by default.
@@ -63,17 +63,17 @@ class CageFit(Fit):
         Whose Laplacian smooths steps: that of the cage's edges, or of the limit surface where the fit begins.
     sharp_edges : (n, 2) array of int, optional
         0-based ends of edges whose sharpness is fitted as well, from that which ``cage`` has. When the cage is refined,
-        their halves have what is left of it: one less, or 0.
+        their halves have one less, or 0.
     crease_of : (n,) array of int, optional
         Which crease each of these edges belongs to, 0-based: edges of a crease have one sharpness, which begins as the
         mean of theirs. By default each edge is a crease of its own.
     highest_sharpness : int
-        What sharpness is found up to, 1 to 6; one less after each refinement, but 1 at least. The shape's cage is then
+        Upper bound of the sharpness, 1 to 6; one less after each refinement, but 1 at least. The shape's cage is then
         one that is refined as often: see `VariableSharpness`.
     sharpness_rate : float or schedule
         How far a step moves a sharpness at most, about.
     regularizers : dict of str to float or schedule, optional
-        Weights of what keeps the cage even: "laplacian" (of the cage), "bending" (of the limit surface), "anchor"
+        Weights of terms that keep the cage even: "laplacian" (of the cage), "bending" (of the limit surface), "anchor"
         (where the points began) and "folds" (of faces onto their neighbours).
     others : dict of str to float or schedule, optional
         Learning rates of other parameters of the scene, by their names in `mi.traverse`. The shape's begin with
@@ -229,7 +229,7 @@ class CageFit(Fit):
         return {name: dr.detach(self._others[name]) for name in self._other_rates if name != SHARPNESS}
 
     def _points(self) -> dr.ArrayBase:
-        """Flat control points, computed from what the optimiser moves."""
+        """Flat control points, computed from the optimiser's variables."""
         u = self._optimizer[U]
         return u if self._steps is None else self._steps.from_differential(u)
 
@@ -257,7 +257,7 @@ class CageFit(Fit):
     def _states(self) -> dict[str, State]:
         others = {f"other {name}": adam_state(self._others, name) for name in self._other_rates}
         if self._variable is not None:
-            # What the cage was refined to depends on the sharpness of that time.
+            # The refined cage depends on the sharpness at that time.
             others["start"] = {"positions": self._start.positions, "sharpness": self._variable.initial}
         return {"points": adam_state(self._optimizer, U), **others}
 

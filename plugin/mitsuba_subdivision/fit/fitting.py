@@ -1,4 +1,4 @@
-"""What all fits of cages have in common: steps, refinement on the way, checkpoints."""
+"""The base of all fits of cages: steps, refinement on the way, checkpoints."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .checkpoint import Checkpoint, State
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# A loss has stopped falling when its mean over so many steps is within this part of that over as many before.
+# A loss has stopped falling when its mean over this many steps is within this part of that over as many before.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
 
@@ -54,7 +54,7 @@ class Fit(ABC):
         self._refine, self._callbacks = refine, tuple(callbacks)
         self.losses: list[float] = []
         self.refinements = 0
-        # Steps since control points became more.
+        # Steps since the last refinement.
         self._since = 0
         self._scheme = scheme
         # Where its points began, refined as often.
@@ -97,7 +97,7 @@ class Fit(ABC):
         Raises
         ------
         CageError, SchemeError
-            If it is time to refine the cage and that is not possible: see `ControlCage.refinement`.
+            If the cage is due to be refined and cannot be: see `ControlCage.refinement`.
         """
         number = len(self.losses)
         if self._is_time_to_refine(number):
@@ -115,7 +115,7 @@ class Fit(ABC):
         ----------
         steps : int
         checkpoint : path, optional
-            Of a file that `save_checkpoint` writes after every so many steps, and at the end.
+            Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end.
         every : int
         """
         for number in counted(range(1, steps + 1), "Steps"):
@@ -153,7 +153,7 @@ class Fit(ABC):
         Raises
         ------
         OSError
-            If the file cannot be written; one that was there before is then unchanged.
+            If the file cannot be written; an existing one is then unchanged.
         """
         Checkpoint(self.refinements, self._since, np.array(self.losses), self._states()).save(Path(path))
 

@@ -1,7 +1,7 @@
 """Large steps: coordinates in which a gradient step moves a whole surface, not single control points.
 
 A gradient of pictures moves the few points that pictures see. In the coordinates u = (I + λ L) x, with the Laplacian L
-of a mesh [Nicolet et al. 2021], the same step moves what is around them as well: in x it is the step times
+of a mesh [Nicolet et al. 2021], the same step also moves their surroundings: in x it is the step times
 the inverse of the matrix. Here L may be that of the cage's edges, or the stiffness matrix of the limit surface.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class LargeSteps:
     """Differentiable change between control points and large-step coordinates.
 
-    It stands in for ``mitsuba.ad.LargeSteps``, which wants a mesh of triangles.
+    It stands in for ``mitsuba.ad.LargeSteps``, which requires a mesh of triangles.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class LargeSteps:
         self._factors = splu(self.matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
 
     def to_differential(self, points: dr.ArrayBase | NDArray) -> mi.Float:
-        """Large-step coordinates of control points, flat x, y, z; not differentiable, as they are found once.
+        """Large-step coordinates of control points, flat x, y, z; not differentiable, as they are computed once.
 
         Parameters
         ----------

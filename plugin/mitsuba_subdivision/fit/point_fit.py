@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 POINTS = "points"
-# Parts of the surface have no points nearby if these are further than so many times the median distance of a point from
+# Parts of the surface have no points nearby if these are further than this many median distances of a point from
 # the next one. Gaps between random points are smaller.
 NEAR = 5.0
-# How much more each control point is held where it is than points hold the mean one.
+# Weight that holds each control point where it is, relative to the mean weight of points.
 DAMPING = 1e-8
 
 
@@ -51,7 +51,7 @@ class _Pairs:
 
     @classmethod
     def joined(cls, parts: Sequence[_Pairs]) -> _Pairs:
-        """All pairs of some lists."""
+        """The pairs of several lists, concatenated."""
         from scipy import sparse
 
         weights = sparse.csr_array(sparse.vstack([part.weights for part in parts]))
@@ -82,12 +82,12 @@ class PointFit(Fit):
     scheme : str, optional
         By default that of the cage, or Catmull-Clark.
     sliding : float or schedule
-        What squared distances along the surface count, in parts of those across; 1 if pairs are not to slide.
+        Weight of squared distances along the surface, relative to those across; at 1, pairs do not slide.
     both_ways : bool
         Whether the surface is to lie at the points everywhere; not for scans with holes.
     regularizers : dict of str to float or schedule, optional
-        Weights of what keeps the cage even, in squares of the diagonal of the box around the points: "laplacian" (of
-        the cage), "bending" (of the limit surface; 1e-8 if it is not given) and "anchor" (where control points began).
+        Weights of terms that keep the cage even, in squares of the diagonal of the box around the points: "laplacian"
+        (of the cage), "bending" (of the limit surface; 1e-8 if it is not given) and "anchor" (of initial positions).
     refine : sequence of int, or int
         Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
     seed : int
@@ -162,8 +162,8 @@ class PointFit(Fit):
     def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
         """Current pairs of nearest points."""
         near = surface.closest_point(self._points)
-        everyone = np.arange(len(self._points))
-        found = [_paired(surface, near, self._points, self._normals, everyone)]
+        every_point = np.arange(len(self._points))
+        found = [_paired(surface, near, self._points, self._normals, every_point)]
         if self._tree is not None:
             samples = surface.sample(len(self._points), seed)
             distance, at = (np.array(each) for each in self._tree.query(samples.p))
@@ -210,7 +210,7 @@ def _least_squares(
     forms = pairs.forms(sliding) / count
     blocks: list[list[Any]] = [[weights.T @ weights.multiply(forms[:, i, j, None]) for j in range(3)] for i in range(3)]
     right = np.stack([weights.T @ (forms[:, i] * pairs.goals).sum(axis=1) for i in range(3)])
-    # What no point and no term holds stays where it was.
+    # Control points that no pair and no term affects stay where they are.
     damping = DAMPING * np.mean([block[i].diagonal().mean() for i, block in enumerate(blocks)])
     for axis in range(3):
         blocks[axis][axis] = blocks[axis][axis] + damping * sparse.eye_array(len(before))

@@ -40,7 +40,7 @@ MATRICES: dict[str, Callable[[LimitSurface], sparse.csr_array]] = {
 }
 # No quadratic form.
 FOLDS = "folds"
-# Those that are about the way from where control points were when the fit began.
+# Terms of the displacement from the initial control points.
 ABOUT_START = ("anchor",)
 
 

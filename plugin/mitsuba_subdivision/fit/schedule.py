@@ -10,7 +10,7 @@ import numpy as np
 
 from ..schemes.domain import FloatArray
 
-# What users may give in place of a number.
+# A number, or what users may give instead.
 Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
 
 
@@ -24,7 +24,7 @@ class Schedule:
         In increasing order of the steps, counted from 0. Between two of them, the values lie on a line; on an
         exponential, if all are positive. Before the first and after the last step they stay.
     function : callable, optional
-        Takes a step, and is asked instead.
+        Maps a step to its value, instead of ``steps`` and ``values``.
     """
 
     steps: FloatArray

@@ -11,7 +11,7 @@ from ..cage import ControlCage
 from .point_fit import PointFit
 from .triangle_samples import triangle_samples
 
-# Points on the mesh for each control point that the fit ends with, if nobody says how many.
+# Points on the mesh for each control point that the fit ends with, by default.
 POINTS_PER_CONTROL_POINT = 8
 
 

@@ -1,4 +1,4 @@
-"""Pictures that a surface is to look like, and the loss of its own pictures against them."""
+"""Target pictures of a surface, and the loss of its own pictures against them."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Pictures:
     Raises
     ------
     ValueError
-        If the variant has no derivatives, there are no views, a picture does not fit to its film, or an entry of
+        If the variant has no derivatives, there are no views, a picture does not fit its film, or an entry of
         ``scene`` has the shape's name.
     """
 

@@ -1,6 +1,6 @@
 """Images: OpenEXR files, Monte Carlo estimates of pixels, and the comparison of a render with a reference.
 
-Nothing here knows Mitsuba, so that renders of any origin can be compared. The words of `images` and of `regression`:
+This package does not use Mitsuba, so that it compares renders of any origin. Terms of `images` and `regression`:
 
 image
     An array of pixels, with the metadata of its file (`image.Image`). A render is an image of a scene.

@@ -39,7 +39,7 @@ def compare(
     Parameters
     ----------
     tiers : sequence of str, optional
-        Names in `TIERS`. By default every tier that is marked so; FLIP besides, if no tier can compare the radiance.
+        Names in `TIERS`. By default every tier with ``by_default``; FLIP besides, if no tier can compare the radiance.
     tolerances : Tolerances, optional
         By default those stored with the reference.
     suite_size : int

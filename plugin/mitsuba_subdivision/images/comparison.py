@@ -61,7 +61,7 @@ class Comparison:
         The worst of the tiers'.
     tiers : list of TierResult
     notes : list of str
-        What else there is to know: the relative error of the whole image, files that changed, a second attempt.
+        Further findings: the relative error of the whole image, files that changed, a second attempt.
     worst : WorstPixel or None
         None only if the images are equal in all that was compared.
     tolerances : Tolerances

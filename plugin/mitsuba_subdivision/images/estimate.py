@@ -17,7 +17,7 @@ class Estimate:
 
     A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
     samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
-    and a renderer need output nothing but images.
+    and a renderer needs to output images only.
 
     Attributes
     ----------

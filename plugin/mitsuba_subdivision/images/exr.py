@@ -41,7 +41,7 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
     """Write named channels into one single-part file; the file appears whole or not at all.
 
     The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
-    several and does not say so.
+    several, without a warning.
 
     Parameters
     ----------
@@ -104,9 +104,9 @@ def _quiet() -> Iterator[None]:
             yield
             return
         stack.callback(os.close, kept)
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        os.close(nowhere)
+        null_device = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null_device, 2)
+        os.close(null_device)
         stack.callback(os.dup2, kept, 2)
         yield
 

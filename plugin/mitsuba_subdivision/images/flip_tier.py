@@ -20,12 +20,12 @@ NAME = "flip"
 _ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.0, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
 _ACES_LIMIT = 0.85
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-# Stops between the brightest and the median pixel at most: more would find nothing new, and each takes its time.
+# Stops between the brightest and the median pixel at most: more would take time and show nothing new.
 _MOST_STOPS = 12
 
 
 def flip_exposures(pixels: NDArray[np.floating]) -> dict[str, float]:
-    """Exposures at which FLIP shall look at a reference, to be stored with the reference.
+    """Exposures for FLIP, chosen from a reference and stored with it.
 
     FLIP would choose them anew from each version of a reference, so that scores could not be compared, and it ends the
     whole process at a black image. As in FLIP, the first and the last exposure map the brightest and the median

@@ -27,7 +27,7 @@ class Panel:
     caption : str
         HTML.
     colour_map : str or None
-        Name in `png.MAPS`, if the report shall show a scale of colours.
+        Name in `png.MAPS`, if the report shows a scale of colours.
     ends : (str, str)
         Meanings of the first and the last colour of that scale, HTML.
     tiles : sequence of mappings

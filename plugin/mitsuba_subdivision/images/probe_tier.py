@@ -1,4 +1,4 @@
-"""The probe tier: geometry without noise, so that it sees changes that no radiance shows."""
+"""The probe tier: geometry without noise, which shows changes that radiance does not."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _compare(reference: Probe, test: Probe, tolerances: Tolerances) -> TierResul
         "uv_p999": _percentile(parameters[same_triangle]),
         "triangle_fraction": other_triangle,
     }
-    # Each measurement's name, its limit, how to say it, and its value at each pixel.
+    # Each measurement's name, limit, text, and value at each pixel.
     criteria = [
         ("mask_fraction", tolerances.mask_fraction, "of the pixels hit another shape", other_shape),
         ("element_fraction", tolerances.mask_fraction, "of the pixels hit another element", other_element),

@@ -96,7 +96,7 @@ def _panels(comparison: Comparison) -> Iterable[Panel]:
 
 
 def _flip_besides(comparison: Comparison) -> Iterable[Panel]:
-    """FLIP's panel where its tier did not run, for the eye; none where FLIP is not installed."""
+    """FLIP's panel where its tier did not run, for inspection; none where FLIP is not installed."""
     try:
         found = TIERS[FLIP].compare(comparison.reference, comparison.test, comparison.tolerances, 1)
     except ImageError:

@@ -53,7 +53,7 @@ def skipped(name: str, reason: str) -> TierResult:
 
 
 def skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
-    """Result of a tier that needs something both images should have, and that at least one of them lacks."""
+    """Result of a tier that needs data of both images that at least one of them lacks."""
     if reference is None and test is None:
         return skipped(name, f"the images have no {what}")
     return skipped(name, f"the {'reference' if reference is None else 'test'} has no {what}")

@@ -4,7 +4,7 @@ A new tier is one file and one line. The file is a module of this package with t
 reference, the test, the tolerances, and the number of scenes that share one probability of a false alarm; it returns a
 `tier.TierResult`. ``panels`` gets the reference, the test and that result; it returns the tier's panels for the report.
 The line in the table `TIERS` names the module and describes what the tier compares. The command ``compare`` and its
-help, the pytest fixture and the report read this table. A limit that users can set is, besides, a field of
+help, the pytest fixture and the report read this table. A limit that users can set is also a field of
 `tolerances.Tolerances`.
 """
 

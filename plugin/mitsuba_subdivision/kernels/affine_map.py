@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import Any
 
 import drjit as dr
 
+from .types import FloatBuffer, Matrix4, Vector3
 from .vectors import cross, dot, unit
 
 
@@ -22,11 +22,11 @@ class AffineMap:
     translation : 3-vector
     """
 
-    columns: tuple[Any, Any, Any]
-    translation: Any
+    columns: tuple[Vector3, Vector3, Vector3]
+    translation: Vector3
 
     @classmethod
-    def of(cls, matrix: Any, vector3: type) -> AffineMap:
+    def of(cls, matrix: Matrix4, vector3: type) -> AffineMap:
         """The map of a 4x4 matrix, whose last row is not used.
 
         Parameters
@@ -39,30 +39,30 @@ class AffineMap:
         x, y, z, translation = (vector3(*(matrix[row, column] for row in range(3))) for column in range(4))
         return cls((x, y, z), translation)
 
-    def point(self, point: Any) -> Any:
+    def point(self, point: Vector3) -> Vector3:
         """Map a point."""
         # The translation comes last, so that points far from the world's origin are rounded once.
         return self.direction(point) + self.translation
 
-    def direction(self, vector: Any) -> Any:
+    def direction(self, vector: Vector3) -> Vector3:
         """Map a vector without the translation."""
         return _combined(self.columns, vector)
 
-    def normal(self, normal: Any) -> Any:
+    def normal(self, normal: Vector3) -> Vector3:
         """Map the direction of a normal by the inverse transpose; reflections keep it on the outside."""
         return type(normal)(*(dot(column, normal) for column in self._inverse))
 
-    def inverse_point(self, point: Any) -> Any:
+    def inverse_point(self, point: Vector3) -> Vector3:
         """The point that is mapped to a given one."""
         # Subtract the translation first: both points may be far from the world's origin.
         return self.inverse_direction(point - self.translation)
 
-    def inverse_direction(self, vector: Any) -> Any:
+    def inverse_direction(self, vector: Vector3) -> Vector3:
         """The vector that is mapped to a given one without the translation."""
         return _combined(self._inverse, vector)
 
     @cached_property
-    def _inverse(self) -> tuple[Any, Any, Any]:
+    def _inverse(self) -> tuple[Vector3, Vector3, Vector3]:
         """Columns of the inverse of the linear map."""
         # Divided by the largest entry, so that the determinant neither overflows nor underflows.
         scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for column in self.columns for entry in column])
@@ -73,7 +73,9 @@ class AffineMap:
         return a, b, c
 
 
-def placed(positions: Any, normals: Any, matrix: Any, vector3: type) -> tuple[Any, Any]:
+def placed(
+    positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4, vector3: type
+) -> tuple[FloatBuffer, FloatBuffer]:
     """Map flat positions and unit normals; differentiable with respect to all.
 
     Parameters
@@ -82,15 +84,15 @@ def placed(positions: Any, normals: Any, matrix: Any, vector3: type) -> tuple[An
     matrix : 4x4 Dr.Jit matrix
     vector3 : type
     """
-    p: Any = dr.unravel(vector3, positions)
-    n: Any = dr.unravel(vector3, normals)
+    p: Vector3 = dr.unravel(vector3, positions)
+    n: Vector3 = dr.unravel(vector3, normals)
     if dr.grad_enabled(matrix):
         matrix = dr.custom(_Spread, matrix, dr.width(p))
     to_world = AffineMap.of(matrix, vector3)
     return dr.ravel(to_world.point(p)), dr.ravel(unit(to_world.normal(n)))
 
 
-def _combined(columns: tuple[Any, Any, Any], vector: Any) -> Any:
+def _combined(columns: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
     x, y, z = columns
     return dr.fma(x, vector[0], dr.fma(y, vector[1], z * vector[2]))
 

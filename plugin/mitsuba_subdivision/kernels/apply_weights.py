@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -14,6 +14,7 @@ from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
 from .product_batch import ProductBatch
 from .sparse_matrix import SparseMatrix
+from .types import FloatBuffer, Vector3
 from .unit_normal import RoundingBound, UnitNormal
 
 if TYPE_CHECKING:
@@ -50,9 +51,9 @@ class WeightKernel:
             self._refined_count = table.refinement.shape[0]
             self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
             self._refine_transposed = SparseMatrix(table.refinement.T.tocsr(), float_type, is_relative=False)
-        self._place = self._types.indices(table.weld_target) if table.copies.size else None
+        self._weld_target = self._types.indices(table.weld_target) if table.copies.size else None
 
-    def __call__(self, control_points: Any) -> tuple[Any, Any]:
+    def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Evaluate every vertex of the tessellation.
 
         Parameters
@@ -80,7 +81,7 @@ class WeightKernel:
         )
         return self.welded(positions), normals
 
-    def evaluated(self, control_points: Any) -> EvaluatedVertices:
+    def evaluated(self, control_points: FloatBuffer) -> EvaluatedVertices:
         """Evaluate every vertex and the tangents that derivatives need, from detached control points.
 
         Raises
@@ -91,7 +92,7 @@ class WeightKernel:
         self.require_control_points(control_points)
         return EvaluatedVertices(self, *self.sampled(control_points, 4, _with_tangents))
 
-    def require_control_points(self, control_points: Any) -> None:
+    def require_control_points(self, control_points: FloatBuffer) -> None:
         """Check that a flat array has as many coordinates as the table has of control points.
 
         Raises
@@ -102,11 +103,11 @@ class WeightKernel:
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
 
-    def welded(self, positions: Any) -> Any:
+    def welded(self, positions: FloatBuffer) -> FloatBuffer:
         """The positions, with both sides of a crease equal bit by bit; see `VertexTable.weld_target`."""
-        return positions if self._place is None else self._types.gathered(positions, self._place)
+        return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
 
-    def sampled(self, control_points: Any, count: int, finish: Callable[..., tuple]) -> tuple:
+    def sampled(self, control_points: FloatBuffer, count: int, finish: Callable[..., tuple]) -> tuple:
         """Evaluate ``count`` vectors at every vertex; flat, detached.
 
         Parameters
@@ -115,7 +116,9 @@ class WeightKernel:
             Computes the vectors from a point, two tangents, and the `RoundingBound` of the tangents.
         """
         padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
-        buffers: tuple[Any, ...] = tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count))
+        buffers: tuple[FloatBuffer, ...] = tuple(
+            dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count)
+        )
 
         def emit(vertex, point, du, dv, bound):
             for buffer, value in zip(buffers, finish(point, du, dv, bound), strict=True):
@@ -125,7 +128,7 @@ class WeightKernel:
             batch.sample(padded, emit)
         return buffers
 
-    def transposed(self, values: Sequence[Any], finish: Callable[..., tuple]) -> Any:
+    def transposed(self, values: Sequence[FloatBuffer], finish: Callable[..., tuple]) -> FloatBuffer:
         """Sum weights times vectors over all vertices, per control point; flat, detached.
 
         Parameters
@@ -139,7 +142,7 @@ class WeightKernel:
         def fetch(vertex):
             return finish(*(dr.gather(self._types.vector3, value, vertex) for value in values))
 
-        sums: Any = dr.zeros(self._types.float, 3 * self._refined_count)
+        sums: FloatBuffer = dr.zeros(self._types.float, 3 * self._refined_count)
         for batch in self._batches:
             batch.add_transposed(fetch, sums)
         return sums if self._refine_transposed is None else self._refine_transposed(sums)
@@ -184,12 +187,12 @@ class EvaluatedVertices:
     """
 
     kernel: WeightKernel
-    positions: Any
-    normals: Any
-    du: Any
-    dv: Any
+    positions: FloatBuffer
+    normals: FloatBuffer
+    du: FloatBuffer
+    dv: FloatBuffer
 
-    def attached(self, control_points: Any) -> tuple[Any, Any]:
+    def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Positions and normals attached to control points, without evaluating them.
 
         Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
@@ -228,7 +231,9 @@ class _Evaluation(dr.CustomOp):
         return "WeightKernel"
 
 
-def _with_tangents(point: Any, du: Any, dv: Any, bound: RoundingBound) -> tuple[Any, Any, Any, Any]:
+def _with_tangents(
+    point: Vector3, du: Vector3, dv: Vector3, bound: RoundingBound
+) -> tuple[Vector3, Vector3, Vector3, Vector3]:
     """Point, normal and tangents. Without a normal, it, the tangents and all derivatives are zero."""
     normal = UnitNormal(du, dv, bound)
     return point, normal.value, dr.select(normal.exists, du, 0), dr.select(normal.exists, dv, 0)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
 from .element_walk import ElementWalk, Location
+from .types import Float, Index, Mask, Vector2
 
 if TYPE_CHECKING:
-    from ..patches import SamplePlaces
+    from ..patches import SamplingCells
 
 
 class AreaSampler:
@@ -19,27 +20,27 @@ class AreaSampler:
 
     Parameters
     ----------
-    places : SamplePlaces
+    cells : SamplingCells
     types : ArrayTypes
     walk : ElementWalk
         Over the surface's elements.
     """
 
-    def __init__(self, places: SamplePlaces, types: ArrayTypes, walk: ElementWalk) -> None:
+    def __init__(self, cells: SamplingCells, types: ArrayTypes, walk: ElementWalk) -> None:
         self._types, self._walk = types, walk
-        self._count = len(places.areas)
+        self._count = len(cells.areas)
         precision = np.float64 if types.is_double else np.float32
         # Probabilities are differences of the rounded cumulative sums.
-        until = (np.cumsum(places.areas) / places.areas.sum()).astype(precision)
+        until = (np.cumsum(cells.areas) / cells.areas.sum()).astype(precision)
         until[-1] = 1
         chances = np.diff(until.astype(np.float64), prepend=0)
-        size = np.abs(np.linalg.det(places.matrices)) * (0.5 if walk.domain.corner_count == 3 else 1)
+        size = np.abs(np.linalg.det(cells.matrices)) * (0.5 if walk.domain.corner_count == 3 else 1)
         self._until = types.floats(until)
-        self._start = types.indices(places.half_edge)
-        self._matrices, self._offsets = types.floats(places.matrices), types.floats(places.offsets)
+        self._start = types.indices(cells.half_edge)
+        self._matrices, self._offsets = types.floats(cells.matrices), types.floats(cells.offsets)
         self._density = types.floats(chances / size)
 
-    def drawn(self, choice: Any, inside: Any) -> tuple[Location, Any]:
+    def drawn(self, choice: Float, inside: Vector2) -> tuple[Location, Float]:
         """Locations, and their density by the parameters of their elements.
 
         Parameters
@@ -51,7 +52,7 @@ class AreaSampler:
         """
         types = self._types
 
-        def is_before(index: Any) -> Any:
+        def is_before(index: Index) -> Mask:
             return types.fetch(types.float, self._until, index) <= choice
 
         number = types.index(dr.binary_search(0, self._count - 1, is_before))

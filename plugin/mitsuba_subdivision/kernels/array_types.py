@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alignment import aligned
+from .types import FloatBuffer, Index, IndexBuffer, Mask, Vector3
 
 # For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
@@ -75,17 +76,17 @@ class ArrayTypes:
         """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""
         return (self.float, self.vector2, self.vector3, self.vector4)[size - 1]
 
-    def indices(self, *parts: NDArray[np.integer]) -> Any:
+    def indices(self, *parts: NDArray[np.integer]) -> IndexBuffer:
         """Upload integer arrays, flattened and concatenated."""
         values = aligned(*parts, dtype=np.uint32)
         return self.index(values) if self.is_jit else values
 
-    def floats(self, values: NDArray[np.floating]) -> Any:
+    def floats(self, values: NDArray[np.floating]) -> FloatBuffer:
         """Upload an array of numbers, flattened."""
         values = aligned(values, dtype=np.float64 if self.is_double else np.float32)
         return self.float(values) if self.is_jit else values
 
-    def fetch(self, kind: type, buffer: Any, index: Any, active: Any = True) -> Any:
+    def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:
         """Gather a number or a vector from an array that `indices` or `floats` uploaded.
 
         Parameters
@@ -106,19 +107,19 @@ class ArrayTypes:
         size = dr.size_v(kind)
         return kind(buffer[size * index : size * (index + 1)])
 
-    def padded(self, flat: Any) -> Any:
+    def padded(self, flat: FloatBuffer) -> FloatBuffer:
         """Pad flat 3-vectors to four components, for packet loads."""
         if not self.is_jit:
             return np.pad(np.reshape(flat, (-1, 3)), ((0, 0), (0, 1))).ravel()
-        v: Any = dr.unravel(self.vector3, flat)
+        v: Vector3 = dr.unravel(self.vector3, flat)
         return dr.ravel(self.vector4(v.x, v.y, v.z, 0))
 
-    def packet(self, padded: Any, index: Any, active: Any = True) -> Any:
+    def packet(self, padded: FloatBuffer, index: Index, active: Mask = True) -> Vector3:
         """Fetch a padded 3-vector."""
         value = self.fetch(self.vector4, padded, index, active)
         return self.vector3(value.x, value.y, value.z)
 
-    def gathered(self, flat: Any, index: Any) -> Any:
+    def gathered(self, flat: FloatBuffer, index: IndexBuffer) -> FloatBuffer:
         """Flat x, y, z of the 3-vectors at some indices; differentiable, forward and backward."""
         return dr.ravel(dr.gather(self.vector3, flat, index))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -17,6 +17,7 @@ from .coefficient_map import CoefficientMap
 from .control_values import ControlValues, WeightedValues
 from .piece_kernel import PatchValues, Piece, PieceKernel
 from .polynomial import Monomials
+from .types import Float, FloatBuffer, Index, Mask, Value
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel
@@ -48,19 +49,19 @@ class SubdividedChannelKernel:
         coefficients = CoefficientMap.shared(table, float_type)
         self._size = size = channel.values.shape[1]
 
-        def make(values: Any) -> Any:
+        def make(values: FloatBuffer) -> FloatBuffer:
             if not types.is_jit:
                 return coefficients(np.pad(values, ((0, 0), (0, 3 - size))))
-            own: Any = values if size == 1 else dr.unravel(types.vector(size), values)
+            own: Value = values if size == 1 else dr.unravel(types.vector(size), values)
             return coefficients(dr.ravel(types.vector3(*([own] if size == 1 else own), *[0] * (3 - size))))
 
         self.values = ControlValues(channel.values, types, make)
 
-    def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
+    def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:
         """The value, and its derivatives by the parameters."""
         return _values(self, location, active)
 
-    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> Piece:
+    def piece(self, half_edge: Index, u: Float, v: Float, active: Mask = True) -> Piece:
         """The values around a location, as `PieceKernel.piece`."""
         return self._kernel.piece(self.values.flat, half_edge, u, v, active, size=self._size)
 
@@ -77,12 +78,12 @@ class BilinearPiece:
     u, v : float arrays
     """
 
-    coefficients: Sequence[Any]
+    coefficients: Sequence[Value]
     monomials: Monomials
-    u: Any
-    v: Any
+    u: Float
+    v: Float
 
-    def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
+    def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
         """See `Piece.values`."""
         value, by_u, by_v, *second = self.monomials.values(self.coefficients, self.u + du, self.v + dv, derivatives)
         return PatchValues(value, by_u, by_v, value * 0, tuple(second))
@@ -122,11 +123,11 @@ class LinearChannelKernel:
         self._monomials = Monomials(_POWERS[: 3 if self._is_triangular else 4])
         self._rows = self._types.indices(rows)
 
-    def __call__(self, location: Location, active: Any = True) -> tuple[Any, Any, Any]:
+    def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:
         """The value, and its derivatives by the parameters."""
         return _values(self, location, active)
 
-    def piece(self, half_edge: Any, u: Any, v: Any, active: Any = True) -> BilinearPiece:
+    def piece(self, half_edge: Index, u: Float, v: Float, active: Mask = True) -> BilinearPiece:
         """The values over the element or the corner of an element that a half-edge names."""
         row = self._walk.row(half_edge, active)
         following, preceding = row[FOLLOWING], row[PRECEDING]
@@ -142,7 +143,7 @@ class LinearChannelKernel:
             mixed.append((opposite - along_v) - (along_u - origin))
         return BilinearPiece([origin, along_u - origin, along_v - origin, *mixed], self._monomials, u, v)
 
-    def _at(self, half_edge: Any, active: Any, *, of_centre: bool = False) -> Any:
+    def _at(self, half_edge: Index, active: Mask, *, of_centre: bool = False) -> Value:
         types = self._types
         location = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
         row = types.fetch(types.index, self._rows, location, active)
@@ -153,7 +154,7 @@ ChannelKernel = SubdividedChannelKernel | LinearChannelKernel
 AnyChannelPiece = Piece | BilinearPiece
 
 
-def _values(kernel: ChannelKernel, location: Location, active: Any) -> tuple[Any, Any, Any]:
+def _values(kernel: ChannelKernel, location: Location, active: Mask) -> tuple[Value, Value, Value]:
     """The value of a channel, and its derivatives by the parameters."""
     u, v = dr.detach(location.u), dr.detach(location.v)
     piece = kernel.piece(location.half_edge, u, v, active)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -13,6 +14,7 @@ from ..mesh.shared import Shared
 from ..patches.piece_table import PACKET, piece_packets
 from .array_types import NO_CONFLICTS, ArrayTypes
 from .sparse_matrix import SparseMatrix
+from .types import FloatBuffer, Index, IndexBuffer, Vector3, Vector4
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -36,7 +38,7 @@ class CoefficientMap:
         """The map of a table, shared by all callers."""
         return _MAPS.get((table, float_type), lambda: cls(table, float_type))
 
-    def __call__(self, points: Any, made: Any = None) -> Any:
+    def __call__(self, points: FloatBuffer, made: FloatBuffer | None = None) -> FloatBuffer:
         """Compute the coefficients, see `PieceTable`.
 
         Parameters
@@ -75,16 +77,16 @@ class CoefficientMap:
                 rows[:, :, :3] += controls[0][:, None]
         return found.ravel()
 
-    def apply(self, points: Any) -> Any:
+    def apply(self, points: FloatBuffer) -> FloatBuffer:
         """The coefficients on a device, without derivatives."""
         types, steps = self._types, self._steps
         padded = types.padded(points if steps.refine is None else steps.refine(points))
         if steps.parts is not None:
             own, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
-            every: Any = dr.arange(types.index, steps.refined_count)
+            every: Index = dr.arange(types.index, steps.refined_count)
             dr.scatter(padded, types.fetch(types.vector4, own, every), every, mode=NO_CONFLICTS)
             steps.parts.write(own, padded)
-        found: Any = dr.zeros(types.float, PACKET * self._table.packet_count)
+        found: FloatBuffer = dr.zeros(types.float, PACKET * self._table.packet_count)
         if steps.rings is not None:
             control, packet = steps.rings
             dr.scatter(found, types.fetch(types.vector4, padded, control), packet, mode=NO_CONFLICTS)
@@ -92,10 +94,10 @@ class CoefficientMap:
             steps.pieces.write(padded, found)
         return found
 
-    def apply_transposed(self, gradient: Any) -> Any:
+    def apply_transposed(self, gradient: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from the gradient by the coefficients."""
         types, steps = self._types, self._steps
-        sums: Any = dr.zeros(types.float, PACKET * steps.point_count)
+        sums: FloatBuffer = dr.zeros(types.float, PACKET * steps.point_count)
         if steps.rings is not None:
             control, packet = steps.rings
             dr.scatter_add(sums, types.fetch(types.vector4, gradient, packet), control)
@@ -104,7 +106,7 @@ class CoefficientMap:
         if steps.parts is not None:
             dr.eval(sums)
             steps.parts.add_transposed(type(sums)(sums), sums)
-        own: Any = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
+        own: Vector4 = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
         found = dr.ravel(types.vector3(own.x, own.y, own.z))
         return found if steps.refine_transposed is None else steps.refine_transposed(found)
 
@@ -208,7 +210,7 @@ class _Blocks:
             self._row_count += len(weights) * control_count
         self.added.append((len(weights), count, first, control_count, self._weights[key][1], to, apart, step))
 
-    def rows(self, types: ArrayTypes, controls: Any) -> _Rows:
+    def rows(self, types: ArrayTypes, controls: IndexBuffer) -> _Rows:
         """Upload the blocks."""
         precision = np.float64 if types.is_double else np.float32
         weights = np.zeros((self._row_count, -(-self.width // PACKET) * PACKET), dtype=precision)
@@ -220,10 +222,10 @@ class _Blocks:
             own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
             own[:, 0, 0] += 1
         added = np.array(self.added)
-        place = ragged.places(added[:, 0])
+        index = ragged.index_in_row(added[:, 0])
         _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
         # Controls of a block's patches are as far apart as there are patches.
-        columns = [count, first, count, control_count, row + place * control_count, to + place * apart, step, 0 * to]
+        columns = [count, first, count, control_count, row + index * control_count, to + index * apart, step, 0 * to]
         return _Rows(types, self.width, np.stack(columns, axis=1), weights, controls)
 
 
@@ -244,7 +246,9 @@ class _Rows:
         Indices of control points.
     """
 
-    def __init__(self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: Any) -> None:
+    def __init__(
+        self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: IndexBuffer
+    ) -> None:
         self._types, self._width, self._controls = types, width, controls
         self._row_packets = weights.shape[1] // PACKET
         lane_count = columns[:, 0]
@@ -254,7 +258,7 @@ class _Rows:
         self._blocks = types.indices(np.concatenate([ragged.starts(lane_count)[:, None], columns[:, 1:]], axis=1))
         self._weights = types.floats(weights)
 
-    def write(self, padded: Any, found: Any) -> None:
+    def write(self, padded: FloatBuffer, found: FloatBuffer) -> None:
         """Scatter packets of all vectors, computed from the padded control points."""
         types = self._types
         control, control_count, row, packet = self._lanes()
@@ -265,7 +269,7 @@ class _Rows:
             weights = self._row(row + k)
             return k + 1, *(dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
 
-        zero: Any = dr.zeros(types.vector3, self._count)
+        zero: Vector3 = dr.zeros(types.vector3, self._count)
         start = (dr.full(types.index, 1, self._count), *(types.vector3(zero) for _ in range(self._width)))
         _, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
         sums[0] = sums[0] + origin
@@ -274,7 +278,7 @@ class _Rows:
         for i in range(0, len(numbers), PACKET):
             dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET, mode=NO_CONFLICTS)
 
-    def add_transposed(self, gradient: Any, sums: Any) -> None:
+    def add_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
         """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
         types = self._types
         control, control_count, row, packet = self._lanes()
@@ -289,25 +293,25 @@ class _Rows:
             dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
             return (k + 1,)
 
-        start: tuple[Any] = (dr.zeros(types.index, self._count),)
+        start: tuple[Index] = (dr.zeros(types.index, self._count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
-    def _lanes(self) -> tuple[Any, Any, Any, Any]:
+    def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index, Index]:
         """Per lane: a function that finds its control points, their number, its first row of weights and packet."""
         types = self._types
-        lane: Any = dr.arange(types.index, self._count)
+        lane: Index = dr.arange(types.index, self._count)
         block = types.fetch(types.index, self._block, lane)
         first_lane, first_control, patch_count, control_count = types.fetch(types.index4, self._blocks, 2 * block)
         row, first_packet, step, _ = types.fetch(types.index4, self._blocks, 2 * block + 1)
         patch = lane - first_lane
         at = first_control + patch
 
-        def control(k: Any) -> Any:
+        def control(k: Index) -> Index:
             return types.fetch(types.index, self._controls, dr.fma(k, patch_count, at))
 
         return control, control_count, row, dr.fma(patch, step, first_packet)
 
-    def _row(self, row: Any) -> list:
+    def _row(self, row: Index) -> list:
         """A row of weights, one for each vector."""
         types, count = self._types, self._row_packets
         packets = (types.fetch(types.vector4, self._weights, row * count + i) for i in range(count))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
 from .sparse_matrix import SparseMatrix
+from .types import FloatBuffer, Index, Mask, Value
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +32,7 @@ class WeightedValues:
     def __init__(self, weights: sparse.csr_array, float_type: type) -> None:
         self._weights, self._float = weights, float_type
 
-    def __call__(self, values: Any, size: int) -> Any:
+    def __call__(self, values: FloatBuffer, size: int) -> FloatBuffer:
         """The weighted values, each of `size` components: flat, or in NumPy one per row."""
         return self._weights @ values if self._float is float else dr.custom(_Product, self, values, size)
 
@@ -84,13 +85,13 @@ class ControlValues:
     """
 
     def __init__(
-        self, values: NDArray[np.floating], types: ArrayTypes, make: Callable[[Any], Any] | None = None
+        self, values: NDArray[np.floating], types: ArrayTypes, make: Callable[[FloatBuffer], FloatBuffer] | None = None
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
-        self.flat: Any = types.float() if types.is_jit else None
+        self.flat: FloatBuffer = types.float() if types.is_jit else None
         self.set(types.floats(values.ravel()))
 
-    def set(self, values: Any) -> None:
+    def set(self, values: FloatBuffer) -> None:
         """Set new values of the cage, flat. Later lookups are attached to them."""
         if not self._types.is_jit:
             given = np.array(values, dtype=np.float64).reshape(-1, self.size)
@@ -106,6 +107,6 @@ class ControlValues:
         """Whether there are derivatives by the values."""
         return self._types.is_jit and bool(dr.grad_enabled(self.flat))
 
-    def fetch(self, index: Any, active: Any = True) -> Any:
+    def fetch(self, index: Index, active: Mask = True) -> Value:
         """Gather the value at an index, where a mask is set."""
         return self._types.fetch(self._types.vector(self.size), self.flat, index, active)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
 from .lanes import Emit, Fetch, Lanes
+from .types import FloatBuffer, Index, IndexBuffer, Vector3
 
 if TYPE_CHECKING:
     from ..tessellation import Runs
 
 # One-rings are padded to a multiple of this many control points, so that few kernels serve all cages.
 CONTROL_STEP = 4
-# A lane of the transposed map sums for so many control points at most: more would compile slowly.
+# A lane of the transposed map sums for this many control points at most: more would compile slowly.
 CONTROL_BLOCK = 24
 
 
@@ -30,7 +31,7 @@ class DenseBatch:
     lane for each sample would take one for every sample and control point.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Runs, controls: Any, are_rounded: bool) -> None:
+    def __init__(self, types: ArrayTypes, runs: Runs, controls: IndexBuffer, are_rounded: bool) -> None:
         self._types = types
         self.width = padded_size(max(stencils.controls.shape[1] for stencils in runs.classes))
         self._lanes = Lanes(types, runs, controls, are_rounded)
@@ -52,7 +53,7 @@ class DenseBatch:
         self._order = types.indices(runs.samples)
         self._order_at, self._counts = types.indices(runs.starts), types.indices(runs.counts)
 
-    def sample(self, padded: Any, emit: Emit) -> None:
+    def sample(self, padded: FloatBuffer, emit: Emit) -> None:
         """See `Batch.sample`."""
         types = self._types
         patch, kind, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
@@ -75,11 +76,11 @@ class DenseBatch:
 
         samples.loop((dr.zeros(types.index, self._lanes.count),), evaluate, "apply_weights")
 
-    def add_transposed(self, fetch: Fetch, sums: Any) -> None:
+    def add_transposed(self, fetch: Fetch, sums: FloatBuffer) -> None:
         """See `Batch.add_transposed`."""
         types, block = self._types, min(self.width, CONTROL_BLOCK)
         block_count = -(-self.width // block)
-        index: Any = dr.arange(types.index, self._lanes.count * block_count)
+        index: Index = dr.arange(types.index, self._lanes.count * block_count)
         lane = index // block_count
         patch, kind, first_vertex = self._lanes.at(lane)
         samples = self._samples(kind)
@@ -98,17 +99,20 @@ class DenseBatch:
             return sample + 1, *added
 
         count = dr.width(lane)
-        start: tuple[Any, ...] = (dr.zeros(types.index, count), *(dr.zeros(types.vector3, count) for _ in columns))
+        start: tuple[Index | Vector3, ...] = (
+            dr.zeros(types.index, count),
+            *(dr.zeros(types.vector3, count) for _ in columns),
+        )
         _, *totals = samples.loop(start, add, "apply_transposed_weights")
         control = self._lanes.one_rings(patch, kind)
         for (column, is_within), total in zip(columns, totals, strict=True):
             dr.scatter_add(sums, total, control(column), is_within)
 
-    def _samples(self, kind: Any) -> _LaneSamples:
+    def _samples(self, kind: Index) -> _LaneSamples:
         per_kind = (self._counts, self._order_at, self._weights_at)
         return _LaneSamples(self, *(dr.gather(self._types.index, values, kind) for values in per_kind))
 
-    def order(self, index: Any) -> Any:
+    def order(self, index: Index) -> Index:
         """The sample, as its class counts them, at an index into the samples of all kinds, one after the other."""
         return dr.gather(self._types.index, self._order, index)
 
@@ -118,11 +122,11 @@ class _LaneSamples:
     """The samples that each lane loops over, counted from 0."""
 
     batch: DenseBatch
-    count: Any
-    order_at: Any
-    weights_at: Any
+    count: Index
+    order_at: Index
+    weights_at: Index
 
-    def weights(self, sample: Any) -> Any:
+    def weights(self, sample: Index) -> Index:
         """Index of a sample's weights."""
         return self.weights_at + self.batch.order(self.order_at + sample) * self.batch.width
 

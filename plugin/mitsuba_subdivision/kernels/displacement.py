@@ -14,11 +14,12 @@ vanishes, as at valence 3 under Catmull-Clark, that is the limit.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 
 from .piece_kernel import DIFFERENCE, PatchValues, Piece
+from .types import Float, Index, Mask, Value
 from .vectors import added, cross, dot, like, unit
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ SPANNING = 0.5
 class Heights(Protocol):
     """Heights that depend on the values of a channel."""
 
-    def __call__(self, value: Any, du: Any, dv: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
         """Heights and their derivatives by the parameters.
 
         Parameters
@@ -43,7 +44,7 @@ class Heights(Protocol):
         """
         ...
 
-    def height(self, value: Any) -> Any:
+    def height(self, value: Value) -> Float:
         """The heights alone."""
         ...
 
@@ -52,7 +53,7 @@ class Heights(Protocol):
         ...
 
 
-def displaced(surface: PatchValues, height: tuple[Any, Any, Any]) -> PatchValues:
+def displaced(surface: PatchValues, height: tuple[Float, Float, Float]) -> PatchValues:
     """Displace points of a surface along its normals.
 
     Parameters
@@ -102,14 +103,14 @@ class Displacement:
 
     channel: ChannelKernel
     heights: Heights
-    scale: Any
+    scale: Float
 
     def variables(self) -> list:
         """Arrays that derivatives reach."""
         values = [self.channel.values.flat] if self.channel.values.are_moving else []
         return [self.scale, *values, *self.heights.variables()]
 
-    def piece(self, surface: Piece, half_edge: Any, u: Any, v: Any, active: Any) -> DisplacedPiece:
+    def piece(self, surface: Piece, half_edge: Index, u: Float, v: Float, active: Mask) -> DisplacedPiece:
         """Displace the piece of the surface at a location."""
         return DisplacedPiece(surface, self.channel.piece(half_edge, u, v, active), self, active)
 
@@ -131,18 +132,18 @@ class DisplacedPiece:
     surface: Piece
     channel: AnyChannelPiece
     displacement: Displacement
-    active: Any
+    active: Mask
 
     @property
-    def magnification(self) -> Any:
+    def magnification(self) -> Float:
         """See `Piece`."""
         return self.surface.magnification
 
-    def is_inside(self, du: Any, dv: Any, tolerance: Any) -> Any:
+    def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """See `Piece.is_inside`."""
         return self.surface.is_inside(du, dv, tolerance)
 
-    def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
+    def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
         """See `Piece.values`; second derivatives are differences of the first, and have no derivatives of their own."""
         surface, channel = self.surface.values(du, dv, 2), self.channel.values(du, dv)
         height = self.displacement.heights(channel.value, channel.du, channel.dv, self.active)

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import drjit as dr
 
 from ..schemes.domain import ParameterDomain
 from .array_types import ArrayTypes
+from .types import Float, Index
 
 
-def distances(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
+def distances(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
     """Distances of parameters from each side of a domain, positive inside."""
     return (v, 1 - (u + v), u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
 
 
-def along_sides(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, ...]:
+def along_sides(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
     """Positions of parameters along each side of a domain, from the corner of the same number."""
     return (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
 
 
-def clamped(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, Any]:
+def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
     """The nearest parameters in a domain, or nearly so."""
     u, v = dr.clip(u, 0, 1), dr.clip(v, 0, 1)
     if domain.corner_count == 4:
@@ -31,8 +31,8 @@ def clamped(domain: ParameterDomain, u: Any, v: Any) -> tuple[Any, Any]:
 
 
 def in_child(
-    domain: ParameterDomain, types: ArrayTypes, u: Any, v: Any, *, is_beyond_first: bool = False
-) -> tuple[Any, Any, Any, Any]:
+    domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float, *, is_beyond_first: bool = False
+) -> tuple[Index, Float, Float, Float]:
     """The halved copy of a domain that parameters lie in.
 
     Parameters
@@ -74,7 +74,7 @@ def in_child(
     return number, inner_u, inner_v, scale
 
 
-def turned(domain: ParameterDomain, u: Any, v: Any, turn: Any) -> tuple[Any, Any]:
+def turned(domain: ParameterDomain, u: Float, v: Float, turn: Index) -> tuple[Float, Float]:
     """Parameters seen from the first corner, from those seen from corner ``turn``."""
     found_u, found_v = u, v
     if domain.corner_count == 4:
@@ -88,7 +88,7 @@ def turned(domain: ParameterDomain, u: Any, v: Any, turn: Any) -> tuple[Any, Any
     )
 
 
-def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Any) -> tuple[Any, Any, Any, Any]:
+def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tuple[Float, Float, Float, Float]:
     """Derivatives of the parameters seen from the first corner by those seen from corner ``turn``.
 
     Returns

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from ..patches.piece_table import CODE, CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
 from .array_types import ArrayTypes
 from .domain_map import along_sides, clamped, distances, turned
+from .types import Float, Index, Index4, Mask
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -26,11 +27,11 @@ class Location:
     u, v : float arrays
     """
 
-    half_edge: Any
-    u: Any
-    v: Any
+    half_edge: Index
+    u: Float
+    v: Float
 
-    def chosen(self, condition: Any, other: Location) -> Location:
+    def chosen(self, condition: Mask, other: Location) -> Location:
         """Another location where a condition holds."""
         select = dr.select
         return Location(
@@ -62,28 +63,28 @@ class ElementWalk:
         self._first = types.indices(table.patches.elements.face_offsets)
         self._all_whole = bool(table.patches.is_whole.all())
 
-    def at(self, element: Any, u: Any, v: Any, corner: Any = 0, active: Any = True) -> Location:
+    def at(self, element: Index, u: Float, v: Float, corner: Index = 0, active: Mask = True) -> Location:
         """The location in an element with parameters seen from one of its corners."""
         return Location(self.types.fetch(self.types.index, self._first, element, active) + corner, u, v)
 
-    def row(self, half_edge: Any, active: Any = True) -> Any:
+    def row(self, half_edge: Index, active: Mask = True) -> Index4:
         """The row of `PieceTable.half_edges`: the twin, the half-edge after and before in the element, and the code."""
         return self.types.fetch(self.types.index4, self._half_edges, half_edge, active)
 
-    def corner(self, half_edge: Any, active: Any = True) -> Any:
+    def corner(self, half_edge: Index, active: Mask = True) -> Index:
         """Corner of a whole element at which a half-edge begins; 0 in other elements."""
         return self.row(half_edge, active)[CODE] & CORNERS
 
-    def from_first(self, location: Location, active: Any = True) -> Location:
+    def from_first(self, location: Location, active: Mask = True) -> Location:
         """The same locations, seen from the first corner in whole elements."""
         corner = self.corner(location.half_edge, active)
         return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner))
 
-    def is_whole(self, half_edge: Any, active: Any = True) -> Any:
+    def is_whole(self, half_edge: Index, active: Mask = True) -> Mask:
         """Whether elements fit the domain."""
         return (self.row(half_edge, active)[CODE] & WHOLE) != 0
 
-    def carried(self, location: Location, active: Any = True, row: Any = None) -> Location:
+    def carried(self, location: Location, active: Mask = True, row: Index4 | None = None) -> Location:
         """Map locations whose parameters have left their element to the neighbouring element.
 
         Parameters continue as if both elements lay in a plane. They are clamped to the sides where there is no
@@ -115,7 +116,7 @@ class ElementWalk:
         u, v = clamped(self.domain, found.u, found.v)
         return Location(found.half_edge, u, v)
 
-    def is_border(self, location: Location, side: Any, active: Any = True) -> Any:
+    def is_border(self, location: Location, side: Index, active: Mask = True) -> Mask:
         """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
         row = self.row(location.half_edge, active)
         if not self._all_whole:
@@ -124,7 +125,7 @@ class ElementWalk:
             active = active & (is_spoke == False)  # noqa: E712 - an array
         return active & (self.row(self._edge_on_side(location, row, side), active)[TWIN] == NOTHING)
 
-    def _nearest_side(self, location: Location) -> tuple[Any, Any, Any]:
+    def _nearest_side(self, location: Location) -> tuple[Index, Float, Float]:
         """The side nearest to locations, their distance from it, and their position along it."""
         u, v = location.u, location.v
         (depth, *depths), (t, *ts) = distances(self.domain, u, v), along_sides(self.domain, u, v)
@@ -135,7 +136,7 @@ class ElementWalk:
             depth = dr.minimum(depth, other)
         return side, depth, t
 
-    def _edge_on_side(self, location: Location, row: Any, side: Any) -> Any:
+    def _edge_on_side(self, location: Location, row: Index4, side: Index) -> Index:
         """The half-edge on a side of elements; of corners of other elements, that on the first or the last side."""
         count = self.domain.corner_count
         corner = row[CODE] & CORNERS
@@ -147,7 +148,7 @@ class ElementWalk:
         of_corner = dr.select(side == 0, location.half_edge, row[PRECEDING])
         return dr.select((row[CODE] & WHOLE) != 0, edge, of_corner)
 
-    def _across_spoke(self, location: Location, row: Any, side: Any) -> Location:
+    def _across_spoke(self, location: Location, row: Index4, side: Index) -> Location:
         """Locations in the next or the previous corner of the same element."""
         is_next = side == 1
         return Location(
@@ -156,7 +157,7 @@ class ElementWalk:
             dr.select(is_next, 2 - location.u, location.u),
         )
 
-    def _entered(self, edge: Any, t: Any, depth: Any, active: Any) -> Location:
+    def _entered(self, edge: Index, t: Float, depth: Float, active: Mask) -> Location:
         """Locations in an element at a distance along one of its half-edges and away from it."""
         whole = Location(edge, t, depth)
         if self._all_whole:

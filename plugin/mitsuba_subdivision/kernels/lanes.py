@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from functools import reduce
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
+from .types import Float, FloatBuffer, Index, IndexBuffer, Vector3
 from .unit_normal import LEAST_EXTENT, TANGENT_ROUNDING, RoundingBound
 
 if TYPE_CHECKING:
     from ..tessellation import Runs
 
 # Receives for every lane a vertex, its point, its two tangents, and the rounding bound of the tangents.
-Emit = Callable[[Any, Any, Any, Any, RoundingBound], None]
+Emit = Callable[[Index, Vector3, Vector3, Vector3, RoundingBound], None]
 # Returns for every lane's vertex the vectors that the weights of its point and two tangents multiply.
-Fetch = Callable[[Any], tuple[Any, Any, Any]]
+Fetch = Callable[[Index], tuple[Vector3, Vector3, Vector3]]
 
 
 class Batch(Protocol):
     """Patches that one kernel evaluates."""
 
-    def sample(self, padded: Any, emit: Emit) -> None:
+    def sample(self, padded: FloatBuffer, emit: Emit) -> None:
         """Evaluate all samples.
 
         Parameters
@@ -36,7 +37,7 @@ class Batch(Protocol):
         """
         ...
 
-    def add_transposed(self, fetch: Fetch, sums: Any) -> None:
+    def add_transposed(self, fetch: Fetch, sums: FloatBuffer) -> None:
         """Apply the transposed map: add the vectors of all samples, times the weights, to the control points' sums.
 
         Parameters
@@ -68,7 +69,7 @@ class Lanes:
         Number of lanes.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Runs, controls: Any, are_rounded: bool) -> None:
+    def __init__(self, types: ArrayTypes, runs: Runs, controls: IndexBuffer, are_rounded: bool) -> None:
         self.count = len(runs.kind)
         self._index = types.index
         self._controls = controls
@@ -81,14 +82,16 @@ class Lanes:
         self._frame_weights = types.float(TANGENT_ROUNDING[dr.type_v(types.float)] * np.ravel(runs.frame_weights()))
         self._float = types.float
 
-    def at(self, lane: Any) -> tuple[Any, Any, Any]:
+    def at(self, lane: Index) -> tuple[Index, Index, Index]:
         """The patch of each lane, counted from the first of its class, its kind, and its first vertex."""
-        patch: Any = dr.gather(self._index, self._patch, lane)
-        kind: Any = dr.gather(self._index, self._kind, lane)
-        first_vertex: Any = dr.gather(self._index, self._first_vertex, lane)
+        patch: Index = dr.gather(self._index, self._patch, lane)
+        kind: Index = dr.gather(self._index, self._kind, lane)
+        first_vertex: Index = dr.gather(self._index, self._first_vertex, lane)
         return patch, kind, first_vertex
 
-    def rounding_bound(self, kind: Any, origin: Any, relative: Iterable[Any], is_turned: bool = False) -> RoundingBound:
+    def rounding_bound(
+        self, kind: Index, origin: Vector3, relative: Iterable[Vector3], is_turned: bool = False
+    ) -> RoundingBound:
         """Rounding bound of the two tangents.
 
         Parameters
@@ -101,8 +104,8 @@ class Lanes:
         is_turned : bool
             Whether the first tangent may be the one by v, and the second the one by u.
         """
-        u: Any
-        v: Any
+        u: Float
+        v: Float
         u, v = (dr.gather(self._float, self._frame_weights, 2 * kind + i) for i in (0, 1))
         if is_turned:
             u = v = dr.maximum(u, v)
@@ -111,18 +114,18 @@ class Lanes:
             extent = dr.maximum(extent, dr.abs(origin) * self._rounding)
         return RoundingBound(u, v, extent)
 
-    def one_rings(self, patch: Any, kind: Any) -> Callable[[Any], Any]:
+    def one_rings(self, patch: Index, kind: Index) -> Callable[[Index], Index]:
         """Function that finds the control points of some patches by their column in `ClassStencils.controls`.
 
         For columns past the last one, it returns the first control point.
         """
         per_part = (self._first_control, self._patch_count, self._control_count)
-        first: Any
-        patch_count: Any
-        control_count: Any
+        first: Index
+        patch_count: Index
+        control_count: Index
         first, patch_count, control_count = (dr.gather(self._index, values, kind) for values in per_part)
 
-        def control(column: Any) -> Any:
+        def control(column: Index) -> Index:
             inside = dr.select(self._index(column) < control_count, column, 0)
             return dr.gather(self._index, self._controls, first + inside * patch_count + patch)
 

@@ -11,8 +11,9 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import turned
 from .element_walk import ElementWalk, Location
-from .newton import LAST_STEP, LONGEST_STEP, over, rounding, step_along
+from .newton import LONGEST_STEP, STEP_TOLERANCE, over, rounding, step_along
 from .piece_kernel import PatchValues
+from .types import Float, Index, Mask, Vector3
 
 if TYPE_CHECKING:
     from .displacement import DisplacedPiece
@@ -47,7 +48,7 @@ class LineHits:
     """
 
     location: Location
-    kind: Any
+    kind: Index
     values: PatchValues
 
 
@@ -63,11 +64,11 @@ class Lines:
         Which lines hold their points: a point that is not on its line keeps its location on the surface.
     """
 
-    o: Any
-    d: Any
-    hold: Any = True
+    o: Vector3
+    d: Vector3
+    hold: Mask = True
 
-    def step(self, here: PatchValues) -> tuple[Any, Any]:
+    def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton's step at given values of the surface, with derivatives that follow the line."""
         du, dv = step_along(self.o - here.value, self.d, dr.detach(here.du), dr.detach(here.dv))
         return dr.select(self.hold, du, 0), dr.select(self.hold, dv, 0)
@@ -91,11 +92,11 @@ class _Round:
         The surface before the last step.
     """
 
-    d: Any
-    u: Any
-    v: Any
-    length: Any
-    is_along_surface: Any
+    d: Vector3
+    u: Float
+    v: Float
+    length: Float
+    is_along_surface: Mask
     values: PatchValues
 
 
@@ -108,7 +109,7 @@ class LineIntersection:
     - `ON_LINE`: the line. Where the surface there faces the wrong way, a step leads along the surface, to the other
       side of what the line enters or leaves.
     - `ON_NORMAL`: the point of the line that was given, along the surface's normal where the search began.
-    - `MISSED`: nothing but the surface's values where the search began.
+    - `MISSED`: only the surface's values where the search began.
 
     On borders and creases, where steps lead beyond, it holds the nearest point there.
 
@@ -125,14 +126,26 @@ class LineIntersection:
         self._types, self._walk, self._piece = types, walk, piece
         self._rounding = rounding(types)
 
-    def hits(self, p: Any, d: Any, location: Location, active: Any, max_distance: Any, facing: Any) -> LineHits:
+    def hits(
+        self, p: Vector3, d: Vector3, location: Location, active: Mask, max_distance: Float, facing: Float
+    ) -> LineHits:
         """Intersect lines with the surface; parameters as those of `SurfaceKernel.line_hits`."""
         types = self._types
 
-        def goes_on(aim: Any, *_: Any) -> Any:
+        def continues(aim: Index, *_: Any) -> Mask:
             return active & (aim < _ENDED)
 
-        def search(aim: Any, count: Any, side: Any, is_held: Any, d: Any, half_edge: Any, u: Any, v: Any, *_: Any):
+        def search(
+            aim: Index,
+            count: Index,
+            side: Float,
+            is_held: Mask,
+            d: Vector3,
+            half_edge: Index,
+            u: Float,
+            v: Float,
+            *_: Any,
+        ):
             row = self._walk.row(half_edge, active)
             piece = self._piece(half_edge, u, v, active, row)
             turns = (aim == ON_NORMAL) & (count == 0)
@@ -171,21 +184,23 @@ class LineIntersection:
         begin = (types.index(ON_LINE), types.index(0), zero, zero > 1, d, location.half_edge, location.u, location.v)
         state = (*begin, *(d * 0 for _ in range(4)))
         aim, _, _, _, _, half_edge, u, v, *values = dr.while_loop(
-            state, goes_on, search, mode=types.loops, label="line_intersection"
+            state, continues, search, mode=types.loops, label="line_intersection"
         )
         corner = self._walk.corner(half_edge, active)
         first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
         return LineHits(first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(self._walk, corner))
 
-    def _last_step(self, piece: AnyPiece, p: Any, here: PatchValues) -> Any:
+    def _last_step(self, piece: AnyPiece, p: Vector3, here: PatchValues) -> Float:
         """A step shorter than this, in parameters of a piece, is the last.
 
-        Next to extraordinary points, rounding errors exceed `LAST_STEP`.
+        Next to extraordinary points, rounding errors exceed `STEP_TOLERANCE`.
         """
         rounded = self._rounding * (dr.norm(p) + dr.norm(here.value)) * piece.magnification
-        return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), LAST_STEP, 1)
+        return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), STEP_TOLERANCE, 1)
 
-    def _steps(self, piece: AnyPiece, p: Any, d: Any, is_still: Any, turns: Any, side: Any, facing: Any) -> _Round:
+    def _steps(
+        self, piece: AnyPiece, p: Vector3, d: Vector3, is_still: Mask, turns: Mask, side: Float, facing: Float
+    ) -> _Round:
         """Newton's steps within a piece.
 
         Parameters
@@ -200,10 +215,10 @@ class LineIntersection:
         """
         types = self._types
 
-        def goes_on(left: Any, *_: Any) -> Any:
+        def continues(left: Index, *_: Any) -> Mask:
             return left > 0
 
-        def step(left: Any, d: Any, u: Any, v: Any, length: Any, is_along_surface: Any, *_: Any) -> tuple:
+        def step(left: Index, d: Vector3, u: Float, v: Float, length: Float, is_along_surface: Mask, *_: Any) -> tuple:
             here = piece.values(u, v)
             is_first = left > STEPS_IN_ROUND
             d = dr.select(is_first & turns, here.normal, d)
@@ -221,7 +236,7 @@ class LineIntersection:
             length = dr.select(is_last, length, size)
             u, v = dr.fma(du, factor, u), dr.fma(dv, factor, v)
             # After a short step, once more for the values there.
-            is_short = (size * piece.magnification < LAST_STEP) & (left > 1)
+            is_short = (size * piece.magnification < STEP_TOLERANCE) & (left > 1)
             left = dr.select(is_last | is_along_surface, 0, dr.select(is_short, 1, left - 1))
             return left, d, u, v, length, is_along_surface, here.value, here.du, here.dv, here.normal
 
@@ -229,6 +244,6 @@ class LineIntersection:
         begin = (types.index(STEPS_IN_ROUND + 1), type(d)(d), zero, zero, zero, zero > 1)
         state = (*begin, *(d * 0 for _ in range(4)))
         _, d, u, v, length, is_along_surface, *values = dr.while_loop(
-            state, goes_on, step, mode=types.loops, label="newton"
+            state, continues, step, mode=types.loops, label="newton"
         )
         return _Round(d, u, v, length, is_along_surface, PatchValues(*values))

@@ -11,8 +11,9 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import distances
 from .element_walk import ElementWalk, Location
-from .newton import LAST_STEP, LAST_STEP_DOUBLE, LONGEST_STEP, rounding
+from .newton import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
 from .piece_kernel import PatchValues, Piece
+from .types import Float, Index, Mask, Vector3
 
 # Maximum number of steps; about five are usual.
 STEPS = 40
@@ -38,12 +39,12 @@ class NearestPoints:
         Surface points that may move in all directions.
     """
 
-    p: Any
-    along_u: Any
-    along_v: Any
-    is_free: Any
+    p: Vector3
+    along_u: Float
+    along_v: Float
+    is_free: Mask
 
-    def step(self, here: PatchValues) -> tuple[Any, Any]:
+    def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton's step at given values of the surface, with derivatives that follow the nearest point."""
         away = here.value - self.p
         by_u, by_v = dr.dot(away, here.du), dr.dot(away, here.dv)
@@ -69,7 +70,7 @@ class NearestLocation:
         self._types, self._walk, self._piece = types, walk, piece
         self._domain = walk.domain
 
-    def found(self, p: Any, start: Location, active: Any = True) -> tuple[Location, NearestPoints]:
+    def found(self, p: Vector3, start: Location, active: Mask = True) -> tuple[Location, NearestPoints]:
         """Locations where the distance to points is least, at least among those nearby.
 
         Parameters
@@ -88,14 +89,24 @@ class NearestLocation:
             The directions in which the location may move.
         """
         types = self._types
-        last_step = LAST_STEP_DOUBLE if types.is_double else LAST_STEP
+        last_step = STEP_TOLERANCE_DOUBLE if types.is_double else STEP_TOLERANCE
         given_up = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
         rounded = rounding(types)
 
-        def goes_on(left: Any, *_: Any) -> Any:
+        def continues(left: Index, *_: Any) -> Mask:
             return active & (left > 0)
 
-        def go(left: Any, half_edge: Any, u: Any, v: Any, squared: Any, du: Any, dv: Any, part: Any, *_: Any) -> tuple:
+        def step(
+            left: Index,
+            half_edge: Index,
+            u: Float,
+            v: Float,
+            squared: Float,
+            du: Float,
+            dv: Float,
+            part: Float,
+            *_: Any,
+        ) -> tuple:
             aim = Location(half_edge, u + part * du, v + part * dv)
             here = self._walk.carried(aim, active)
             piece = self._piece(here.half_edge, here.u, here.v, active)
@@ -132,14 +143,14 @@ class NearestLocation:
         zero = types.float(0)
         begin = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
         state = (*begin, zero, zero, zero > 1)
-        _, half_edge, u, v, *_ = dr.while_loop(state, goes_on, go, mode=types.loops, label="nearest_location")
+        _, half_edge, u, v, *_ = dr.while_loop(state, continues, step, mode=types.loops, label="nearest_location")
         # A last step at the final location, seen from the first corner, for the direction in which it may move.
         location = self._walk.from_first(Location(half_edge, u, v), active)
         values = self._piece(location.half_edge, location.u, location.v, active).values(derivatives=2)
         _, _, along_u, along_v, is_free = self._step(location, values, values.value - p)
         return location, NearestPoints(p, along_u, along_v, is_free)
 
-    def _step(self, here: Location, values: PatchValues, away: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def _step(self, here: Location, values: PatchValues, away: Vector3) -> tuple[Float, Float, Float, Float, Mask]:
         """Newton's step, projected to a border that it would cross; the border's direction; and whether it is free."""
         types = self._types
         by_u, by_v = dr.dot(away, values.du), dr.dot(away, values.dv)
@@ -149,12 +160,12 @@ class NearestLocation:
         part = _along(values, away, by_u, by_v, first_u, first_v)
         along_u, along_v = _limited(part * first_u, part * first_v)
         # Along a border it may reach a corner, and stop there.
-        _, _, goes_on = self._direction(here, along_u, along_v)
-        first_u, first_v = dr.select(goes_on, first_u, types.float(0)), dr.select(goes_on, first_v, types.float(0))
-        along_u, along_v = dr.select(goes_on, along_u, types.float(0)), dr.select(goes_on, along_v, types.float(0))
+        _, _, may_move = self._direction(here, along_u, along_v)
+        first_u, first_v = dr.select(may_move, first_u, types.float(0)), dr.select(may_move, first_v, types.float(0))
+        along_u, along_v = dr.select(may_move, along_u, types.float(0)), dr.select(may_move, along_v, types.float(0))
         return dr.select(is_free, du, along_u), dr.select(is_free, dv, along_v), first_u, first_v, is_free
 
-    def _direction(self, here: Location, du: Any, dv: Any) -> tuple[Any, Any, Any]:
+    def _direction(self, here: Location, du: Float, dv: Float) -> tuple[Float, Float, Mask]:
         """Direction of the border that a step would cross, and whether the step is free, as it crosses none."""
         types = self._types
         inside = distances(self._domain, here.u, here.v)
@@ -177,12 +188,12 @@ def _sides(corner_count: int) -> tuple[tuple[float, float], ...]:
     return ((1, 0), (1, -1), (0, 1)) if corner_count == 3 else ((1, 0), (0, 1), (1, 0), (0, 1))
 
 
-def _limited(du: Any, dv: Any) -> tuple[Any, Any]:
+def _limited(du: Float, dv: Float) -> tuple[Float, Float]:
     factor = LONGEST_STEP / dr.maximum(dr.maximum(dr.abs(du), dr.abs(dv)), LONGEST_STEP)
     return du * factor, dv * factor
 
 
-def _forms(values: PatchValues, away: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+def _forms(values: PatchValues, away: Vector3) -> tuple[tuple[Float, Float, Float], tuple[Float, Float, Float]]:
     """First fundamental form, and the same plus the difference's components along second derivatives."""
     du, dv = values.du, values.dv
     flat = dr.squared_norm(du), dr.dot(du, dv), dr.squared_norm(dv)
@@ -190,7 +201,7 @@ def _forms(values: PatchValues, away: Any) -> tuple[tuple[Any, Any, Any], tuple[
     return flat, bent  # type: ignore[return-value]
 
 
-def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, Any]:
+def _newton(values: PatchValues, away: Vector3, by_u: Float, by_v: Float) -> tuple[Float, Float]:
     """The step that zeroes the gradient of half the squared distance."""
     (a, b, c), (h, i, j) = _forms(values, away)
     is_convex = (h > 0) & (h * j - i * i > CONVEX * a * c)
@@ -202,7 +213,7 @@ def _newton(values: PatchValues, away: Any, by_u: Any, by_v: Any) -> tuple[Any, 
     return (i * by_v - j * by_u) * inverse, (i * by_u - h * by_v) * inverse
 
 
-def _along(values: PatchValues, away: Any, by_u: Any, by_v: Any, along_u: Any, along_v: Any) -> Any:
+def _along(values: PatchValues, away: Vector3, by_u: Float, by_v: Float, along_u: Float, along_v: Float) -> Float:
     """Length of the step in a direction; zero if the direction is zero."""
     flat, bent = (
         each[0] * along_u * along_u + 2 * each[1] * along_u * along_v + each[2] * along_v * along_v

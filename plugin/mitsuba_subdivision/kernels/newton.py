@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
 from .array_types import ArrayTypes
+from .types import Float, Vector3
 from .vectors import cross
 
 # Longest step, in parameters of an element: outside its element, a polynomial may be far from the surface.
 LONGEST_STEP = 0.5
-# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square. For
-# nearest points in double precision, whose derivatives go on from there.
-LAST_STEP, LAST_STEP_DOUBLE = 3e-4, 1e-7
+# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square. The
+# second is for nearest points in double precision, which derivatives start from.
+STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE = 3e-4, 1e-7
 # Rounding error of the difference of two points, relative to their coordinates: some units in the last place.
 _ROUNDING_SINGLE, _ROUNDING_DOUBLE = 2.0**-21, 2.0**-50
 
@@ -23,14 +22,14 @@ def rounding(types: ArrayTypes) -> float:
     return _ROUNDING_DOUBLE if types.is_double else _ROUNDING_SINGLE
 
 
-def step_along(r: Any, d: Any, du: Any, dv: Any) -> tuple[Any, Any]:
+def step_along(r: Vector3, d: Vector3, du: Vector3, dv: Vector3) -> tuple[Float, Float]:
     """Components of a vector ``r`` along two tangents, after removing its component along ``d``."""
     across_v, across_u = cross(dv, d), cross(d, du)
     inverse = over(1, dr.dot(du, across_v))
     return dr.dot(r, across_v) * inverse, dr.dot(r, across_u) * inverse
 
 
-def over(value: Any, divisor: Any) -> Any:
+def over(value: Float, divisor: Float) -> Float:
     """A quotient; infinite where the divisor is zero, also in scalar variants, where Python would raise an error."""
     exists = divisor != 0
     return dr.select(exists, value / dr.select(exists, divisor, 1), dr.inf)

@@ -36,6 +36,7 @@ from .array_types import ArrayTypes
 from .domain_map import distances, in_child, turn_matrix, turned
 from .element_walk import ElementWalk
 from .polynomial import Monomials
+from .types import Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
 from .vectors import cross
 
 if TYPE_CHECKING:
@@ -68,13 +69,13 @@ class PatchValues:
         Derivatives by uu, uv and vv.
     """
 
-    value: Any
-    du: Any
-    dv: Any
-    normal: Any
-    second: tuple[Any, ...] = ()
+    value: Value
+    du: Value
+    dv: Value
+    normal: Vector3
+    second: tuple[Value, ...] = ()
 
-    def shifted(self, du: Any, dv: Any) -> PatchValues:
+    def shifted(self, du: Float, dv: Float) -> PatchValues:
         """The value and its first derivatives, with first derivatives of parameters that move; needs second ones.
 
         Derivatives do not pass through the loop over a tip's control points, and two such loops in forward mode end in
@@ -89,7 +90,7 @@ class PatchValues:
             dv=self.dv + (uv * du + vv * dv),
         )
 
-    def seen_from_first(self, walk: ElementWalk, corner: Any) -> PatchValues:
+    def seen_from_first(self, walk: ElementWalk, corner: Index) -> PatchValues:
         """First derivatives by parameters seen from the first corner, instead of from a later one."""
         a, b, c, d = turn_matrix(walk.domain, walk.types, corner)
         du, dv = d * self.du - c * self.dv, a * self.dv - b * self.du
@@ -112,9 +113,9 @@ class Tip:
         Where derivatives do not serve as tangents; None where they always do.
     """
 
-    control_count: Any
-    ring: Any
-    row: Any
+    control_count: Index
+    ring: Index
+    row: Index
     frame: TipFrame | None
 
 
@@ -130,9 +131,9 @@ class TipFrame:
         Where they are; and where they are those of `uneven_frame`.
     """
 
-    row: Any
-    is_needed: Any
-    is_uneven: Any
+    row: Index
+    is_needed: Mask
+    is_uneven: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,16 +159,16 @@ class Piece:
     """
 
     kernel: PieceKernel
-    buffer: Any
-    coefficients: list[list[Any]]
-    s: Any
-    t: Any
-    jacobian: tuple[Any, Any, Any, Any]
-    magnification: Any
+    buffer: FloatBuffer
+    coefficients: list[list[Float]]
+    s: Float
+    t: Float
+    jacobian: tuple[Float, Float, Float, Float]
+    magnification: Float
     tip: Tip | None
     size: int = 3
 
-    def is_inside(self, du: Any, dv: Any, tolerance: Any) -> Any:
+    def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """Whether parameters so far on are in the piece, or no further outside than a tolerance."""
         s, t = self._parameters(du, dv)
         least, *others = distances(self.kernel.domain, s + self.kernel.centre[0], t + self.kernel.centre[1])
@@ -175,7 +176,7 @@ class Piece:
             least = dr.minimum(least, other)
         return least >= -tolerance
 
-    def values(self, du: Any = 0, dv: Any = 0, derivatives: int = 1) -> PatchValues:
+    def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
         """Evaluate the piece.
 
         Parameters
@@ -209,13 +210,13 @@ class Piece:
             ]
         return PatchValues(value, found_u, found_v, normal, tuple(second))
 
-    def _parameters(self, du: Any, dv: Any) -> tuple[Any, Any]:
+    def _parameters(self, du: Float, dv: Float) -> tuple[Float, Float]:
         a, b, c, d = self.jacobian
         return self.s + (a * du + b * dv), self.t + (c * du + d * dv)
 
     def _with_tip(
-        self, tip: Tip, value: Any, by: list, s: Any, t: Any, derivatives: int
-    ) -> tuple[Any, list, tuple[Any, Any, Any] | None]:
+        self, tip: Tip, value: Value, by: list, s: Float, t: Float, derivatives: int
+    ) -> tuple[Value, list, tuple[Mask, Value, Value] | None]:
         """Add the point and the derivatives at deeper levels to those of pieces.
 
         Also gives where a frame is needed, and its tangents by s and t.
@@ -223,10 +224,10 @@ class Piece:
         kernel, types = self.kernel, self.kernel.types
         evaluate, frame = kernel.monomials.values, tip.frame
 
-        def control(packet: Any, active: Any = True) -> Any:
+        def control(packet: Index, active: Mask = True) -> Value:
             return kernel.control(self.buffer, packet, self.size, active)
 
-        def add(k: Any, power: Any, slow_s: Any, slow_t: Any, *sums: Any) -> tuple:
+        def add(k: Index, power: Float, slow_s: Float, slow_t: Float, *sums: Value) -> tuple:
             row, of_frame = kernel.weights(tip.row + k), []
             of_value, *of = evaluate(row, s, t, derivatives)
             if frame is not None:
@@ -317,7 +318,14 @@ class PieceKernel:
         return _KERNELS.get((table, float_type, use_stam), lambda: cls(table, float_type, use_stam=use_stam))
 
     def piece(
-        self, buffer: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None, size: int = 3
+        self,
+        buffer: FloatBuffer,
+        half_edge: Index,
+        u: Float,
+        v: Float,
+        active: Mask = True,
+        row: Index4 | None = None,
+        size: int = 3,
     ) -> Piece:
         """The piece in which parameters lie.
 
@@ -331,13 +339,13 @@ class PieceKernel:
             Inside the domain, seen from the half-edge.
         active : mask
         row : index array, optional
-            `ElementWalk.row` of the half-edges, for those who know it.
+            `ElementWalk.row` of the half-edges, if it is known.
         size : int
             How many of a coefficient's three numbers are wanted.
         """
         types, domain = self.types, self.domain
         if types.is_jit:
-            # What is asked once more while derivatives pass is to find the array that it found first, whatever the
+            # Dr.Jit evaluates this again for derivatives, and must find the same array then, whatever the
             # object has been assigned since.
             buffer = type(buffer)(buffer)
         if row is None:
@@ -373,28 +381,30 @@ class PieceKernel:
             size,
         )
 
-    def control(self, buffer: Any, packet: Any, size: int, active: Any = True) -> Any:
+    def control(self, buffer: FloatBuffer, packet: Index, size: int, active: Mask = True) -> Value:
         """The control value in a packet of the coefficients."""
         return self._vector(self.types.fetch(self.types.vector4, buffer, packet, active), size)
 
-    def _vector(self, numbers: Sequence[Any], size: int) -> Any:
+    def _vector(self, numbers: Sequence[Float], size: int) -> Value:
         """The first of some numbers as one value."""
         return self.types.vector(size)(*(numbers[i] for i in range(size)))
 
-    def weights(self, row: Any, active: Any = True) -> list:
+    def weights(self, row: Index, active: Mask = True) -> list:
         """A row of the blocks, one number for each monomial."""
         types, count = self.types, self._row_packets
         packets = (types.fetch(types.vector4, self._weights, row * count + i, active) for i in range(count))
         return [weight for packet in packets for weight in packet][: self._count]
 
-    def _coefficients(self, buffer: Any, packet: Any, active: Any, size: int) -> list[list[Any]]:
+    def _coefficients(self, buffer: FloatBuffer, packet: Index, active: Mask, size: int) -> list[list[Float]]:
         """Coefficients of a piece, by its first packet, of each coordinate."""
         types = self.types
         packets = (types.fetch(types.vector4, buffer, packet + i, active) for i in range(self._packets))
         numbers = [number for each in packets for number in each]
         return [numbers[i : 3 * self._count : 3] for i in range(size)]
 
-    def _split(self, half_edge: Any, row: Any, u: Any, v: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def _split(
+        self, half_edge: Index, row: Index4, u: Float, v: Float, active: Mask
+    ) -> tuple[Index, Float, Float, Float, Index]:
         """Of the corner of a whole element in whose quarter parameters lie.
 
         Returns
@@ -419,21 +429,23 @@ class PieceKernel:
         u, v = dr.select(is_whole, quarter_u, u), dr.select(is_whole, quarter_v, v)
         return code, u, v, dr.select(is_whole, inner_scale, types.float(1)), turn
 
-    def _leaf(self, node: Any, turn: Any, u: Any, v: Any, scale: Any, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def _leaf(
+        self, node: Index, turn: Index, u: Float, v: Float, scale: Float, active: Mask
+    ) -> tuple[Index, Index, Float, Float, Float]:
         """The node in which parameters lie that is not divided, and parameters there before it is turned.
 
-        Parameters go on being seen from the corner that they were given from, ``turn``: near it, turning them would
+        Parameters remain relative to the corner from which they were given, ``turn``: near it, turning them would
         lose their last digits. It is the same corner in every copy of the domain.
         """
         types, count = self.types, self.domain.corner_count
 
-        def node_at(node: Any) -> Any:
+        def node_at(node: Index) -> Index4:
             return types.fetch(types.index4, self._nodes, node, active)
 
-        def is_inner(node: Any, *_: Any) -> Any:
+        def is_inner(node: Index, *_: Any) -> Mask:
             return active & ((node_at(node)[0] & KINDS) < _REGULAR)
 
-        def descend(node: Any, turn: Any, u: Any, v: Any, scale: Any) -> tuple:
+        def descend(node: Index, turn: Index, u: Float, v: Float, scale: Float) -> tuple:
             kind, first, _, _ = node_at(node)
             turn = (turn + kind // TURN) % count
             number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
@@ -450,7 +462,9 @@ class PieceKernel:
 
         return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode=types.loops, label="piece_tree")
 
-    def _at_level(self, is_tip: Any, level_count: Any, u: Any, v: Any, scale: Any) -> tuple[Any, Any, Any, Any, Any]:
+    def _at_level(
+        self, is_tip: Mask, level_count: Index, u: Float, v: Float, scale: Float
+    ) -> tuple[Index, Index, Float, Float, Float]:
         """Where parameters lie in a tip.
 
         Returns
@@ -478,7 +492,7 @@ class PieceKernel:
             dr.select(is_child, scale * inner_scale, scale),
         )
 
-    def _tip(self, start: Any, block_row: Any, ends: Any, level: Any, block: Any, is_deep: Any) -> Tip:
+    def _tip(self, start: Index, block_row: Index, ends: Index, level: Index, block: Index, is_deep: Mask) -> Tip:
         """What is summed at deeper levels; ``ends`` is the last column of `PieceTable.nodes`."""
         types = self.types
         frame, level_count, control_count = ends & FRAMES, ends // LEVEL & LEVELS, ends // CONTROL
@@ -515,7 +529,7 @@ class FirstTerm:
     functions: list[list[float]]
     monomials: Monomials
 
-    def __call__(self, s: Any, t: Any, value: Any, active: Any) -> tuple[Any, Any, Any]:
+    def __call__(self, s: Float, t: Float, value: Value, active: Mask) -> tuple[Value, Value, Value]:
         """What is added to a point and to its two derivatives by the parameters of a child."""
         total = (s * 0,) * 3
         for coefficients in self.functions:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
+
+from .types import Float, Value
 
 
 class Monomials:
@@ -25,7 +26,7 @@ class Monomials:
             column = {a: index for index, (a, b) in enumerate(powers) if b == power}
             self._columns.append([column.get(a) for a in range(max(column, default=0) + 1)])
 
-    def values(self, coefficients: Sequence[Any], s: Any, t: Any, derivatives: int = 1) -> tuple[Any, ...]:
+    def values(self, coefficients: Sequence[Value], s: Float, t: Float, derivatives: int = 1) -> tuple[Value, ...]:
         """Evaluate a polynomial.
 
         Parameters
@@ -38,7 +39,7 @@ class Monomials:
         Returns
         -------
         tuple
-            The value; its derivatives by s and t; if 2 are asked for, those by ss, st and tt.
+            The value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
         """
         zero = coefficients[0] * 0
         along_s = []
@@ -53,7 +54,7 @@ class Monomials:
         return tuple(zero if each is None else each for each in found)
 
 
-def _horner(coefficients: list[Any], x: Any, derivatives: int) -> list[Any]:
+def _horner(coefficients: list[Value], x: Float, derivatives: int) -> list[Value]:
     """A polynomial of one variable and so many of its derivatives, at most two; None for those that are zero."""
     found = [coefficients[-1], *[None] * derivatives]
     for coefficient in reversed(coefficients[:-1]):

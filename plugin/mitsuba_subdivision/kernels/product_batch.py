@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes
 from .lanes import Emit, Fetch, Lanes
+from .types import Float, FloatBuffer, Index, IndexBuffer, Vector3
 
 if TYPE_CHECKING:
     from ..tessellation import Runs
@@ -24,14 +25,14 @@ class ProductBatch:
     with the weights for u.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Runs, controls: Any, are_rounded: bool) -> None:
+    def __init__(self, types: ArrayTypes, runs: Runs, controls: IndexBuffer, are_rounded: bool) -> None:
         (stencils,) = runs.classes
         product = stencils.product
         if product is None:
             raise ValueError("patches whose weights are no products; expected a class with a ProductPatch")
-        self._types, self._count = types, product.places.shape[1]
+        self._types, self._count = types, product.lattice_index.shape[1]
         self._lanes = Lanes(types, runs, controls, are_rounded)
-        self._places = types.indices(product.places)
+        self._lattice_index = types.indices(product.lattice_index)
         rows = [product.rows(stencils.uv[runs.samples_of(kind)]) for kind in range(len(runs.counts))]
         # Parameters along u of all kinds, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
@@ -44,7 +45,7 @@ class ProductBatch:
         lines = product.line_weights(np.concatenate(parameters)).transpose(1, 0, 2)
         self._lines = types.float(lines.ravel())
 
-    def sample(self, padded: Any, emit: Emit) -> None:
+    def sample(self, padded: FloatBuffer, emit: Emit) -> None:
         """See `Batch.sample`."""
         types, every = self._types, range(self._count)
         patch, kind, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
@@ -74,11 +75,11 @@ class ProductBatch:
 
         self._loop(kind, self._begin_v, self._end_v, (first_vertex,), row, "apply_products")
 
-    def add_transposed(self, fetch: Fetch, sums: Any) -> None:
+    def add_transposed(self, fetch: Fetch, sums: FloatBuffer) -> None:
         """See `Batch.add_transposed`."""
         types, every = self._types, range(self._count)
         patch, kind, first_vertex = self._lanes.at(dr.arange(types.index, self._lanes.count))
-        zero: Any = dr.zeros(types.vector3, self._lanes.count)
+        zero: Vector3 = dr.zeros(types.vector3, self._lanes.count)
 
         def zeros(count):
             return [types.vector3(zero) for _ in range(count)]
@@ -109,27 +110,29 @@ class ProductBatch:
         for at, total in enumerate(totals):
             dr.scatter_add(sums, total, control(at))
 
-    def _lattice(self, patch: Any, kind: Any) -> Callable[[Any], Any]:
+    def _lattice(self, patch: Index, kind: Index) -> Callable[[Index], Index]:
         """Function that finds the control points of some patches by their index in the lattice, as the kind sees it."""
         index, control = self._types.index, self._lanes.one_rings(patch, kind)
         first = dr.gather(index, self._corner, kind) * self._count**2
-        return lambda at: control(dr.gather(index, self._places, first + at))
+        return lambda at: control(dr.gather(index, self._lattice_index, first + at))
 
-    def _line(self, parameter: Any) -> tuple[list[Any], list[Any]]:
+    def _line(self, parameter: Index) -> tuple[list[Float], list[Float]]:
         """All one-dimensional weights and their derivatives at a parameter, given by its index."""
         first = 2 * self._count * parameter
-        weights: list[Any] = [dr.gather(self._types.float, self._lines, first + i) for i in range(2 * self._count)]
+        weights: list[Float] = [dr.gather(self._types.float, self._lines, first + i) for i in range(2 * self._count)]
         return weights[: self._count], weights[self._count :]
 
-    def _loop(self, kind: Any, begin: Any, end: Any, start: tuple, body: Callable[..., tuple], label: str) -> tuple:
+    def _loop(
+        self, kind: Index, begin: IndexBuffer, end: IndexBuffer, start: tuple, body: Callable[..., tuple], label: str
+    ) -> tuple:
         """Loop over a kind's parameters; the first state variable is their index."""
-        first: Any
-        last: Any
+        first: Index
+        last: Index
         first, last = dr.gather(self._types.index, begin, kind), dr.gather(self._types.index, end, kind)
         return dr.while_loop((first, *start), lambda at, *_: at < last, body, label=label)
 
 
-def _combined(weights: list[Any], vectors: list[Any], start: Any | None = None) -> Any:
+def _combined(weights: list[Float], vectors: list[Vector3], start: Vector3 | None = None) -> Vector3:
     """Sum of weights times vectors, added to ``start`` if there is one."""
     total = weights[0] * vectors[0] if start is None else dr.fma(vectors[0], weights[0], start)
     for weight, vector in zip(weights[1:], vectors[1:], strict=True):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from .array_types import ArrayTypes
+from .types import FloatBuffer, Index, Mask, Value
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -31,7 +32,7 @@ class SparseMatrix:
         self._start, self._columns = types.indices(matrix.indptr), types.indices(matrix.indices)
         self._entries = float_type(matrix.data)
 
-    def __call__(self, flat: Any, size: int = 3) -> Any:
+    def __call__(self, flat: FloatBuffer, size: int = 3) -> FloatBuffer:
         """The product as the flat components of ``n`` vectors, from those of ``m`` vectors.
 
         Parameters
@@ -42,14 +43,14 @@ class SparseMatrix:
         """
         types = self._types
         vector = types.vector(size)
-        row: Any = dr.arange(types.index, self._row_count)
-        start: Any = dr.gather(types.index, self._start, row)
-        end: Any = dr.gather(types.index, self._start, row + 1)
-        zero: Any = dr.zeros(vector, self._row_count)
+        row: Index = dr.arange(types.index, self._row_count)
+        start: Index = dr.gather(types.index, self._start, row)
+        end: Index = dr.gather(types.index, self._start, row + 1)
+        zero: Value = dr.zeros(vector, self._row_count)
 
-        def value(index: Any, active: Any = True) -> Any:
+        def value(index: Index, active: Mask = True) -> Value:
             """The vector that an entry is multiplied by."""
-            column: Any = dr.gather(types.index, self._columns, index, active)
+            column: Index = dr.gather(types.index, self._columns, index, active)
             return dr.gather(vector, flat, column, active)
 
         origin = value(start, start < end) if self._is_relative else zero

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -22,10 +22,11 @@ from .nearest_location import NearestLocation, NearestPoints
 from .newton import over
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
+from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .vectors import cross, unit
 
 if TYPE_CHECKING:
-    from ..patches import PieceTable, SamplePlaces
+    from ..patches import PieceTable, SamplingCells
     from .displacement import Displacement
     from .line_intersection import AnyPiece
 
@@ -44,8 +45,8 @@ class SurfaceKernel:
         precision, as in scalar variants.
     use_stam : bool
         Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
-    places : callable, optional
-        Makes the `SamplePlaces` that `sample` draws from, when it is first asked.
+    cells : callable, optional
+        Makes the `SamplingCells` that `sample` draws from, when it is first asked.
 
     Attributes
     ----------
@@ -65,19 +66,19 @@ class SurfaceKernel:
         float_type: type,
         *,
         use_stam: bool = False,
-        places: Callable[[], SamplePlaces] | None = None,
+        cells: Callable[[], SamplingCells] | None = None,
     ) -> None:
         self.types = ArrayTypes.of(float_type)
-        self._places = places
+        self._cells = cells
         self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
         self.walk = self._patches.walk
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
-        self.coefficients: Any = float_type() if self.types.is_jit else None
+        self.coefficients: FloatBuffer = float_type() if self.types.is_jit else None
         self._loaded: _Loaded | None = None
 
-    def set_control_points(self, points: Any) -> None:
+    def set_control_points(self, points: FloatBuffer) -> None:
         """Take over control points. What is evaluated afterwards has derivatives by them.
 
         Parameters
@@ -103,21 +104,21 @@ class SurfaceKernel:
             dr.make_opaque(self._loaded.coefficients)
         self.take(self._loaded.coefficients)
 
-    def attach(self, points: Any) -> None:
+    def attach(self, points: FloatBuffer) -> None:
         """Attach derivatives by the control points once more, without making coefficients."""
         self.take(self._map(points, dr.detach(self.coefficients)))
 
-    def take(self, coefficients: Any) -> None:
-        """Take over coefficients, maybe the same with other derivatives."""
+    def take(self, coefficients: FloatBuffer) -> None:
+        """Take over coefficients, maybe equal ones with other derivatives."""
         if not self.types.is_jit:
             self.coefficients = coefficients
             return
-        # Else they would be part of kernels.
+        # Literals would be compiled into kernels.
         dr.make_opaque(coefficients)
-        # The same array as before, as others may have got hold of it.
+        # Assign in place, because others may hold a reference to the array.
         self.coefficients[:] = coefficients
 
-    def evaluate(self, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfacePoints:
+    def evaluate(self, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfacePoints:
         """Evaluate points, normals and tangents.
 
         Differentiable with respect to the control points and the parameters, forward and backward.
@@ -134,7 +135,7 @@ class SurfaceKernel:
         """
         return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
 
-    def intersect(self, ray: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1) -> SurfaceHits:
+    def intersect(self, ray: Ray, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfaceHits:
         """Find where rays intersect the surface, near given parameters.
 
         Differentiable with respect to the control points and the ray: points stay on the ray.
@@ -156,15 +157,15 @@ class SurfaceKernel:
         hits = self.line_hits(foot, along, start)
         lines = Lines(o, d, hits.kind == ON_LINE)
         found = self.at(hits.location, derivatives=derivatives, lines=lines, values=hits.values)
-        way = found.p - o
-        t = dr.dot(way, d) / dr.squared_norm(d)
-        off = dr.squared_norm(dr.detach(way - d * t))
+        along_ray = found.p - o
+        t = dr.dot(along_ray, d) / dr.squared_norm(d)
+        off = dr.squared_norm(dr.detach(along_ray - d * t))
         is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
         t = dr.select((hits.kind != MISSED) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 
     def closest(
-        self, points: Any, element: Any, uv: Any, corner: Any = 0, derivatives: int = 1
+        self, points: Vector3, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1
     ) -> NearestSurfacePoints:
         """Find the nearest points of the surface, from given parameters down.
 
@@ -188,7 +189,7 @@ class SurfaceKernel:
         found = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
         return NearestSurfacePoints(**vars(found), distance=dr.norm(points - found.p))
 
-    def sample(self, choice: Any, inside: Any, derivatives: int = 1) -> RandomSurfacePoints:
+    def sample(self, choice: Float, inside: Vector2, derivatives: int = 1) -> RandomSurfacePoints:
         """Draw points of the surface from random numbers.
 
         Each number gives a point, so points are not exactly uniform by area: their density is ``pdf``, and ``1 / pdf``
@@ -200,7 +201,7 @@ class SurfaceKernel:
         Parameters
         ----------
         choice : float array
-            In [0, 1): chooses a place of the surface.
+            In [0, 1): chooses a cell of the surface.
         inside : 2-vector
             In [0, 1) each: chooses a point there.
         derivatives : int
@@ -209,7 +210,7 @@ class SurfaceKernel:
         Raises
         ------
         ValueError
-            If the kernel was made without places.
+            If the kernel was made without cells.
         """
         location, density = self._sampler.drawn(choice, inside)
         found = self.at(location, derivatives=derivatives)
@@ -217,16 +218,14 @@ class SurfaceKernel:
 
     @cached_property
     def _sampler(self) -> AreaSampler:
-        if self._places is None:
-            raise ValueError(
-                "the kernel was made without places to draw from; expected one from LimitSurface.on_device"
-            )
-        return AreaSampler(self._places(), self.types, self.walk)
+        if self._cells is None:
+            raise ValueError("the kernel was made without cells to draw from; expected one from LimitSurface.on_device")
+        return AreaSampler(self._cells(), self.types, self.walk)
 
     def at(
         self,
         location: Location,
-        active: Any = True,
+        active: Mask = True,
         derivatives: int = 1,
         *,
         lines: Lines | None = None,
@@ -261,11 +260,11 @@ class SurfaceKernel:
     def _at(
         self,
         location: Location,
-        active: Any,
+        active: Mask,
         derivatives: int,
         lines: Lines | None,
         nearest: NearestPoints | None,
-        coefficients: Any,
+        coefficients: FloatBuffer,
         values: PatchValues | None,
     ) -> SurfacePoints:
         u, v = dr.detach(location.u), dr.detach(location.v)
@@ -291,7 +290,7 @@ class SurfaceKernel:
         x, y = (dr.replace_grad(self.types.float(0), each) for each in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
         location, moved = Location(location.half_edge, u + x, v + y), values.shifted(x, y)
         n = n + (dr.detach(dn_du) * x + dr.detach(dn_dv) * y)
-        # Those of tangents have no bound near extraordinary points, and would drown all else in noise.
+        # Derivatives of tangents have no bound near extraordinary points, and would add much noise.
         tangents = values if follows is lines and lines is not None else moved
         found = SurfacePoints(location, moved.value, n, tangents.du, tangents.dv)
         if derivatives == 1:
@@ -303,7 +302,13 @@ class SurfaceKernel:
         return replace(found, dn_du=dn_du, dn_dv=dn_dv)
 
     def _piece(
-        self, coefficients: Any, half_edge: Any, u: Any, v: Any, active: Any = True, row: Any = None
+        self,
+        coefficients: FloatBuffer,
+        half_edge: Index,
+        u: Float,
+        v: Float,
+        active: Mask = True,
+        row: Index4 | None = None,
     ) -> AnyPiece:
         """The piece of the surface in which parameters lie, displaced if there is a displacement."""
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
@@ -311,13 +316,13 @@ class SurfaceKernel:
 
     def line_hits(
         self,
-        p: Any,
-        d: Any,
+        p: Vector3,
+        d: Vector3,
         location: Location,
-        active: Any = True,
+        active: Mask = True,
         *,
-        max_distance: Any = dr.inf,
-        facing: Any = 0,
+        max_distance: Float = dr.inf,
+        facing: Float = 0,
     ) -> LineHits:
         """Find where lines intersect the surface near given locations, see `LineIntersection`; without derivatives.
 
@@ -342,7 +347,7 @@ class SurfaceKernel:
             return search.hits(p, d, location, active, max_distance, facing)
 
 
-def _normal_derivatives(values: PatchValues, n: Any) -> tuple[Any, Any]:
+def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vector3]:
     """Derivatives of the unit normal, from second derivatives."""
     uu, uv, vv = values.second
     area = dr.norm(cross(values.du, values.dv))
@@ -360,7 +365,7 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
     """Derivatives by u and by v of those of the unit normal: differences, without derivatives of their own."""
     step = DIFFERENCE * dr.rcp(piece.magnification)
 
-    def at(du: Any, dv: Any) -> tuple[Any, Any]:
+    def at(du: Float, dv: Float) -> tuple[Vector3, Vector3]:
         values = piece.values(du, dv, 2)
         return _normal_derivatives(values, unit(values.normal))
 
@@ -378,7 +383,7 @@ class _Loaded:
     __slots__ = ("__weakref__", "coefficients")
 
     def __init__(self) -> None:
-        self.coefficients: Any = None
+        self.coefficients: FloatBuffer = None
 
 
 _LOADED: Shared[_Loaded] = Shared()

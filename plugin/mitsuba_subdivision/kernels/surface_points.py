@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 
 from .affine_map import AffineMap
 from .element_walk import Location
+from .types import Float, Vector3
 from .vectors import unit
 
 
@@ -28,16 +28,16 @@ class SurfacePoints:
     dp_du, dp_dv : 3-vectors
         Derivatives by the location's parameters.
     dn_du, dn_dv : 3-vectors, or None
-        If second derivatives were asked for.
+        If second derivatives were requested.
     """
 
     location: Location
-    p: Any
-    n: Any
-    dp_du: Any
-    dp_dv: Any
-    dn_du: Any = None
-    dn_dv: Any = None
+    p: Vector3
+    n: Vector3
+    dp_du: Vector3
+    dp_dv: Vector3
+    dn_du: Vector3 = None
+    dn_dv: Vector3 = None
 
     def placed(self, to_world: AffineMap) -> SurfacePoints:
         """The same points in another space."""
@@ -65,7 +65,7 @@ class SurfaceHits(SurfacePoints):
         Distance along the ray, in lengths of its direction; infinite where it does not intersect the surface nearby.
     """
 
-    t: Any = None
+    t: Float = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class NearestSurfacePoints(SurfacePoints):
     distance : float array
     """
 
-    distance: Any = None
+    distance: Float = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,4 +90,4 @@ class RandomSurfacePoints(SurfacePoints):
         Their density by area.
     """
 
-    pdf: Any = None
+    pdf: Float = None

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import drjit as dr
 import numpy as np
 
 from ..tessellation import UniformGrid
 from .element_walk import ElementWalk, Location
+from .types import Float, Index, Mask
 
 if TYPE_CHECKING:
     from ..tessellation import VertexTable
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 class TriangleLocations(Protocol):
     """Finds out where points of triangles lie."""
 
-    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+    def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
         """The location of a point of a triangle, where its parameters are interpolated.
 
         Parameters
@@ -61,7 +62,7 @@ class AdaptiveLocations:
         corner, uv = grid.triangle_locations
         self._half_edge, self._parameters = types.indices(corner), types.floats(uv)
 
-    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+    def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
         """See `TriangleLocations`."""
         types = self._types
         half_edge = types.fetch(types.index, self._half_edge, triangle, active)
@@ -93,7 +94,7 @@ class UniformLocations:
             self._element = types.indices(grid.element())
             self._first = types.indices(np.cumsum(counts) - counts)
 
-    def __call__(self, triangle: Any, b1: Any, b2: Any, active: Any = True) -> Location:
+    def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
         """See `TriangleLocations`."""
         types = self._types
         if self._element is None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
 from ..evaluation import normals
+from .types import Float, Vector3
 
 # Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
 # component shorter than this means that the patch has collapsed to a point or a curve.
@@ -28,9 +28,9 @@ class RoundingBound:
         Of the weighted points along each axis, from one of them.
     """
 
-    weight_u: Any
-    weight_v: Any
-    extent: Any
+    weight_u: Float
+    weight_v: Float
+    extent: Vector3
 
 
 class UnitNormal:
@@ -50,7 +50,7 @@ class UnitNormal:
     exists : mask
     """
 
-    def __init__(self, du: Any, dv: Any, bound: RoundingBound | None = None) -> None:
+    def __init__(self, du: Vector3, dv: Vector3, bound: RoundingBound | None = None) -> None:
         # The tangents' lengths matter neither to the normal nor, but for these factors, to its derivative.
         self._scale_u, self._scale_v = _scale(du), _scale(dv)
         self._du, self._dv = du * self._scale_u, dv * self._scale_v
@@ -60,7 +60,7 @@ class UnitNormal:
         self._inverse_length = dr.select(self.exists, dr.rsqrt(squared), 0)
         self.value = cross * self._inverse_length
 
-    def _rounding_of_cross(self, bound: RoundingBound) -> Any:
+    def _rounding_of_cross(self, bound: RoundingBound) -> Float:
         """Square of what rounding may leave of the cross product of parallel tangents."""
         left_u, left_v = bound.weight_u * self._scale_u, bound.weight_v * self._scale_v
         # For each product of two coordinates: those of one tangent times what rounding may leave of the other's.
@@ -71,20 +71,20 @@ class UnitNormal:
             + dr.square(dr.fma(a.x, b.y, a.y * b.x))
         )
 
-    def forward(self, change_u: Any, change_v: Any) -> Any:
+    def forward(self, change_u: Vector3, change_v: Vector3) -> Vector3:
         """Change of the normal where the tangents change; zero where there is no normal."""
         change = dr.cross(change_u * self._scale_u, self._dv) + dr.cross(self._du, change_v * self._scale_v)
         return self._across(change)
 
-    def backward(self, gradient: Any) -> tuple[Any, Any]:
+    def backward(self, gradient: Vector3) -> tuple[Vector3, Vector3]:
         """Gradients by the tangents from that by the normal; zero where there is no normal."""
         across = self._across(gradient)
         return dr.cross(self._dv, across) * self._scale_u, dr.cross(across, self._du) * self._scale_v
 
-    def _across(self, vector: Any) -> Any:
+    def _across(self, vector: Vector3) -> Vector3:
         """The part of a vector across the normal, over the length of the cross product."""
         return (vector - self.value * dr.dot(self.value, vector)) * self._inverse_length
 
 
-def _scale(tangent: Any) -> Any:
+def _scale(tangent: Vector3) -> Float:
     return dr.rcp(dr.maximum(dr.max(dr.abs(tangent)), SHORTEST))

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any
 
 import drjit as dr
 
+from .types import Float, Vector3
 
-def dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
+
+def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
     """Scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Any, b: Any) -> Any:
+def cross(a: Vector3, b: Vector3) -> Vector3:
     """Cross product."""
     (a_x, a_y, a_z), (b_x, b_y, b_z) = a, b
     components = [
@@ -28,7 +29,7 @@ def cross(a: Any, b: Any) -> Any:
     return like(components, a)
 
 
-def unit(vector: Any) -> Any:
+def unit(vector: Vector3) -> Vector3:
     """The vector over its length; zero if that is zero."""
     # Over the largest component first, so that squares neither overflow nor vanish.
     largest = dr.detach(reduce(dr.maximum, [dr.abs(x) for x in vector]))
@@ -39,11 +40,11 @@ def unit(vector: Any) -> Any:
     return like([x * inverse for x in scaled], vector)
 
 
-def added(a: Any, b: Any, factor: Any = 1) -> Any:
+def added(a: Vector3, b: Vector3, factor: Float = 1) -> Vector3:
     """A vector, and another times a factor."""
     return like([dr.fma(y, factor, x) for x, y in zip(a, b, strict=True)], a)
 
 
-def like(components: list, vector: Any) -> Any:
+def like(components: list, vector: Vector3) -> Vector3:
     """A vector of three components, of the type of another one."""
     return components if isinstance(vector, list) else type(vector)(*components)

@@ -287,7 +287,7 @@ class Topology:
     def turn_back(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
         beyond = _looked_up(self.twin, half_edge)
-        # The brackets make a number of an array without dimensions, which one half-edge leads to.
+        # Indexing by () turns the zero-dimensional result for one half-edge into a number.
         return np.where(beyond < 0, -1, self.following(beyond))[()]
 
     def walks(self) -> tuple[Walk, Walk, Walk]:

@@ -138,8 +138,8 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
     current, number = copied, t.vertex_count + np.arange(len(copied))
     while len(current):
         face_vertices[current] = number
-        goes_on = ~is_border[t.preceding(current)]
-        current, number = t.turn(current[goes_on]).astype(np.int64), number[goes_on]
+        continues = ~is_border[t.preceding(current)]
+        current, number = t.turn(current[continues]).astype(np.int64), number[continues]
         is_new = face_vertices[current] != number
         current, number = current[is_new], number[is_new]
     return face_vertices, vertex
@@ -151,8 +151,8 @@ def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: I
     current, fan = closed_fans, np.arange(len(closed_fans))
     while len(current):
         current = topology.turn(current)
-        goes_on = current != closed_fans[fan]
-        current, fan = current[goes_on], fan[goes_on]
+        continues = current != closed_fans[fan]
+        current, fan = current[continues], fan[continues]
         is_divided[fan] |= is_border[current]
     return closed_fans[~is_divided]
 

@@ -6,7 +6,7 @@ The faces of a polygon mesh are one, and the vertices at their corners its entri
 ============================  =============  ======================================
 ``starts(lengths)``           ``0 3 3``      where each row begins
 ``offsets(lengths)``          ``0 3 3 5``    and, after them, where the last one ends
-``places(lengths)``           ``0 1 2 0 1``  the index of each entry in its row
+``index_in_row(lengths)``     ``0 1 2 0 1``  the index of each entry in its row
 ``ranges(first, lengths)``                   ``first, first + 1, ...`` in every row
 ============================  =============  ======================================
 
@@ -34,7 +34,7 @@ def offsets(lengths: ArrayLike, dtype: type[np.signedinteger] = np.int64) -> NDA
     return found
 
 
-def places(lengths: IntArray) -> NDArray[np.int64]:
+def index_in_row(lengths: IntArray) -> NDArray[np.int64]:
     """``(lengths.sum(),)`` the index of each entry in its row, from 0 on."""
     begins = np.repeat(starts(lengths), lengths)
     return np.arange(len(begins)) - begins

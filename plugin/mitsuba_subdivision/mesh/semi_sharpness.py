@@ -64,7 +64,7 @@ class SemiSharpness:
 
         A refinement lowers each sharpness by one. Chaikin's method first replaces the sharpness of an edge by three
         quarters of it and a quarter of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998], as
-        OpenSubdiv has it.
+        OpenSubdiv does.
 
         Parameters
         ----------

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .area_samples import AreaSamples, uniform_places
+    from .area_samples import AreaSamples, uniform_locations
     from .channel import Channel, ChannelLayout, LinearChannel, SubdividedChannel, contracts_alike
     from .closest_points import ClosestPoints, ClosestPointSearch
     from .element_bounds import ElementBounds
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .patch_table import PatchClass, PatchTable
     from .piece_table import PieceTable
     from .polynomial_pieces import SurfacePieces
-    from .sample_places import SamplePlaces
+    from .sampling_cells import SamplingCells
     from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
     from .surface_area import SurfaceAreas
 
@@ -31,7 +31,7 @@ __all__ = [
     "PatchClass",
     "PatchTable",
     "PieceTable",
-    "SamplePlaces",
+    "SamplingCells",
     "StencilMatrices",
     "StencilRows",
     "SubdividedChannel",
@@ -43,7 +43,7 @@ __all__ = [
     "gradients",
     "hessians",
     "sample_matrices",
-    "uniform_places",
+    "uniform_locations",
 ]
 
 __getattr__ = deferred(
@@ -59,7 +59,7 @@ __getattr__ = deferred(
         "PatchClass": "patch_table",
         "PatchTable": "patch_table",
         "PieceTable": "piece_table",
-        "SamplePlaces": "sample_places",
+        "SamplingCells": "sampling_cells",
         "StencilMatrices": "stencil_matrices",
         "StencilRows": "stencil_matrices",
         "SubdividedChannel": "channel",
@@ -71,6 +71,6 @@ __getattr__ = deferred(
         "gradients": "energies",
         "hessians": "energies",
         "sample_matrices": "stencil_matrices",
-        "uniform_places": "area_samples",
+        "uniform_locations": "area_samples",
     },
 )

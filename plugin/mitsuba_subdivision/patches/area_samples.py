@@ -39,7 +39,7 @@ class AreaSamples:
     dp_dv: FloatArray
 
 
-def uniform_places(
+def uniform_locations(
     pieces: SurfacePieces, areas: SurfaceAreas, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Random locations on a surface, uniform by area.

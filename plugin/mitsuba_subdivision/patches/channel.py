@@ -16,7 +16,7 @@ from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
-from ..schemes.members import has_phantom_points
+from ..schemes.scheme_members import has_phantom_points
 from .patch_samples import evaluate_patches
 from .patch_table import PatchTable
 from .stencil_matrices import value_matrix

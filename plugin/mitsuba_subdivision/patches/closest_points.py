@@ -12,7 +12,7 @@ from ..evaluation.irregular_patch import level_at_size
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
+from ..schemes.scheme_members import optional_member
 from .box_tree import BoxTree, squared_gaps
 from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
 from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike
@@ -21,12 +21,12 @@ from .turned_boxes import TurnedBoxes
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-# Pieces are divided until they are as flat as this, thickness over length, but no more than so often.
+# Pieces are divided until they are as flat as this, thickness over length, but at most this many times.
 FLAT, MOST_HALVINGS = 0.05, 4
-# Pieces around extraordinary points are kept up to so many, about a kilobyte each. Those of further levels are made
+# Pieces around extraordinary points are kept up to this many, about a kilobyte each. Those of further levels are made
 # whenever they are needed.
 MOST_KEPT = 200_000
-# A piece in which the distance to a point may have several minima is divided, but no more than so often.
+# A piece in which the distance to a point may have several minima is divided, but at most this many times.
 MOST_CONVEX_HALVINGS = 3
 # Where the distance falls no faster than this along the surface, it has a minimum.
 FLAT_SLOPE = 1e-10
@@ -38,7 +38,7 @@ SMALLEST = 2.0**-44
 NEARLY = 0.02
 # Points are processed in runs of this many, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
-# Undivided parts are tried for so many pairs of a point and a part at once.
+# Undivided parts are tried for this many pairs of a point and a part at once.
 MOST_PAIRS = 1 << 11
 
 _Boxed = TypeVar("_Boxed", PolynomialPieces, ElementParts)

@@ -14,7 +14,7 @@ from .polynomial_pieces import PolynomialPieces
 # Most steps; five to seven are usual, more where a point is about as far away as the surface's centre of curvature.
 STEPS = 60
 # After a step this short, in parameters of a piece, the next would be lost in rounding.
-LAST_STEP = 1e-11
+STEP_TOLERANCE = 1e-11
 # A step of Newton's this short is the last as well: the rest is about its square.
 LAST_NEWTON_STEP = 1e-7
 # No further from an edge of the domain than this is on the edge: rounding of a sum of parameters.
@@ -152,7 +152,7 @@ class _Descent:
                 own[improves] = new[improves]
             self.part = np.where(improves, 1, self.part * SHORTER)
         length = np.abs(step).max(axis=1, initial=0)
-        return (length < LAST_STEP) | (is_newton & improves & (length < LAST_NEWTON_STEP))
+        return (length < STEP_TOLERANCE) | (is_newton & improves & (length < LAST_NEWTON_STEP))
 
     def _direction(self) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Newton's step, along the edges of the domain where it would leave it, and no further than to the next.

@@ -18,7 +18,7 @@ from ..mesh.chunks import gathered
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
-# Up to so many codes are not renumbered: they fit into two bytes, which sort fast.
+# Up to this many codes are not renumbered: they fit into two bytes, which sort fast.
 FEW_CODES = 1 << 16
 
 
@@ -80,7 +80,7 @@ def _vertex_codes(topology: Topology) -> IntArray:
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
     beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
-    beyond[vertex[order], ragged.places(count)] = rows[order]
+    beyond[vertex[order], ragged.index_in_row(count)] = rows[order]
     columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
     return row_codes([t.vertex_rules, *map(_value_codes, columns)])
 

@@ -16,7 +16,7 @@ from .patch_table import PatchTable
 
 # Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
 CHUNK = 32768
-# And of so many classes, whose pieces are prepared at once.
+# And of at most this many classes, whose pieces are prepared at once.
 CLASSES = 512
 # Of tips; that leaves a 64th of each to eigen-coordinates.
 PIECE_LEVELS = 3
@@ -56,7 +56,9 @@ def evaluate_patches(
     order = np.argsort(class_index.astype(np.min_scalar_type(len(patches.classes))), kind="stable")
     first_control = np.array([each.first_control for each in patches.classes], dtype=np.int64)
     patch_count, size = np.array([each.controls.shape for each in patches.classes], dtype=np.int64).reshape(-1, 2).T
-    extent = control_values.max(axis=0, initial=-np.inf) - control_values.min(axis=0, initial=np.inf)
+    # Column by column: operations along rows of three would be slow.
+    columns = np.ascontiguousarray(control_values.T)
+    extent = columns.max(axis=1, initial=-np.inf) - columns.min(axis=1, initial=np.inf)
     own_row = None if np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))) else control_of_vertex
     for at in counted(_runs(class_index[order], order), "Evaluated patches"):
         of_class = class_index[at]

@@ -16,8 +16,8 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 from .one_ring_codes import fan_codes, row_codes
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ FEW_PATCHES = 200
 FEWER = 4
 # Number of weights of pieces that are kept: those of a cage with 600 classes take 7 MB.
 KEPT_BYTES = 1 << 25
-# They have so many columns, or a multiple.
+# The number of their columns is a multiple of this.
 COLUMN_STEP = 4
 
 

@@ -21,7 +21,7 @@ from .patch_table import PatchTable
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Numbers are read in packets of so many.
+# Numbers are read in packets of this many.
 PACKET = 4
 # In place of a twin, where there is none.
 NOTHING = 0xFFFFFFFF

@@ -21,8 +21,8 @@ MOST_HALVINGS = 10
 # Around extraordinary points levels are measured until their areas have shrunk to this. From there on each level is
 # smaller than the one before by the same factor: what this leaves is below the tolerance.
 TAIL = 2.0**-36
-# Pieces are measured in runs of so many points, whose arrays stay in a processor's cache; bounds of area elements are
-# found in runs of so many pieces, which bounds temporary memory to some tens of megabytes.
+# Pieces are measured in runs of this many points, whose arrays stay in a processor's cache; bounds of area elements are
+# found in runs of this many pieces, which bounds temporary memory to some tens of megabytes.
 MOST_POINTS, CHUNK = 1 << 14, 2048
 
 

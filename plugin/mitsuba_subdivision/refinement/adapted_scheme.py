@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..cage.control_cage import ControlCage
 from ..cage.errors import warn
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules
-from ..schemes.members import has_phantom_points, optional_member, require_members, unsupported_parts
+from ..schemes.scheme_members import has_phantom_points, optional_member, require_members, unsupported_parts
 
 
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:

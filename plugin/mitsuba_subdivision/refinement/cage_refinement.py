@@ -219,5 +219,5 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
     element, corner = np.full((2, t.vertex_count), -1, dtype=np.int64)
     offsets, half_edges = cut.vertex_fans
     element[half_edges] = cut.face_vertices[half_edges]
-    corner[half_edges] = ragged.places(np.diff(offsets))
+    corner[half_edges] = ragged.index_in_row(np.diff(offsets))
     return CageRefinement(found, matrix, element, corner)

@@ -16,8 +16,8 @@ from ..mesh.agreement import differences
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
-from ..schemes.members import has_phantom_points
 from ..schemes.scheme import Refinement
+from ..schemes.scheme_members import has_phantom_points
 from .refined_corners import RefinedCorners
 
 if TYPE_CHECKING:

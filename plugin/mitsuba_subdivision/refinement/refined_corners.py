@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ..cage.control_cage import ControlCage
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes import Scheme, SchemeError
-from ..schemes.members import optional_member
+from ..schemes.scheme_members import optional_member
 
-# What a refined vertex is the point of.
+# Origins of a refined vertex.
 VERTEX, EDGE, FACE = range(3)
 
 

@@ -160,7 +160,7 @@ def _averaged(r: VariableRefinement, features: FeatureSharpness) -> tuple[FloatA
     is_mixed = is_sharp & (r.sums(is_sharp)[vertex] > 1)
     others = np.where(is_mixed, 1 / 4 / number, 0)
     own[: r.edge_count] = np.where(is_mixed, 3 / 4 - others, 1)
-    # As `SemiSharpness.decaying` has it: rounding must not make smooth what is sharp there.
+    # As in `SemiSharpness.decaying`: rounding must not smooth an edge that is sharp there.
     mean = (r.sums(of_edges)[vertex] - of_edges) / number
     averaged = sharpness.copy()
     averaged[: r.edge_count] = np.where(is_mixed, 0.75 * of_edges + 0.25 * mean, of_edges)

@@ -25,8 +25,8 @@ from ..mesh.semi_sharpness import CreaseMethod, SemiSharpness
 from ..mesh.sharpness import INFINITE
 from ..schemes.crease_masks import CREASE_NEIGHBOUR
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 
 if TYPE_CHECKING:
     from scipy import sparse

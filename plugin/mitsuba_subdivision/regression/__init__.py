@@ -5,4 +5,4 @@
 
 
 class RegressionError(ValueError):
-    """A scene cannot be rendered as asked, or a reference cannot be used."""
+    """A scene cannot be rendered as requested, or a reference cannot be used."""

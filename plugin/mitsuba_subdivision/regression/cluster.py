@@ -62,7 +62,7 @@ def render_on_cluster(
         count = count or min(threads, sampling.batches)
         path = str(Path(scene).resolve())
         numbers = list(range(1, count + 1))
-        # Not pure, in the sense of Dask: when a render is asked for again, it is made again.
+        # Not pure, in the sense of Dask: a repeated request renders again.
         futures = client.map(
             _work, numbers, pure=False, job=(path, dict(parameters), variant, sampling, count, filter_name, with_probe)
         )

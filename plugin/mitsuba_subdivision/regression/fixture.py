@@ -56,7 +56,7 @@ class FixtureSettings:
 
 
 class RenderRegression:
-    """What the fixture hands to a test: a function of a scene, which compares the scene with its reference."""
+    """The fixture's value: a function of a scene, which compares the scene with its reference."""
 
     def __init__(self, settings: FixtureSettings, node: Any) -> None:
         self.settings = settings

@@ -78,7 +78,7 @@ def render_pass(
     Parameters
     ----------
     with_probe : bool
-        Whether the first pass shall have what a reference has besides: the first batch alone, and the geometry probe.
+        Whether the first pass also has the data of a reference: the first batch alone, and the geometry probe.
     """
     share = sampling.share(number, count)
     first: NDArray[np.float32] | None = None

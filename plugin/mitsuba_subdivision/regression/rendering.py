@@ -1,4 +1,4 @@
-"""Rendering an image in one process, in parts that show how far it has come."""
+"""Rendering an image in one process, in parts, which show the progress."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class DooSabin(OptionalMembers):
 
         size = t.face_sizes[t.face]
         corner = np.repeat(corners, size)
-        steps = ragged.places(size)
+        steps = ragged.index_in_row(size)
         begin = t.face_offsets[t.face[corner]]
         member = t.face_vertices[begin + (corner - begin + steps) % size[corner]]
         n = size[corner]

@@ -253,8 +253,9 @@ def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
     """
     orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
     count = u.shape[1:]
-    products = np.empty((len(orders), count[0], v.shape[2], count[1]), dtype=u.dtype)
+    # Samples come last, so that NumPy's loops are long.
+    u, v = (np.ascontiguousarray(each.swapaxes(1, 2)) for each in (u, v))
+    products = np.empty((len(orders), v.shape[1], count[1], count[0]), dtype=u.dtype)
     for product, (a, b) in zip(products, orders, strict=True):
-        for column in range(v.shape[2]):
-            np.multiply(v[b][:, column, None], u[a], out=product[:, column])
-    return products.reshape(len(orders), count[0], -1)
+        np.multiply(v[b][:, None], u[a], out=product)
+    return np.ascontiguousarray(products.reshape(len(orders), -1, count[0]).swapaxes(1, 2))

@@ -19,8 +19,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..kernels.alignment import aligned
+from ..kernels.types import FloatBuffer
 from ..mesh.shared import Content, Shared
 from ..schemes.domain import FloatArray
+from ..variants import Variant
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
@@ -39,7 +41,7 @@ PREFIX = "cage_"
 _UPLOADED: Shared[SharedArray] = Shared()
 
 # Called with an attribute's name and the gradient with respect to its values, after reverse mode has reached them.
-OnBackward = Callable[[str, Any], None]
+OnBackward = Callable[[str, FloatBuffer], None]
 
 
 class CageAttributes:
@@ -62,27 +64,27 @@ class CageAttributes:
         Names of the parameters that move vertices.
     """
 
-    def __init__(self, variant: Any, surface: LimitSurface, names: Iterable[str]) -> None:
+    def __init__(self, variant: Variant, surface: LimitSurface, names: Iterable[str]) -> None:
         self._source = surface.cage.source.name
         self._float = variant.Float if dr.is_jit_v(variant.Float) else None
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
         kind = self._float or dr.scalar.ArrayXf
-        self.values: dict[str, Any] = {
+        self.values: dict[str, FloatBuffer] = {
             f"{PREFIX}{name}": kind(channel.values.ravel()) for name, channel in self._channels.items()
         }
         self.moving: set[str] = set()
-        self._followers: list[tuple[str, Callable[[Any], None]]] = []
+        self._followers: list[tuple[str, Callable[[FloatBuffer], None]]] = []
         # Attributes that differ from their loaded values, with their derivatives.
-        self._moved: dict[str, Any] = {}
+        self._moved: dict[str, FloatBuffer] = {}
         self._computed: dict[str, set[int]] = {}
 
-    def add_follower(self, name: str, take: Callable[[Any], None], *, moves: bool = False) -> None:
+    def add_follower(self, name: str, take: Callable[[FloatBuffer], None], *, moves: bool = False) -> None:
         """Call a function with each new array of an attribute's values; `moves` says whether they move vertices."""
         self._followers.append((name, take))
         if moves:
             self.moving.add(f"{PREFIX}{name}")
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the parameters."""
         flags = mi.ParamFlags
         for name, values in self.values.items():
@@ -120,13 +122,13 @@ class CageAttributes:
             self._move(name, on_backward)
         return names
 
-    def renew(self, name: str, gradient: Any, on_backward: OnBackward) -> None:
+    def renew(self, name: str, gradient: FloatBuffer, on_backward: OnBackward) -> None:
         """Attach the arrays computed from an attribute to its values again, after reverse mode has reached them."""
         if self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"]) and dr.any(gradient != 0):
             warn_of_lost(self._source, f"{PREFIX}{name}")
         self._move(name, on_backward)
 
-    def buffers(self, names: Iterable[str] | None = None) -> dict[str, Any]:
+    def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
         """Mesh buffers of some attributes, by default of all, keyed by buffer name."""
         chosen = self._channels if names is None else names
         return {mesh_name(name): self._at_vertices(name) for name in chosen if name in self._loaded}
@@ -141,7 +143,7 @@ class CageAttributes:
 
         return make() if self._float is None else _UPLOADED.get((self._float, Content(values)), make)
 
-    def _at_vertices(self, name: str) -> Any:
+    def _at_vertices(self, name: str) -> FloatBuffer:
         if name not in self._moved:
             return self._uploaded[name].array
         values, channel = self._moved[name], self._channels[name]

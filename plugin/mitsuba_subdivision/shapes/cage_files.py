@@ -17,7 +17,7 @@ from ..cage.attributes import Attribute
 from ..cage.errors import noting_warnings, warn
 from ..mesh.shared import Shared
 
-# A file modified less than so many nanoseconds ago may change again without a new modification time: the resolution of
+# A file modified less than this many nanoseconds ago may change without a new modification time: the resolution of
 # file times is some milliseconds, and two seconds on some systems.
 SETTLED = 2_000_000_000
 # Suffixes of files that refer to no other files.

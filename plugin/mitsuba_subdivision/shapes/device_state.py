@@ -14,7 +14,7 @@ import drjit as dr
 
 # Packages whose objects hold Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
-_ROOMS = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
+_PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
 
 
 class DeviceState:
@@ -53,5 +53,5 @@ def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
     elif isinstance(value, (list, tuple)):
         for each in value:
             yield from _arrays_in(each, seen)
-    elif kind.__module__.startswith(_ROOMS) and hasattr(value, "__dict__"):
+    elif kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__"):
         yield from _arrays_in(vars(value), seen)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
 import numpy as np
@@ -20,6 +20,7 @@ from ..kernels.array_types import ArrayTypes
 from ..kernels.displacement import displaced
 from ..kernels.element_walk import Location
 from ..kernels.piece_kernel import PatchValues
+from ..kernels.types import Float, FloatBuffer, Vector3
 from ..kernels.vectors import cross, unit
 from ..mesh.connectivity import IntArray
 from ..patches import contracts_alike, evaluate_patches
@@ -44,19 +45,19 @@ class VertexLocations:
         Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
     uv : (n, 2) float64
         Samples at corners of elements have (0, 0).
-    place : (n,) int64
+    weld_target : (n,) int64
         The first copy of each vertex; the vertex itself where it has no copies.
     """
 
     corner: IntArray
     uv: FloatArray
-    place: IntArray
+    weld_target: IntArray
 
     @cached_property
     def copies(self) -> IntArray:
         """``(g, c)`` copies of each vertex that has several, padded with -1."""
-        order = np.argsort(self.place, kind="stable")
-        _, begins, counts = np.unique(self.place[order], return_index=True, return_counts=True)
+        order = np.argsort(self.weld_target, kind="stable")
+        _, begins, counts = np.unique(self.weld_target[order], return_index=True, return_counts=True)
         several = counts > 1
         begins, counts = begins[several, None], counts[several, None]
         along = np.arange(counts.max(initial=0))
@@ -67,7 +68,7 @@ class VertexLocations:
     @cached_property
     def group(self) -> IntArray:
         """``(n,)`` row of `copies` of each vertex; -1 for a vertex without copies."""
-        found = np.full(len(self.place), -1, dtype=np.int64)
+        found = np.full(len(self.weld_target), -1, dtype=np.int64)
         rows, columns = np.nonzero(self.copies >= 0)
         found[self.copies[rows, columns]] = rows
         return found
@@ -134,7 +135,7 @@ class DisplacedKernelVertices:
         self._group = types.indices(np.maximum(locations.group, 0))
         self._has_copies = types.indices((locations.group >= 0).astype(np.uint32)) != 0
         dr.eval(self._has_copies)
-        self._found: tuple[Any, Any] | None = None
+        self._found: tuple[FloatBuffer, FloatBuffer] | None = None
 
     def _read_values(self) -> None:
         """Evaluate what heights depend on, if it has changed."""
@@ -152,13 +153,13 @@ class DisplacedKernelVertices:
             raise RuntimeError("a surface without displacement; expected one that `ShapeDisplacement` was attached to")
         return found
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         found = self._vertices(points)
         self._found = dr.detach(found[0]), dr.detach(found[1])
         return self._moved(*found)
 
-    def attached(self, points: Any) -> tuple[Any, Any]:
+    def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         if dr.grad_enabled(points):
             return self._moved(*cast("DifferentiableVertices", self._vertices).attached(points))
@@ -166,9 +167,9 @@ class DisplacedKernelVertices:
             raise RuntimeError("vertices were not evaluated; expected a call before")
         return self._moved(*self._found)
 
-    def _moved(self, positions: Any, normals: Any) -> tuple[Any, Any]:
-        p: Any = dr.unravel(self._types.vector3, positions)
-        n: Any = dr.unravel(self._types.vector3, normals)
+    def _moved(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        p: Vector3 = dr.unravel(self._types.vector3, positions)
+        n: Vector3 = dr.unravel(self._types.vector3, normals)
         self._read_values()
         height = self._displacement.heights.height(self._value) * self._displacement.scale
         positions = dr.ravel(p + self._mean(height * n))
@@ -178,14 +179,14 @@ class DisplacedKernelVertices:
             normals = dr.ravel(dr.select(exists, own, n))
         return positions, normals
 
-    def _mean(self, vectors: Any) -> Any:
+    def _mean(self, vectors: Vector3) -> Vector3:
         """For each vertex, the mean of the vectors of all copies of it."""
         if not self._copies:
             return vectors
         flat, total = dr.ravel(vectors), self._types.vector3(0)
         for count, copies in enumerate(self._copies, start=1):
             total += dr.gather(self._types.vector3, flat, copies, self._counts >= count)
-        mean: Any = dr.gather(self._types.vector3, dr.ravel(total / self._counts), self._group, self._has_copies)
+        mean: Vector3 = dr.gather(self._types.vector3, dr.ravel(total / self._counts), self._group, self._has_copies)
         return dr.select(self._has_copies, mean, vectors)
 
 
@@ -221,7 +222,7 @@ class DisplacedTableVertices:
         self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
         self._read: Channel | None = None
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         self._read_values()
         positions, normals = (np.array(flat).reshape(-1, 3) for flat in self._vertices(points))
@@ -243,7 +244,7 @@ class DisplacedTableVertices:
             self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]
             self._read = channel
 
-    def _limit(self, points: Any) -> PatchValues:
+    def _limit(self, points: FloatBuffer) -> PatchValues:
         """The undisplaced limit surface at the vertices."""
         samples = evaluate_patches(
             self._surface.patches,
@@ -268,10 +269,10 @@ class DisplacedTableVertices:
         return found
 
 
-def _columns(rows: NDArray) -> list[Any]:
+def _columns(rows: NDArray) -> list[Float]:
     """Columns of an array, the vector components that `displaced` takes."""
     return [dr.scalar.ArrayXf64(np.ascontiguousarray(column, dtype=np.float64)) for column in rows.T]
 
 
-def _rows(columns: list[Any]) -> FloatArray:
+def _rows(columns: list[Float]) -> FloatArray:
     return np.stack([np.array(column) for column in columns], axis=1)

@@ -24,10 +24,12 @@ from ..kernels.channel_kernel import channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.displacement import Displacement
 from ..kernels.surface_kernel import SurfaceKernel
+from ..kernels.types import FloatBuffer
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import DisplacementBound
+from ..variants import Variant
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
 
 if TYPE_CHECKING:
@@ -74,7 +76,7 @@ class ShapeDisplacement:
 
     def __init__(
         self,
-        variant: Any,
+        variant: Variant,
         surface: LimitSurface,
         positions: FloatArray,
         given: Any,
@@ -128,12 +130,12 @@ class ShapeDisplacement:
         if self.kernel is not None and self.kernel.displacement is not None:
             self.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the scale; Mitsuba exposes a texture as an attribute of the shape."""
         flags = mi.ParamFlags
         callback.put("displacement_scale", self.scale, flags.Differentiable | flags.Discontinuous)
 
-    def set_values(self, values: Any) -> None:
+    def set_values(self, values: FloatBuffer) -> None:
         """Set new values, flat, of the channel that the heights depend on."""
         given = np.array(dr.detach(values), dtype=np.float64).reshape(self.channel.values.shape)
         self.channel = replace(self.channel, values=given)
@@ -142,7 +144,7 @@ class ShapeDisplacement:
         if self._own_values is not None:
             self._own_values.set(values)
 
-    def variables(self) -> list[Any]:
+    def variables(self) -> list[FloatBuffer]:
         """Differentiable arrays of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
 

@@ -21,11 +21,14 @@ from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import TriangleLocations, triangle_locations
+from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
+from ..kernels.vectors import dot
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
+from ..variants import Variant
 from .attribute_parameters import WIDTHS, mesh_name
 
 if TYPE_CHECKING:
@@ -36,6 +39,7 @@ GRAZING = 1e-2
 # Texture coordinates that differ by less belong to the same location.
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
+_PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
 _KINDS = (
     "are on the ray",
     "are along the normal nearby",
@@ -85,7 +89,9 @@ class ExactShading:
         Of texture coordinates and of the attributes that are evaluated on the surface, by their names in the cage.
     """
 
-    def __init__(self, variant: Any, surface: LimitSurface, positions: NDArray[np.float64], *, use_stam: bool) -> None:
+    def __init__(
+        self, variant: Variant, surface: LimitSurface, positions: NDArray[np.float64], *, use_stam: bool
+    ) -> None:
         self._variant = variant
         self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
@@ -93,8 +99,8 @@ class ExactShading:
         pieces = surface.pieces("stam" if use_stam else "stabilized")
         self.kernel = SurfaceKernel(pieces, float_type, use_stam=use_stam)
         self.kernel.load(positions)
-        self.to_world: Any = self.kernel.types.matrix4(1)
-        self._counts: Any = []
+        self.to_world: Matrix4 = self.kernel.types.matrix4(1)
+        self._counts: IndexBuffer = []
         self.take_counts()
         self._limit_surface = surface
         self._channels: dict[str, ChannelKernel] = {}
@@ -128,12 +134,12 @@ class ExactShading:
         layout = _welded(table, found.layout, first)
         return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
-    def follow_side_of(self, shape: Any) -> None:
+    def follow_side_of(self, shape: mi.Mesh) -> None:
         """Read the `Side` of a shape at every hit; its normals may be flipped."""
         self.side = _side_of(shape)
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
-    def place(self, to_world: Any, coefficients: Any, *, mirrors: bool) -> None:
+    def set_transform(self, to_world: Matrix4, coefficients: FloatBuffer, *, mirrors: bool) -> None:
         """Set the transformation and coefficients; derivatives by both reach surface interactions.
 
         Parameters
@@ -161,7 +167,7 @@ class ExactShading:
     def values(self) -> dict[str, ControlValues]:
         return {name: channel.values for name, channel in self._channels.items()}
 
-    def traverse(self, callback: Any) -> None:
+    def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the arrays that gradients pass through: forward mode reaches a rendering through such arrays only."""
         if not self._is_jit:
             return
@@ -171,25 +177,36 @@ class ExactShading:
         for name, values in self.values.items():
             callback.put(f"shading_cage_{name}", values.flat, differentiable)
 
-    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+    def complete(
+        self,
+        si: mi.SurfaceInteraction3f,
+        ray: mi.Ray3f,
+        preliminary: mi.PreliminaryIntersection3f,
+        flags: int,
+        active: Mask,
+    ) -> None:
         """Complete a surface interaction; see `InteractionHook`."""
         kernel, vector3 = self.kernel, self.kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:
             b1, b2 = b2, b1
-        moves = not flags & _DETACHES
+        # Without derivatives, less is traced.
+        moves = not flags & _DETACHES and self._is_moving()
         to_world = self._map(moves=moves)
         hit = dr.detach(to_world.inverse_point(vector3(dr.detach(si.p))))
-        d = dr.detach(to_world.inverse_direction(vector3(dr.detach(ray.d))))
+        along = vector3(dr.detach(ray.d))
+        d = dr.detach(to_world.inverse_direction(along))
         location = self._triangles(preliminary.prim_index, b1, b2, active)
         # Search no further than the triangle's size, nor than the ray's length: its origin is in front of the surface.
-        sides = (dr.detach(to_world.inverse_direction(vector3(dr.detach(side)))) for side in (si.dp_du, si.dp_dv))
-        farthest = dr.minimum(dr.maximum(*map(dr.norm, sides)), dr.detach(si.t) * dr.norm(d))
-        facing = dr.dot(dr.detach(si.n), dr.detach(ray.d)) * self._sign
+        # Both are lengths in the world, where they are compared along the ray.
+        sides = vector3(dr.detach(si.dp_du)), vector3(dr.detach(si.dp_dv))
+        size = dr.maximum(*(dot(side, side) for side in sides))
+        farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(along, along))), dr.detach(si.t)) * dr.sqrt(dot(d, d))
+        facing = dot(vector3(dr.detach(si.n)), along) * self._sign
         hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing)
         self._count(hits.kind, active)
         lines = None
-        if not flags & _FOLLOWS:
+        if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
             o, along = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
             lines = Lines(o, along, hits.kind == ON_LINE)
         found = kernel.at(
@@ -200,10 +217,13 @@ class ExactShading:
             moves=moves,
             values=hits.values,
         )
-        is_before = dr.dot(dr.detach(found.p) - hit, d) < 0
-        self._fill_in(si, ray, found.placed(to_world), is_before, active)
+        is_before = active & (dot(dr.detach(found.p) - hit, d) < 0)
+        found = found.placed(to_world)
+        if flags & _PARAMETERS:
+            self._set_parameters(si, found, active)
+        self._fill_in(si, ray, found, is_before)
 
-    def _count(self, kind: Any, active: Any) -> None:
+    def _count(self, kind: Index, active: Mask) -> None:
         """At the log level Debug, count hits by kind, and log the counts of the last kernel."""
         if mi.log_level() > mi.LogLevel.Debug:
             return
@@ -228,7 +248,7 @@ class ExactShading:
         self._counts = dr.zeros(self.kernel.types.index, len(_KINDS)) if self._is_jit else [0] * len(_KINDS)
         return counts
 
-    def attribute(self, name: str, si: Any, active: Any) -> Any:
+    def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
         """Value of an attribute; see `InteractionHook`."""
         if name not in self._attributes:
             return None
@@ -248,28 +268,33 @@ class ExactShading:
         location = location.chosen(is_other, self.kernel.line_hits(hit, mirrored, start, is_other).location)
         return self._attributes[name](location, active)[0]
 
+    def _is_moving(self) -> bool:
+        """Whether there are derivatives by anything that moves the surface."""
+        displacement = self.kernel.displacement
+        arrays = [] if displacement is None else displacement.variables()
+        return bool(dr.grad_enabled(self.kernel.coefficients, self.to_world, *arrays))
+
     def _map(self, *, moves: bool) -> AffineMap:
         """Map from object space to the world, with derivatives by its matrix or without."""
         return AffineMap.of(self.to_world if moves else dr.detach(self.to_world), self.kernel.types.vector3)
 
-    def _direction(self, si: Any, wi: Any) -> Any:
+    def _direction(self, si: mi.SurfaceInteraction3f, wi: Vector3) -> Vector3:
         """Direction of the ray at an interaction; the normal of an interaction without a ray."""
         vector3 = self.kernel.types.vector3
         seen = vector3(dr.detach(si.to_world(wi)))
         return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))
 
-    def _parameters(self, location: Location, active: Any) -> Any:
+    def _parameters(self, location: Location, active: Mask) -> Vector2:
         """Texture coordinates at a location; its parameters if the cage has none."""
         if self._texcoords is None:
             return location.u, location.v
         return self._texcoords(location, active)[0]
 
-    def _fill_in(self, si: Any, ray: Any, found: SurfacePoints, is_before: Any, active: Any) -> None:
+    def _fill_in(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, found: SurfacePoints, is_before: Mask) -> None:
         variant = self._variant
         exists = dr.squared_norm(found.n) > 0
         n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
-        n = _facing(n, ray.d, dr.dot(si.n, ray.d))
-        self._set_parameters(si, found, active)
+        n = _facing(n, ray.d, dr.dot(si.n, ray.d))  # type: ignore[misc]  # The stub is wrong.
         if side is Side.EMITTER:
             return
         si.sh_frame.n = n
@@ -278,11 +303,11 @@ class ExactShading:
         # If the surface lies behind the triangle, the ray leaves from the triangle, in front of all triangles.
         p = variant.Point3f(found.p)
         t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
-        is_before = is_before & (t > 0) & active
+        is_before &= t > 0
         si.p, si.t = dr.select(is_before, p, si.p), dr.select(is_before, t, si.t)
         si.n = n
 
-    def _set_parameters(self, si: Any, found: SurfacePoints, active: Any) -> None:
+    def _set_parameters(self, si: mi.SurfaceInteraction3f, found: SurfacePoints, active: Mask) -> None:
         """Parameters, or texture coordinates, and derivatives by them."""
         variant = self._variant
         u, v = found.location.u, found.location.v
@@ -301,7 +326,7 @@ class ExactShading:
             si.dn_du, si.dn_dv = (variant.Vector3f(each) for each in tangents[1])
 
 
-def _facing(n: Any, d: Any, side: Any) -> Any:
+def _facing(n: Vector3, d: Vector3, side: Float) -> Vector3:
     """Normals that face a ray from the same side as the triangle.
 
     Where a triangle sticks out beyond a silhouette, the surface nearby may face away, and would be black. There the
@@ -313,7 +338,7 @@ def _facing(n: Any, d: Any, side: Any) -> Any:
     return dr.select(dr.dot(n, d) * side < 0, turned, n)
 
 
-def _side_of(shape: Any) -> Callable[[], Side]:
+def _side_of(shape: mi.Mesh) -> Callable[[], Side]:
     """Function that returns the current `Side` of a shape; it does not keep the shape alive."""
     reference = weakref.ref(shape)
 

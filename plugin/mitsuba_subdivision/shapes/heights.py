@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..kernels.displacement import Heights
+from ..kernels.types import Float, Mask, Value, Vector2
+from ..variants import Variant
 
 if TYPE_CHECKING:
     from ..patches import Channel
@@ -67,11 +69,11 @@ class AttributeHeights:
     def __init__(self, channel: Channel) -> None:
         self._values = channel.values
 
-    def __call__(self, value: Any, du: Any, dv: Any, active: Any = True) -> tuple[Any, Any, Any]:  # noqa: ARG002
+    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:  # noqa: ARG002
         """See `Heights`."""
         return value, du, dv
 
-    def height(self, value: Any) -> Any:
+    def height(self, value: Value) -> Float:
         """The heights alone."""
         return value
 
@@ -101,7 +103,7 @@ class TextureHeights:
         If the texture is not a function of texture coordinates, or not scalar.
     """
 
-    def __init__(self, variant: Any, texture: Any) -> None:
+    def __init__(self, variant: Variant, texture: mi.Texture) -> None:
         self._variant, self._texture = variant, texture
         name = texture.class_name()
         if name in _ELSEWHERE:
@@ -115,14 +117,14 @@ class TextureHeights:
                 f'a texture of the kind "{name}" cannot be evaluated as a single number; expected a scalar texture, '
                 f'such as a bitmap that is "raw" ({error})'
             ) from None
-        self._gradient: Callable[[Any, Any, Any], Sequence[Any]]
+        self._gradient: Callable[[Float, Float, Mask], Sequence[Float]]
         try:
             texture.eval_1_grad(middle)
             self._gradient = self._own_gradient
         except RuntimeError:
             self._gradient = self._derivative if dr.is_diff_v(variant.Float) else self._difference
 
-    def __call__(self, value: Any, du: Any, dv: Any, active: Any = True) -> tuple[Any, Any, Any]:
+    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
         """See `Heights`."""
         s, t = value
         by_s, by_t = self._each(self._gradient, s, t, active)
@@ -130,7 +132,7 @@ class TextureHeights:
             by_s, by_t = self._corrected(by_s, by_t)
         return self._each(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
 
-    def height(self, value: Any) -> Any:
+    def height(self, value: Value) -> Float:
         """The heights alone."""
         s, t = value
         return self._each(self._height, s, t, True)
@@ -155,25 +157,25 @@ class TextureHeights:
         is_bound = self._texture.class_name() == "UniformSpectrum"
         return HeightRange(float(values.min()), float(values.max()), is_bound)
 
-    def _each(self, function: Callable, s: Any, t: Any, active: Any) -> Any:
+    def _each(self, function: Callable, s: Float, t: Float, active: Mask) -> Value:
         """Results of a function; scalar variants call it point by point."""
         if self._is_jit or not dr.is_array_v(s):
             return function(s, t, active)
         found = np.array([function(*each, True) for each in zip(s, t, strict=True)])
         return type(s)(found) if found.ndim == 1 else [type(s)(column) for column in found.T]
 
-    def _interaction(self, s: Any, t: Any) -> Any:
+    def _interaction(self, s: Float, t: Float) -> mi.SurfaceInteraction3f:
         si = dr.zeros(self._variant.SurfaceInteraction3f, max(dr.width(s), dr.width(t)) if self._is_jit else 1)
         si.uv = self._variant.Point2f(s, t)
         return si
 
-    def _height(self, s: Any, t: Any, active: Any) -> Any:
+    def _height(self, s: Float, t: Float, active: Mask) -> Float:
         return self._texture.eval_1(self._interaction(s, t), active)
 
-    def _own_gradient(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
+    def _own_gradient(self, s: Float, t: Float, active: Mask) -> Vector2:
         return self._texture.eval_1_grad(self._interaction(s, t), active)
 
-    def _corrected(self, by_s: Any, by_t: Any) -> Sequence[Any]:
+    def _corrected(self, by_s: Float, by_t: Float) -> Sequence[Float]:
         """Gradients of a rotated bitmap with sides of unequal length.
 
         Mitsuba 3.9.1 multiplies them by the numbers of texels along either side after ``to_uv`` instead of before.
@@ -188,7 +190,7 @@ class TextureHeights:
         (a, b), (c, d) = (to_uv.T @ np.diag(sides) @ np.linalg.inv(to_uv.T) @ np.diag(1 / sides)).tolist()
         return a * by_s + b * by_t, c * by_s + d * by_t
 
-    def _derivative(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
+    def _derivative(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
         found = []
         with dr.resume_grad():
             for direction in ((1, 0), (0, 1)):
@@ -201,7 +203,7 @@ class TextureHeights:
                 found.append(dr.grad(height))
         return found
 
-    def _difference(self, s: Any, t: Any, active: Any) -> Sequence[Any]:
+    def _difference(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
         step = DIFFERENCE
         return (
             (self._height(s + step, t, active) - self._height(s - step, t, active)) / (2 * step),

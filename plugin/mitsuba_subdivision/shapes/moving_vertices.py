@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
+from ..kernels.types import FloatBuffer, Matrix4
 from .placement import Placement, RecentredPoints
 from .vertices import DifferentiableVertices, Vertices
 
 if TYPE_CHECKING:
+    from ..kernels.surface_kernel import SurfaceKernel
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
 
@@ -60,11 +62,11 @@ class MovingVertices:
         self.are_differentiable = vertices.are_differentiable
         self._computed: set[int] = set()
         # In object space, where something has derivatives.
-        self._found: tuple[Any, Any] | None = None
+        self._found: tuple[FloatBuffer, FloatBuffer] | None = None
 
     def evaluated(
-        self, control_points: Any, placement: Placement, on_backward: Callable, *, moves_points: bool
-    ) -> dict[str, Any]:
+        self, control_points: FloatBuffer, placement: Placement, on_backward: Callable, *, moves_points: bool
+    ) -> dict[str, FloatBuffer]:
         """Evaluate the mesh's buffers, by their names, and have exact shading follow.
 
         Parameters
@@ -94,7 +96,9 @@ class MovingVertices:
             self._found = dr.detach(found[0]), dr.detach(found[1])
         return self._placed(*found, placement, on_backward)
 
-    def attached(self, control_points: Any, placement: Placement, on_backward: Callable) -> dict[str, Any]:
+    def attached(
+        self, control_points: FloatBuffer, placement: Placement, on_backward: Callable
+    ) -> dict[str, FloatBuffer]:
         """The buffers of the last evaluation, attached to the parameters again, as is exact shading."""
         points = self._points(control_points)
         if self._kernel is not None and dr.grad_enabled(points):
@@ -104,7 +108,9 @@ class MovingVertices:
             found = cast("DifferentiableVertices", self._vertices).attached(points)
         return self._placed(*found, placement, on_backward)
 
-    def warn_of_lost(self, gradients: dict[str, Any], control_points: Any, placement: Placement) -> None:
+    def warn_of_lost(
+        self, gradients: dict[str, FloatBuffer | Matrix4], control_points: FloatBuffer, placement: Placement
+    ) -> None:
         """Warn if a gradient has come to the parameters, but could not get to what these were computed from.
 
         Parameters
@@ -118,17 +124,19 @@ class MovingVertices:
             warn_of_lost(self._name, parameters)
 
     @property
-    def _kernel(self) -> Any:
+    def _kernel(self) -> SurfaceKernel | None:
         """The surface kernel, displaced or not; None if it is not needed."""
         if self._shading is not None:
             return self._shading.kernel
         return None if self._displacement is None else self._displacement.kernel
 
-    def _others(self) -> list[Any]:
+    def _others(self) -> list[FloatBuffer]:
         """Arrays besides the parameters that vertices are computed from."""
         return [] if self._displacement is None else self._displacement.variables()
 
-    def _placed(self, positions: Any, normals: Any, placement: Placement, on_backward: Callable) -> dict[str, Any]:
+    def _placed(
+        self, positions: FloatBuffer, normals: FloatBuffer, placement: Placement, on_backward: Callable
+    ) -> dict[str, FloatBuffer]:
         if not placement.is_identity:
             positions, normals = _placed(positions, normals, placement.matrix)
         moved = {"vertex_positions": positions, "vertex_normals": normals}
@@ -140,7 +148,7 @@ class MovingVertices:
             if attached:
                 moved |= dr.custom(Watched, attached, on_backward)
         if shading is not None:
-            shading.place(moved.pop("to_world"), moved.pop("coefficients"), mirrors=placement.mirrors)
+            shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), mirrors=placement.mirrors)
         return moved
 
 
@@ -190,7 +198,7 @@ def computed_ones(*values: Any) -> set[int]:
     """Find arrays that were computed from variables with derivatives, which Dr.Jit still knows.
 
     There is no such computation behind a variable whose own gradient is asked for, and none after a gradient has passed
-    through it, which Dr.Jit then forgets unless it is told otherwise.
+    through it, which Dr.Jit then forgets by default.
 
     Returns
     -------
@@ -202,7 +210,7 @@ def computed_ones(*values: Any) -> set[int]:
     return {index for index in derivatives if f" {index} -> " in graph}
 
 
-def _placed(positions: Any, normals: Any, matrix: Any) -> tuple[Any, Any]:
+def _placed(positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4) -> tuple[FloatBuffer, FloatBuffer]:
     """Flat positions and unit normals in the world, of those in object space."""
     if dr.is_jit_v(positions):
         from ..kernels.affine_map import placed

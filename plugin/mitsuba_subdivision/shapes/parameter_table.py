@@ -9,9 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..cage.rules import RULES
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 # Flags of a parameter that `traverse` exposes, as Mitsuba's documentation names them.
 EXPOSED = ("exposed",)
@@ -358,7 +361,7 @@ STATE_PARAMETERS = (
     Parameter(
         "vertex_positions",
         "float[]",
-        "Points of the tessellation in world space. Updates of the control points overwrite what is assigned to them",
+        "Points of the tessellation in world space. Updates of the control points overwrite assigned values",
         flags=DISCONTINUOUS,
     ),
     Parameter(
@@ -371,7 +374,7 @@ STATE_PARAMETERS = (
         "vertex_texcoords",
         "float[]",
         "Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite "
-        "what is assigned to them",
+        "assigned values",
         flags=DIFFERENTIABLE,
     ),
     Parameter(
@@ -392,7 +395,7 @@ STATE_PARAMETERS = (
 PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
 
-def value_of(props: Any, name: str) -> Any:
+def value_of(props: mi.Properties, name: str) -> Any:
     """The checked value of a parameter that a scene gives to the shape; the default where there is none.
 
     Raises

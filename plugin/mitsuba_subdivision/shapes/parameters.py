@@ -66,7 +66,7 @@ class Parameters:
     displacement_scale: float
 
 
-def read_parameters(props: Any) -> Parameters:
+def read_parameters(props: mi.Properties) -> Parameters:
     """Read and check the parameters that a scene gives to the shape.
 
     Parameters
@@ -106,7 +106,7 @@ def read_parameters(props: Any) -> Parameters:
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
-    source = os.path.basename(props["filename"]) if "filename" in props else "control cage"
+    source = os.path.basename(str(props["filename"])) if "filename" in props else "control cage"
     return Parameters(
         LimitSurface(cage, scheme),
         source,
@@ -121,7 +121,7 @@ def read_parameters(props: Any) -> Parameters:
     )
 
 
-def _displacement(props: Any) -> tuple[Any, float]:
+def _displacement(props: mi.Properties) -> tuple[Any, float]:
     """Texture or mesh attribute of the heights, or None, and their scale."""
     scale = value_of(props, "displacement_scale")
     if "displacement" not in props:
@@ -138,7 +138,7 @@ def _displacement(props: Any) -> tuple[Any, float]:
     return given, 1.0 if scale is None else float(scale)
 
 
-def _reject_unknown(props: Any) -> None:
+def _reject_unknown(props: mi.Properties) -> None:
     for name in props.keys():  # noqa: SIM118 - Properties iterates over pairs
         # Nested objects may have any name; Mitsuba itself rejects those that a shape cannot have.
         if name in PARAMETER_OF_NAME or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
@@ -150,7 +150,7 @@ def _reject_unknown(props: Any) -> None:
         raise ValueError(f'unknown parameter "{name}"{meant} known parameters: {", ".join(PARAMETER_OF_NAME)}')
 
 
-def _cage(props: Any, scheme: str | None) -> ControlCage:
+def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
     from .cage_files import cage_of_arrays, cage_of_file
 
     rules = {name: value_of(props, name) for name in RULES if name in props}
@@ -183,7 +183,7 @@ def _cage(props: Any, scheme: str | None) -> ControlCage:
     return cage_of_arrays(**parts, strict=strict, **rules, **read_attributes(props, _tensor))
 
 
-def _tensor(props: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
+def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Values of a tensor, of a shape with -1 for any size. One-dimensional tensors hold integers."""
     value = props[name]
     if not hasattr(value, "shape"):

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.types import FloatBuffer, Matrix4
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
 _LAST_ROW = (0, 0, 0, 1)
-# Points are far from the origin if their middle is more than so many times half their extent away from it. Nearer
+# Points are far from the origin if their middle is more than this many times half their extent away from it. Nearer
 # points lose at most two of 24 bits by rounding to float32.
 FAR = 4
 
@@ -73,7 +78,7 @@ class RecentredPoints:
             self._relative = float_type(self.positions.ravel())
             self._centres = float_type(np.tile(centre, len(positions)))
 
-    def __call__(self, control_points: Any) -> Any:
+    def __call__(self, control_points: FloatBuffer) -> FloatBuffer:
         """Flat control points relative to the centre."""
         # A wrong number of control points raises an error where they are used.
         if self.centre is None or len(control_points) != len(self._loaded):
@@ -95,12 +100,14 @@ class Placement:
         Whether it is a reflection, which turns triangles inside out.
     """
 
-    matrix: Any
+    matrix: Matrix4
     is_identity: bool
     mirrors: bool
 
     @classmethod
-    def of(cls, to_world: Any, value: NDArray[np.float64], centre: NDArray[np.float64] | None) -> Placement:
+    def of(
+        cls, to_world: mi.AffineTransform4f, value: NDArray[np.float64], centre: NDArray[np.float64] | None
+    ) -> Placement:
         """The placement by a transformation.
 
         Parameters

@@ -10,11 +10,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.types import Float, FloatBuffer, IndexBuffer, Matrix4
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
+from ..variants import Variant
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
-from .collection import paused_collection
+from .garbage_collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
 from .parameter_table import errors_about
@@ -37,7 +39,7 @@ _MOVED = ["vertex_positions", "vertex_normals"]
 _CHOOSING = set(LIMITS)
 
 
-def make_subdivision(variant: Any) -> type:
+def make_subdivision(variant: Variant) -> type:
     """Make the shape class of a variant of Mitsuba.
 
     Parameters
@@ -59,10 +61,12 @@ def make_subdivision(variant: Any) -> type:
             Values to assign; if omitted, buffers are read into it.
         """
 
-        def __init__(self, mesh: Any, names: Collection[str], values: dict[str, Any] | None = None) -> None:
+        def __init__(
+            self, mesh: mi.Mesh, names: Collection[str], values: dict[str, FloatBuffer | IndexBuffer] | None = None
+        ) -> None:
             super().__init__()
             self.mesh, self.names, self.assigns = mesh, names, values is not None
-            self.values: dict[str, Any] = {} if values is None else values
+            self.values: dict[str, FloatBuffer | IndexBuffer] = {} if values is None else values
 
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
             if name not in self.names:
@@ -91,7 +95,7 @@ def make_subdivision(variant: Any) -> type:
 
         @on_shallow_stack
         @paused_collection()
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             problem = llvm_problem() if runs_on_llvm else None
             if problem:
                 # The first kernel would crash the process.
@@ -144,7 +148,7 @@ def make_subdivision(variant: Any) -> type:
             )
             if self._exact is not None:
                 from .device_state import DeviceState
-                from .interaction_hook import interaction_hook
+                from .hook.interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
@@ -211,7 +215,7 @@ def make_subdivision(variant: Any) -> type:
             self._prepare(points, to_world)
             self._assemble(moves_points=True)
 
-        def traverse(self, callback: Any) -> None:
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             super().traverse(callback)
             flags = mi.ParamFlags
             callback.put("control_points", self.control_points, flags.Differentiable | flags.Discontinuous)
@@ -254,7 +258,7 @@ def make_subdivision(variant: Any) -> type:
                 self._has_outlines = False
             self._set_buffers(buffers)
             is_attached = self._vertices.are_differentiable and dr.grad_enabled(buffers["vertex_positions"])
-            if is_attached and self._triangles.place is not None:
+            if is_attached and self._triangles.weld_target is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # Listed among the keys, so that Mitsuba keeps these normals instead of averaging those of the triangles.
@@ -267,7 +271,7 @@ def make_subdivision(variant: Any) -> type:
                 # Literals would be compiled into kernels.
                 dr.make_opaque(self.to_world, self._placement.matrix)
 
-        def _tessellate(self, *, moves_points: bool) -> dict[str, Any]:
+        def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
             """Evaluate the moving buffers, and update exact shading."""
             with errors_about("control_points"):
                 on_backward = on_backward_of(self.renew_derivatives)
@@ -275,7 +279,7 @@ def make_subdivision(variant: Any) -> type:
                     self.control_points, self._placement, on_backward, moves_points=moves_points
                 )
 
-        def renew_derivatives(self, gradients: dict[str, Any]) -> None:
+        def renew_derivatives(self, gradients: dict[str, FloatBuffer | Matrix4]) -> None:
             """Attach the moving arrays to the parameters again, without evaluating them; see `MovingVertices`.
 
             Parameters
@@ -290,7 +294,7 @@ def make_subdivision(variant: Any) -> type:
             with dr.resume_grad():
                 self._attach_vertices()
 
-        def renew_attribute(self, name: str, gradient: Any) -> None:
+        def renew_attribute(self, name: str, gradient: FloatBuffer) -> None:
             """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
             with dr.resume_grad():
                 self._cage.renew(name, gradient, on_backward_of(self.renew_attribute))
@@ -302,7 +306,7 @@ def make_subdivision(variant: Any) -> type:
             on_backward = on_backward_of(self.renew_derivatives)
             self._replace_gradients(self._vertices.attached(self.control_points, self._placement, on_backward))
 
-        def _replace_gradients(self, buffers: dict[str, Any]) -> None:
+        def _replace_gradients(self, buffers: dict[str, FloatBuffer]) -> None:
             """Give the mesh's buffers the derivatives of others, except for buffers that a user has assigned since."""
             now = self._get_buffers(*buffers)
             self._set_buffers(
@@ -313,13 +317,13 @@ def make_subdivision(variant: Any) -> type:
                 }
             )
 
-        def _set_buffers(self, values: dict[str, Any]) -> None:
+        def _set_buffers(self, values: dict[str, FloatBuffer | IndexBuffer]) -> None:
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
             super().traverse(MeshBuffers(self, values.keys(), values))
             self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
 
-        def _get_buffers(self, *names: str) -> dict[str, Any]:
+        def _get_buffers(self, *names: str) -> dict[str, FloatBuffer | IndexBuffer]:
             found = MeshBuffers(self, names)
             super().traverse(found)
             return found.values
@@ -335,17 +339,17 @@ def make_subdivision(variant: Any) -> type:
             if self._has_outlines:
                 return
             faces = self._get_buffers("faces")["faces"]
-            self._set_buffers({"faces": dr.gather(type(faces), self._triangles.place, faces)})
+            self._set_buffers({"faces": dr.gather(type(faces), self._triangles.weld_target, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
 
-        def _turned_faces(self) -> Any:
+        def _turned_faces(self) -> IndexBuffer:
             """Triangles with reversed orientation."""
             faces = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)
             return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
 
-        def surface_area(self) -> Any:
+        def surface_area(self) -> Float:
             """Area of the triangles, with derivatives, which Mitsuba's own method does not have."""
             area = super().surface_area()
             if not self.parameters_grad_enabled():
@@ -384,9 +388,9 @@ def make_subdivision(variant: Any) -> type:
     return Subdivision
 
 
-def _is_exact(parameters: Parameters, variant: Any) -> bool:
+def _is_exact(parameters: Parameters, variant: Variant) -> bool:
     if parameters.shading == "auto" and not parameters.face_normals:
-        from .automatic_shading import exact_shading_problem
+        from .exact_shading_support import exact_shading_problem
 
         return exact_shading_problem(variant) is None
     return parameters.shading == "exact"

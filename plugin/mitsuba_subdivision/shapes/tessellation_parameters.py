@@ -12,6 +12,8 @@ from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
 
 if TYPE_CHECKING:
+    import mitsuba as mi
+
     from ..surface import LimitSurface
     from ..tessellation import DisplacementBound, Sensor, VertexTable
 
@@ -156,7 +158,7 @@ class AdaptiveTessellation:
 Tessellation = UniformTessellation | AdaptiveTessellation
 
 
-def read_tessellation(props: Any) -> Tessellation:
+def read_tessellation(props: mi.Properties) -> Tessellation:
     """Read and check the tessellation parameters.
 
     Raises
@@ -186,7 +188,7 @@ def read_tessellation(props: Any) -> Tessellation:
     return AdaptiveTessellation(limit, error, value_of(props, "max_rate"), sensor, fits_outline)
 
 
-def _sensor(props: Any, is_needed: bool, needed_by: str) -> ViewingSensor | None:
+def _sensor(props: mi.Properties, is_needed: bool, needed_by: str) -> ViewingSensor | None:
     given = [name for name in SENSOR if name in props]
     if not is_needed:
         if given:
@@ -204,7 +206,7 @@ def _sensor(props: Any, is_needed: bool, needed_by: str) -> ViewingSensor | None
     return ViewingSensor(to_world, float(fov), (width, height))
 
 
-def pixel_error_for(sensor: Any, pixel_error: float | None = 0.5, *, outline: bool = False) -> dict[str, Any]:
+def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outline: bool = False) -> dict[str, Any]:
     """Parameters of a shape that tessellate it adaptively for a sensor.
 
     Parameters

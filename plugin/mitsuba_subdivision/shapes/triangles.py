@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from ..kernels.alignment import aligned
+from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.shared import Shared
+from ..variants import Variant
 from .vertices import split_weld_targets
 
 if TYPE_CHECKING:
@@ -20,7 +23,7 @@ if TYPE_CHECKING:
 class SharedArray:
     """A buffer of several meshes."""
 
-    array: Any
+    array: FloatBuffer | IndexBuffer
 
 
 class Triangles:
@@ -41,14 +44,14 @@ class Triangles:
     has_texcoords : bool
     """
 
-    def __init__(self, variant: Any, table: VertexTable, attributes: AttributeTable) -> None:
+    def __init__(self, variant: Variant, table: VertexTable, attributes: AttributeTable) -> None:
         self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
         self.table, self.layout, self._attributes = table, attributes.layout, attributes
         self.patch_count, self.has_texcoords = table.patch_count, "texcoords" in attributes.values
         # Keeps shared arrays alive.
         self._held: dict[str, SharedArray] = {}
 
-    def faces(self, *, are_turned: bool) -> Any:
+    def faces(self, *, are_turned: bool) -> IndexBuffer:
         """Vertices of all triangles, flat; with reversed orientation on request."""
 
         def make() -> SharedArray:
@@ -60,7 +63,7 @@ class Triangles:
         return self._shared("faces", (self.layout, self._variant, are_turned), make)
 
     @property
-    def element(self) -> Any:
+    def element(self) -> FloatBuffer:
         """Element of each triangle, as floats."""
 
         def make() -> SharedArray:
@@ -70,16 +73,16 @@ class Triangles:
         return self._shared("element", (self.table, self._variant), make)
 
     @property
-    def place(self) -> Any:
+    def weld_target(self) -> IndexBuffer | None:
         """See `split_weld_targets`; None where no vertices have copies."""
 
         def make() -> SharedArray:
             found = split_weld_targets(self.table, self._attributes)
             return SharedArray(None if found is None else self._variant.UInt32(found))
 
-        return self._shared("place", (self.table, self.layout, self._variant), make)
+        return self._shared("weld_target", (self.table, self.layout, self._variant), make)
 
-    def _shared(self, name: str, key: tuple, make: Any) -> Any:
+    def _shared(self, name: str, key: tuple, make: Callable[[], SharedArray]) -> FloatBuffer | IndexBuffer:
         self._held[name] = _SHARED.get((name, *key), make)
         return self._held[name].array
 

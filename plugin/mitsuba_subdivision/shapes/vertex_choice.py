@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
 
-# Above so many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
+# Above this many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
 WORTH_A_KERNEL = 300_000
 
 
@@ -63,8 +63,8 @@ def vertices_of(
     from .displaced_vertices import DisplacedKernelVertices, DisplacedTableVertices, VertexLocations
 
     found = split_weld_targets(table, split)
-    place = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
-    locations = VertexLocations(*(split.locate or table.locations)(), place)
+    weld_target = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
+    locations = VertexLocations(*(split.locate or table.locations)(), weld_target)
     slopes = locations.follow_slopes(surface, displacement.channel)
     has_normals = not (is_exact or parameters.face_normals)
     if displacement.kernel is not None and is_jit and float_type is not None:

@@ -8,18 +8,20 @@ imported where they are used: a small scene of a scalar variant needs none.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..surface import LimitSurface
 
 if TYPE_CHECKING:
     from ..kernels import EvaluatedVertices, WeightKernel
+    from ..kernels.array_types import ArrayTypes
     from ..tessellation import AttributeTable, VertexTable
     from .parameters import Parameters
 
@@ -35,7 +37,7 @@ class Vertices(Protocol):
 
     are_differentiable: bool
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Positions and normals."""
         ...
 
@@ -43,7 +45,7 @@ class Vertices(Protocol):
 class DifferentiableVertices(Vertices, Protocol):
     """Vertices with derivatives by the control points."""
 
-    def attached(self, points: Any) -> tuple[Any, Any]:
+    def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """The vertices of the last call, attached to the control points again."""
         ...
 
@@ -56,7 +58,7 @@ class TableVertices:
     def __init__(self, table: VertexTable) -> None:
         self._table = table
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         positions, normals = self._table.apply(_rows(points, self._table.control_count), np.float32)
         return positions.ravel(), normals.ravel()
@@ -70,7 +72,7 @@ class SampledVertices:
     def __init__(self, table: VertexTable, parameters: Parameters, float_type: type | None) -> None:
         self._table, self._parameters, self._float = table, parameters, float_type
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         given, cage = self._parameters, self._parameters.surface.cage
         surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), given.surface.scheme)
@@ -91,7 +93,7 @@ class KernelVertices:
         self._evaluated: EvaluatedVertices | None = None
         self.are_differentiable = bool(dr.is_diff_v(float_type))
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         # Free the last evaluation before the next one allocates memory.
         self._evaluated = None
@@ -102,7 +104,7 @@ class KernelVertices:
         self._evaluated = self._kernel.evaluated(dr.detach(points))
         return self._evaluated.attached(points)
 
-    def attached(self, points: Any) -> tuple[Any, Any]:
+    def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         if self._evaluated is None:
             raise RuntimeError("vertices were not evaluated with derivatives; expected a call with some before")
@@ -126,30 +128,30 @@ class SplitVertices:
         self.are_differentiable = vertices.are_differentiable
 
     @cached_property
-    def _types(self) -> Any:
+    def _types(self) -> ArrayTypes:
         from ..kernels.array_types import ArrayTypes
 
         return ArrayTypes.of(self._float or float)
 
     @cached_property
-    def _index(self) -> Any:
+    def _index(self) -> IndexBuffer:
         return self._surface_vertex if self._float is None else self._types.indices(self._surface_vertex)
 
-    def __call__(self, points: Any) -> tuple[Any, Any]:
+    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         return self._split(*self._vertices(points))
 
-    def attached(self, points: Any) -> tuple[Any, Any]:
+    def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """See `Vertices`."""
         return self._split(*cast("DifferentiableVertices", self._vertices).attached(points))
 
-    def _split(self, positions: Any, normals: Any) -> tuple[Any, Any]:
+    def _split(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         if self._float is None:
             return tuple(flat.reshape(-1, 3)[self._index].ravel() for flat in (positions, normals))  # type: ignore[return-value]
         return self._types.gathered(positions, self._index), self._types.gathered(normals, self._index)
 
 
-def require_finite(control_points: Any) -> None:
+def require_finite(control_points: FloatBuffer) -> None:
     """Check flat coordinates on any device.
 
     Raises
@@ -172,15 +174,15 @@ def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArra
     """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None
-    place = attributes.gathered(table.weld_target)
+    target = attributes.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
-    vertices = np.arange(len(place), dtype=np.uint32)
-    # Of several split vertices in a place, the last that is assigned stays: the first one.
-    first[place[::-1]] = vertices[::-1]
-    return first[place]
+    vertices = np.arange(len(target), dtype=np.uint32)
+    # Of several split vertices of one target, the last that is assigned stays: the first one.
+    first[target[::-1]] = vertices[::-1]
+    return first[target]
 
 
-def _rows(points: Any, count: int) -> NDArray[np.float64]:
+def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
     """Flat control points as ``(count, 3)``.
 
     Raises

@@ -7,16 +7,18 @@ from typing import Any
 
 import mitsuba as mi
 
+from ..kernels.types import Float
+
 
 def loss_of_views(
-    scene: Any,
-    params: Any,
-    loss: Callable[[Any, int], Any],
-    sensors: Sequence[Any] | None = None,
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    loss: Callable[[mi.TensorXf, int], Float],
+    sensors: Sequence[int | mi.Sensor] | None = None,
     *,
     seed: int = 0,
     **options: Any,
-) -> Any:
+) -> Float:
     """Render a scene through several sensors, and sum a loss of each image.
 
     ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With one

@@ -60,7 +60,7 @@ class SceneSource(Protocol[C]):
         points : (n, 3) float64, optional
             Points that the camera must see in all frames; by default, the points of the contents.
         follows_sensor : bool
-            Whether the scene's own sensor is the only one that is going to see it, so that triangles may depend on it.
+            Whether only the scene's own sensor renders it, so that triangles may depend on the sensor.
         """
 
     def frames(
@@ -93,7 +93,7 @@ class StillPicture:
 class Turntable:
     """A cage or a stage that turns once around the middle of its bounds, with its own lights.
 
-    Nothing of it moves in Mitsuba: the camera goes around it the other way, with the lights and the backdrop of the
+    In Mitsuba the model stands still: the camera turns around it the other way, with the lights and the backdrop of the
     studio. The studio's camera sees all of it in all frames. Frame 1 is the still picture; in the next ones, what is
     shown is turned counter-clockwise, seen from above.
 

@@ -126,7 +126,7 @@ class CageScenes:
         Raises
         ------
         CageError
-            If texture coordinates are to be shown, and there are none.
+            If ``checker`` is set, and there are no texture coordinates.
         """
         look, model = self._look, contents.model
         if look.checker and model.cage.texcoords is None:

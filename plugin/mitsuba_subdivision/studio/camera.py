@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from .view import View, angles_of, studio_axes
 
-# Of the picture's longer side, in degrees: as long lenses have that products and faces are photographed with.
+# Field of view of the picture's longer side, in degrees: that of long lenses for products and portraits.
 FIELD_OF_VIEW = 28.0
 # Part of the picture that stays empty on each side.
 MARGIN = 0.08
@@ -61,7 +61,7 @@ def framed(
         above, below = (along - slope * z).max(), (-along - slope * z).max()
         nearest.append(-(above + below) / (2 * slope))
         middle.append((above - below) / 2)
-    # Nearer, what is long along the view would look distorted, and a camera could stand in the tip of a needle.
+    # A nearer camera would distort models that are long along the view, and could lie inside a thin tip.
     depth = min(*nearest, z.min() - NEAREST * (z.max() - z.min()))
     centre = (z.min() + z.max()) / 2
     return Camera(axes, axes @ np.array([*middle, depth]), float(centre - depth))

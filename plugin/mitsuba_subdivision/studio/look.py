@@ -30,6 +30,8 @@ class Look:
         Whether texture coordinates of a cage are shown as a checkerboard.
     cage : bool
         Whether the control cage is drawn over its surface.
+    texture_size : int or None
+        Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows.
     """
 
     view: View = DEFAULT_VIEW
@@ -40,3 +42,4 @@ class Look:
     shading: str = "vertex"
     checker: bool = False
     cage: bool = False
+    texture_size: int | None = None

@@ -41,7 +41,7 @@ def studio_scene(
         "front", "side", "back", "top", "three-quarter", or angles in degrees: azimuth 0 is the front, which is -y where
         z is up, and +z where y is up; azimuth 90 is +x; elevation 90 is straight from above.
     up : "y" or "z", optional
-        Axis that points up. By default what a USD file says; y for OBJ files, z for PLY files and cages in memory.
+        Axis that points up. By default that of a USD file; y for OBJ files, z for PLY files and cages in memory.
     size : (width, height)
     spp : int
         Samples per pixel.
@@ -63,9 +63,9 @@ def studio_scene(
     Raises
     ------
     CageError, OSError
-        As `ControlCage.from_file` does; or if a checkerboard is asked for and there are no texture coordinates.
+        As `ControlCage.from_file` does; or if ``checker`` is set and there are no texture coordinates.
     ValueError
-        If view, axis or size are none.
+        If the view, the axis or the size is invalid.
     """
     shading = shading_for(variant_in_use(), {"shading": shading})
     look = Look(view, size, spp, up, rate, shading, checker, cage)

@@ -118,7 +118,7 @@ def _contents(entry: SceneNode) -> CageContents:
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry, lambda properties, key, _shape: np.array(properties[key]))
     with warnings.catch_warnings():
-        # The scene has had these warnings.
+        # These warnings were issued when the scene was made.
         warnings.simplefilter("ignore", CageWarning)
         return ControlCage.from_arrays(**arrays, **rules, **data).contents
 
@@ -152,7 +152,7 @@ def _suffix_for(name: str, contents: CageContents) -> str:
 
 
 def _with_name(path: Path, kept: SceneNode) -> SceneNode:
-    # The type comes first, as `mi.load_dict` has it.
+    # The type comes first, as `mi.load_dict` expects.
     return {"type": kept.pop("type"), "filename": str(path), **kept}
 
 
@@ -164,5 +164,5 @@ def _write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
 def _relative(path: Path, folder: Path) -> str:
     try:
         return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
-    except ValueError:  # On Windows, there is no way from one drive to another.
+    except ValueError:  # On Windows, there is no relative path from one drive to another.
         return path.resolve().as_posix()

@@ -76,7 +76,7 @@ def studio(
     ------
     ValueError
         If no variant is set; if bounds are not finite, or the least not below the greatest; if view, axis, size or
-        samples are none.
+        samples are invalid.
     """
     variant_in_use()
     box = _checked_bounds(bounds)

@@ -50,7 +50,7 @@ def angles_of(view: View) -> tuple[float, float]:
 def studio_axes(up: str) -> NDArray[np.float64]:
     """Directions of the studio in the world: columns right, back and up ``(3, 3)``, of a viewer before the front.
 
-    A model's front is where modelling programs have it: -y where z is up, +z where y is up.
+    A model's front is that of modelling programs: -y where z is up, +z where y is up.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """The limit surface of a control cage."""
 
-from .limit_surface import TEXCOORDS, LimitSurface, limit_stencil
+from .limit_surface import TEXCOORDS, LimitSurface
 from .samples import SurfaceSamples
 
-__all__ = ["TEXCOORDS", "LimitSurface", "SurfaceSamples", "limit_stencil"]
+__all__ = ["TEXCOORDS", "LimitSurface", "SurfaceSamples"]

@@ -18,7 +18,7 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.normals import unit_normals
 from ..mesh.shared import Shared
 from ..refinement.adapted_scheme import adapted_scheme
-from ..schemes import Scheme, scheme_named
+from ..schemes import Scheme
 from ..schemes.domain import FloatArray
 from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from scipy import sparse
 
-    from ..evaluation.limit_stencil import LimitStencil
     from ..kernels.surface_kernel import SurfaceKernel
     from ..patches import (
         AreaSamples,
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
         ElementBounds,
         PatchTable,
         PieceTable,
-        SamplePlaces,
+        SamplingCells,
         StencilMatrices,
         SurfaceAreas,
         SurfacePieces,
@@ -142,7 +141,7 @@ class LimitSurface:
             Precision of the evaluation; control points are rounded to it first.
         derivatives : 1 or 2
             2 adds second derivatives and curvature. The stabilised form computes curvature in the frame of the limit
-            normal, where tangential terms cannot drown it.
+            normal, where tangential terms do not hide it.
 
         Returns
         -------
@@ -293,7 +292,7 @@ class LimitSurface:
         Parameters
         ----------
         order : int
-            Gauss's rule has so many places along each parameter of every polynomial piece. Around extraordinary points
+            Gauss's rule has so many nodes along each parameter of every polynomial piece. Around extraordinary points
             levels are summed until a millionth is left.
 
         Returns
@@ -364,7 +363,9 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        half_edge, uv = patches.uniform_places(self._all_pieces, self._areas, int(count), np.random.default_rng(seed))
+        half_edge, uv = patches.uniform_locations(
+            self._all_pieces, self._areas, int(count), np.random.default_rng(seed)
+        )
         found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
         return patches.AreaSamples(*self._element_and_corner(half_edge), uv, found.p, found.n, found.dp_du, found.dp_dv)
 
@@ -418,8 +419,8 @@ class LimitSurface:
     def _areas(self) -> SurfaceAreas:
         return patches.SurfaceAreas.of(self._all_pieces)
 
-    def _sample_places(self) -> SamplePlaces:
-        return patches.SamplePlaces.build(self._all_pieces, self._areas)
+    def _sampling_cells(self) -> SamplingCells:
+        return patches.SamplingCells.build(self._all_pieces, self._areas)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
@@ -484,8 +485,8 @@ class LimitSurface:
         if evaluator not in ("stabilized", "stam"):
             raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
         float_type = float_type_of(variant_name(variant))
-        places = self._sample_places
-        kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", places=places)
+        cells = self._sampling_cells
+        kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", cells=cells)
         positions = self.cage.positions.ravel()
         kernel.set_control_points(positions if float_type is float else float_type(positions))
         return kernel
@@ -608,27 +609,3 @@ class LimitSurface:
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
         return samples.p[table.weld_target], samples.n
-
-
-def limit_stencil(scheme: str, valence: int) -> LimitStencil:
-    """Weights over a one-ring that make its limit point and two tangents.
-
-    Parameters
-    ----------
-    scheme : str
-    valence : int
-        Of a vertex amid regular faces (true after one refinement of any cage); for Doo-Sabin, corners of a face amid
-        regular vertices. At least 3.
-
-    Returns
-    -------
-    LimitStencil
-
-    Raises
-    ------
-    SchemeError
-        If the scheme is unknown or the valence below 3.
-    """
-    from ..evaluation.limit_stencil import extraordinary_limit_stencil
-
-    return extraordinary_limit_stencil(scheme_named(scheme), valence)

@@ -63,7 +63,7 @@ def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32])
     patch_counts = np.array([len(each.corners) for each in classes])
     of_corner, patch_of_corner = (np.empty(patches.elements.half_edge_count, dtype=np.int32) for _ in range(2))
     of_corner[corners] = np.repeat(np.arange(len(classes), dtype=np.int32), patch_counts)
-    patch_of_corner[corners] = ragged.places(patch_counts)
+    patch_of_corner[corners] = ragged.index_in_row(patch_counts)
     tile, places = grid.vertex_places()
     corner = grid.tiles.corner[tile]
     of_class, patch, uv = of_corner[corner], patch_of_corner[corner], places / UNIT
@@ -88,7 +88,7 @@ def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32])
         stencils,
         np.repeat(np.arange(len(used)), counts[used]),
         np.ones(kinds, dtype=np.int64),
-        ragged.places(counts[used]),
+        ragged.index_in_row(counts[used]),
         run_counts,
         patch[order],
         order.astype(np.uint32),

@@ -114,7 +114,7 @@ class AdaptiveGrid:
         first = numbers.first_inside[numbers.span[long]] + np.where(self.spans.is_backward[long], inside - 1, 0)
         step = np.where(self.spans.is_backward[long], -1, 1)
         found[ragged.ranges(ragged.starts(rate)[long] + 1, inside)] = np.repeat(first, inside) + (
-            np.repeat(step, inside) * ragged.places(inside)
+            np.repeat(step, inside) * ragged.index_in_row(inside)
         )
         return found
 
@@ -154,7 +154,7 @@ class AdaptiveGrid:
         numbers, spans = self._numbers, self.spans
         inside = spans.rate[numbers.of_span] - 1
         span = np.repeat(numbers.of_span, inside)
-        step = ragged.places(inside) + 1
+        step = ragged.index_in_row(inside) + 1
         along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
         along = np.concatenate([np.zeros(len(numbers.of_point)), along])
         of_lines = np.concatenate([numbers.of_point, span])

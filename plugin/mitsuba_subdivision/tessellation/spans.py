@@ -108,7 +108,7 @@ class Spans:
         """The span of each sample along all sides, and its position along the span; for a block of spans."""
         rate, first = self.rate[block], block.start or 0
         span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
-        return span, ragged.places(rate) / np.repeat(rate, rate)
+        return span, ragged.index_in_row(rate) / np.repeat(rate, rate)
 
     def along(self, span: IntArray, part: FloatArray) -> FloatArray:
         """``(2, n)`` parameters, in their patches, of points at given fractions of spans."""
@@ -285,7 +285,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float32)
     held = np.flatnonzero(counts > 1)
     rows, of_side = ragged.ranges(ragged.starts(counts)[held], counts[held]), np.repeat(held, counts[held])
-    place = ragged.places(counts[held])
+    place = ragged.index_in_row(counts[held])
     backward = is_backward[of_side]
     at[rows] += np.where(backward, counts[of_side] - 1 - place, place).astype(np.int32)
     own = group[of_side]

@@ -74,7 +74,7 @@ def inner_counts(rates: IntArray, corner_count: int) -> IntArray:
 def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
     """``(n, 2)`` steps along u and v of the inner samples of all tiles, row by row, u fastest."""
     counts = inner_counts(rates, corner_count)
-    at = ragged.places(counts)
+    at = ragged.index_in_row(counts)
     if corner_count == 4:
         width = np.repeat(rates[:, 0] - 1, counts)
         v, u = np.divmod(at, width)
@@ -168,7 +168,7 @@ def _strips(
         # Each inner segment that sample of the side which follows the side's segments before it.
         width = int(most.max(initial=0)) + 2
         keys = which * width + tip
-        inner_which, k = np.repeat(np.arange(len(tiles)), most - 1), ragged.places(most - 1) + 1
+        inner_which, k = np.repeat(np.arange(len(tiles)), most - 1), ragged.index_in_row(most - 1) + 1
         passed = np.searchsorted(keys, inner_which * width + k, side="right") - ragged.starts(count)[inner_which]
         outer = start[inner_which] + passed
         outer = np.where(passed == count[inner_which], _end(sides, tiles[inner_which], corner), outer)
@@ -208,8 +208,8 @@ def _cut_corners(rates: IntArray, sides: SideSamples, tiles: IntArray, corner: i
     def on_last(which: IntArray, k: IntArray) -> IntArray:
         return np.where(k == 0, begin[which], end[which] - k)
 
-    of_first, k = np.repeat(every, first - 1), ragged.places(first - 1) + 1
-    of_last, j = np.repeat(every, last - 1), ragged.places(last - 1) + 1
+    of_first, k = np.repeat(every, first - 1), ragged.index_in_row(first - 1) + 1
+    of_last, j = np.repeat(every, last - 1), ragged.index_in_row(last - 1) + 1
     middles = sides.middles
     middle_first = 2 * of_first + middles[on_first(of_first, k)]
     middle_last = 2 * of_last + 1 - middles[on_last(of_last, j + 1)]
@@ -256,11 +256,11 @@ def _strips_across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> list
 
     # Across from the base, samples follow each other from the one before its first to the one after its last.
     across = total - length - 2
-    which, q = np.repeat(every, across), ragged.places(across)
+    which, q = np.repeat(every, across), ragged.index_in_row(across)
     ends = sample(which, total[which] - 1 - q), sample(which, total[which] - 2 - q)
     of_ends = [_along_base(sides, tiles[which], base[which], end) for end in ends]
     middle = (of_ends[0] + of_ends[1]) / 2
-    of_base, place = np.repeat(every, length), ragged.places(length)
+    of_base, place = np.repeat(every, length), ragged.index_in_row(length)
     middles = sides.middles[base_start[of_base] + place]
     passed = np.searchsorted(2 * of_base + middles, 2 * which + middle, side="right") - ragged.starts(length)[which]
     # Where the neighbouring side has samples of its own, triangles with the base's end would be flat.
@@ -295,7 +295,7 @@ def _inner(
         rest = np.stack([own[:, 0] - 3] * 2, axis=1)
         return [*_lattice(tiles, own, first, rest, 0), *_lattice(tiles, own, first, rest, 1)]
     n_u, n_v = np.maximum(own - 2, 0).T
-    which, at = np.repeat(np.arange(len(tiles)), n_u * n_v), ragged.places(n_u * n_v)
+    which, at = np.repeat(np.arange(len(tiles)), n_u * n_v), ragged.index_in_row(n_u * n_v)
     v, u = np.divmod(at, np.maximum(n_u, 1)[which])
     a, b, c, d = (_inner_sample(own[which], first[which], u + i, v + j, 4) for i, j in ((1, 1), (2, 1), (2, 2), (1, 2)))
     return [(np.stack(corners, axis=1), tiles[which]) for corners in ((a, b, c), (a, c, d))]

@@ -15,7 +15,7 @@ from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
+from ..schemes.scheme_members import optional_member
 from .criterion import Criterion
 from .flat_tiles import PatchGroup, TileGroup, are_flat, have_flat_rings
 from .patch_frames import PatchFrames

@@ -18,8 +18,8 @@ from ..evaluation.bernstein import regular_bernstein, times
 from ..evaluation.divided_tile import DividedTile
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from ..schemes.members import optional_member
 from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 
 # Parts left after so many divisions are bounded by control points or, if the rules are not convex, as small as the
 # rounding of single precision.

@@ -1,11 +1,14 @@
 """A whole USD file as a scene of Mitsuba.
 
 stage_reader.py, stage_walk.py, stage_*.py, polygons.py   read a stage to plain data, maybe in a process of its own
+materialx_layers.py, materialx_library.py   the USD layers and the node library of MaterialX
 contents.py                  the plain data
+surface_models.py            models of surfaces, by the inputs that all share
+nodes.py, noise.py, baking.py   nodes of MaterialX, evaluated to numbers or pictures
 copies.py                    replaces many instances by meshes
-bsdfs.py, textures.py, emitters.py, sensors.py, shapes.py   build scene entries from the data
+bsdfs.py, textures.py, texture_*.py, emitters.py, sensors.py, shapes.py   build scene entries from the data
 entries.py, loaded_shapes.py  combine the entries, for one scene or for frames
-surfaces.py, rates.py        limit surfaces and their tessellation rates
+limit_surfaces.py, rates.py  limit surfaces and their tessellation rates
 staging.py                   adds the studio's camera and lights if the stage has none
 stage_scenes.py, scene.py    all of it, at one time or in frames
 notes.py                     warnings, one for each kind

@@ -67,7 +67,7 @@ def baked(expression: NodeContents, source: Source) -> Baked:
         wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
     edge = min(max(wanted, default=1), MOST)
     sampling = _Grid(edge, edge, np.eye(3), pictures, is_shared=False)
-    # What does not repeat itself is ramps: they go on as they end.
+    # Only ramps do not repeat: they continue with their last value.
     return Baked(_filled(expression, sampling), np.eye(3), "repeat" if textures else _procedural_wrap(expression))
 
 
@@ -96,7 +96,7 @@ def _nodes(expression: NodeContents) -> list[NodeContents]:
 
 
 def samples_elsewhere(expression: NodeContents) -> bool:
-    """Whether pictures are looked up where expressions say."""
+    """Whether an expression computes the texture coordinates of a picture."""
     return any(each.category == "image" for each in _nodes(expression))
 
 
@@ -108,7 +108,7 @@ def _procedural_wrap(expression: NodeContents) -> str:
 
 
 class _Grid:
-    """Centres of pixels of some rows, in the place that all pictures share or over the unit square."""
+    """Centres of pixels of some rows, in the part of the plane that all pictures share or over the unit square."""
 
     def __init__(
         self,
@@ -166,6 +166,6 @@ def _wrapped(index: NDArray[np.int64], count: int, wrap: str) -> NDArray[np.int6
     if wrap == "repeat":
         return index % count
     if wrap == "mirror":
-        place = index % (2 * count)
-        return np.minimum(place, 2 * count - 1 - place)
+        index = index % (2 * count)
+        return np.minimum(index, 2 * count - 1 - index)
     return np.clip(index, 0, count - 1)

@@ -14,7 +14,7 @@ from .notes import Notes
 from .surface_models import NEUTRAL, conductor, with_shape
 from .textures import Textures
 
-# What USD has for meshes without a colour.
+# USD's colour of meshes without one.
 GREY = [0.5, 0.5, 0.5]
 # Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1.
 _DULL, _GLOSSY = 0.1, 0.001
@@ -95,7 +95,7 @@ def absorbs(material: MaterialContents) -> bool:
 
 
 def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:
-    """An integrator with as long paths as glass asks for, and that knows media if there are any.
+    """An integrator with as long paths as glass needs, and that knows media if there are any.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class _Values:
 
 
 class _Surface:
-    """Puts the BSDF of a material together."""
+    """Assembles the BSDF of a material."""
 
     def __init__(self, material: MaterialContents, values: _Values) -> None:
         self._material, self._values, self._notes = material, values, values.notes

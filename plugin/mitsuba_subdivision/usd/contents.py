@@ -118,6 +118,11 @@ class MaterialContents:
             return True
         return not isinstance(emission, (PrimvarContents, str)) and np.any(np.greater(emission, 0)).item()
 
+    def textures(self) -> list[TextureContents]:
+        """Pictures that it reads."""
+        found = (each for given in self.inputs.values() for each in leaves(given))
+        return [each for each in found if isinstance(each, TextureContents)]
+
     def primvars(self) -> set[str]:
         """Names of the attributes that it reads."""
         found = (each for given in self.inputs.values() for each in leaves(given))

@@ -6,7 +6,10 @@ square of their number; see the page of files. One mesh of all copies of a shape
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,66 +19,127 @@ from ..cage.contents import CageContents
 from ..cage.source import CageSource
 from ..files.usd_reader import reversed_order
 from ..mesh.connectivity import IntArray
-from .contents import InstanceContents, SceneContents, ShapeContents
+from .contents import SceneContents, ShapeContents
+from .notes import Notes
 
 # Fewer instances cost less than a second in each picture.
 LEAST_INSTANCES = 64
+# Of copies as one mesh, measured; and what they may take of the memory of the machine, and at most.
+FACE_BYTES, TRIANGLE_BYTES = {"exact": 600, "vertex": 300}, 170
+MOST_PART, MOST_BYTES = 0.75, 6e9
+# Of a picture of so many instances, whose time grows with the square of their number.
+MEASURED_INSTANCES, MEASURED_SECONDS = 2_000, 65
 
 
-def with_copies(contents: SceneContents, rate: int, most_triangles: int) -> SceneContents:
-    """A scene with one shape for all copies of a shape that has instances, if there are many instances.
+class _Copies(NamedTuple):
+    """Copies of a shape, with the transforms ``(n, 4, 4)`` and the rates ``(n,)`` that they need."""
+
+    name: str
+    shape: ShapeContents
+    to_world: NDArray[np.float64]
+    rates: IntArray
+
+
+def with_copies(
+    contents: SceneContents, rates: Mapping[ShapeContents, IntArray], shading: str, notes: Notes, *, lowest: int = 1
+) -> tuple[SceneContents, dict[ShapeContents, int]]:
+    """A scene where copies of a shape are one shape, if there are many; and the rates of such shapes.
+
+    Copies that need different rates are different shapes. If all would take more than `MOST_BYTES`, their highest rate
+    gives way, down to the lowest; if that is not enough, instances stay.
 
     Parameters
     ----------
     contents : SceneContents
-    rate : int
-        Segments on each edge of limit surfaces.
-    most_triangles : int
-        If copies would have more triangles, instances stay.
+    rates : dict of (n,) int array by shape
+        Segments on each edge of limit surfaces that their copies need, in the order of ``contents.placed_shapes``.
+    shading : "vertex" or "exact"
+    notes : Notes
+    lowest : int
     """
+    placed = _of_instances(contents, rates)
+    of_cage: dict[int, list[ShapeContents]] = {}
+    for shape in contents.shapes:
+        of_cage.setdefault(id(shape.cage), []).append(shape)
+    many = [each for each in of_cage.values() if len(each) >= LEAST_INSTANCES and _is_sound(each[0].cage)]
+    for alike in many:
+        needed = np.concatenate([rates.get(each, _ONE) for each in alike])
+        placed.append(_Copies(f"/copies{alike[0].name}", alike[0], np.stack([each.to_world for each in alike]), needed))
+    if not placed:
+        return contents, {}
+    highest = max(int(each.rates.max()) for each in placed)
+    allowed = min(MOST_BYTES, MOST_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    limits = range(highest, min(lowest, highest) - 1, -1)
+    most = next((most for most in limits if _bytes(placed, most, shading) <= allowed), None)
+    if most is None:
+        count = len(contents.instances)
+        faces = sum(len(each.rates) * len(each.shape.cage.face_sizes) for each in placed)
+        seconds = MEASURED_SECONDS * (count / MEASURED_INSTANCES) ** 2
+        notes.add(
+            f"copies with {faces:,} faces would take about {_bytes(placed, limits[-1], shading) / 1e9:.0f} GB as one "
+            f"mesh, more than {allowed / 1e9:.1f} GB, and stay {count:,} instances: a picture may take {seconds:,.0f} "
+            'seconds; expected fewer copies, smaller cages or shading="vertex"',
+            placed[0].shape.name,
+        )
+        return contents, {}
+    found: dict[ShapeContents, int] = {}
+    for each in placed:
+        of_copies = np.minimum(each.rates, most)
+        for rate in np.unique(of_copies).tolist():
+            found[_copied(each.shape, each.to_world[of_copies == rate], each.name)] = rate
+    alone = [shape for shape in contents.shapes if not any(shape in alike for alike in many)]
+    kept: dict[str, Any] = {} if len(contents.instances) < LEAST_INSTANCES else {"groups": [], "instances": []}
+    return replace(contents, shapes=[*alone, *found], **kept), found
+
+
+_ONE = np.ones(1, np.int64)
+
+
+def _of_instances(contents: SceneContents, rates: Mapping[ShapeContents, IntArray]) -> list[_Copies]:
+    """Copies in place of instances; none if they are few."""
     if len(contents.instances) < LEAST_INSTANCES:
-        return contents
-    of_group: list[list[InstanceContents]] = [[] for _ in contents.groups]
+        return []
+    of_group: list[list[NDArray]] = [[] for _ in contents.groups]
     for each in contents.instances:
-        of_group[each.group].append(each)
-    triangles = sum(
-        len(placed) * _triangles(shape, rate)
-        for group, placed in zip(contents.groups, of_group, strict=True)
-        for shape in group
-    )
-    if triangles > most_triangles or not all(_is_sound(shape.cage) for group in contents.groups for shape in group):
-        return contents
-    copies = [
-        _copied(shape, np.stack([each.to_world for each in placed]), f"/copies_{number}{shape.name}")
-        for number, (group, placed) in enumerate(zip(contents.groups, of_group, strict=True))
-        for shape in group
-    ]
-    return replace(contents, shapes=[*contents.shapes, *copies], groups=[], instances=[])
+        of_group[each.group].append(each.to_world)
+    found = []
+    for number, (group, placed) in enumerate(zip(contents.groups, of_group, strict=True)):
+        for shape in group if placed else []:
+            matrices = np.stack(placed) @ shape.to_world
+            needed = rates.get(shape, np.ones(len(placed), np.int64))
+            found.append(_Copies(f"/copies_{number}{shape.name}", shape, matrices, needed))
+    return found if all(_is_sound(each.shape.cage) for each in found) else []
 
 
-def _triangles(shape: ShapeContents, rate: int) -> int:
-    corners, faces = int(shape.cage.face_sizes.sum()), len(shape.cage.face_sizes)
-    return corners - 2 * faces if shape.cage.scheme is None else corners * rate**2 // 2
+def _bytes(placed: list[_Copies], most: int, shading: str) -> float:
+    """Memory of copies as one mesh, with rates up to the given one."""
+    found = 0.0
+    for each in placed:
+        cage, is_smooth = each.shape.cage, each.shape.cage.scheme is not None
+        corners, faces = int(cage.face_sizes.sum()), len(cage.face_sizes)
+        squares = float(np.square(np.minimum(each.rates, most)).sum())
+        triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * len(each.rates)
+        found += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * len(each.rates) if is_smooth else 0)
+    return found
 
 
 def _is_sound(cage: CageContents) -> bool:
     """Whether all indices of a cage are in range; otherwise they would refer to another copy."""
     vertices = np.concatenate([cage.face_vertices, cage.creases[:, :2].ravel(), cage.corners[:, 0]])
     counts = [(vertices, len(cage.positions)), (cage.holes, len(cage.face_sizes))]
-    if cage.texcoords is not None:
-        indices, values = cage.texcoords.indices, cage.texcoords.values
-        expected = cage.face_vertices if cage.texcoords.interpolation == "face_varying" else cage.positions
+    for each in (*cage.attributes.values(), *([] if cage.texcoords is None else [cage.texcoords])):
+        indices, values = each.indices, each.values
+        expected = cage.face_vertices if each.interpolation == "face_varying" else cage.positions
         if len(values if indices is None else indices) != len(expected):
             return False
         counts.append((np.zeros(0) if indices is None else indices, len(values)))
     is_in_range = all(found.min(initial=0) >= 0 and found.max(initial=-1) < count for found, count in counts)
-    return is_in_range and int(cage.face_sizes.sum()) == len(cage.face_vertices) and not cage.attributes
+    return is_in_range and int(cage.face_sizes.sum()) == len(cage.face_vertices)
 
 
-def _copied(shape: ShapeContents, transforms: NDArray[np.float64], name: str) -> ShapeContents:
+def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> ShapeContents:
     """One shape of all copies of a shape, with the transforms ``(n, 4, 4)``."""
-    cage, count = shape.cage, len(transforms)
-    matrices = transforms @ shape.to_world
+    cage, count = shape.cage, len(matrices)
     linear = matrices[:, :3, :3]
     positions = np.asarray(cage.positions, dtype=np.float64) @ linear.transpose(0, 2, 1) + matrices[:, None, :3, 3]
     # Corners of the faces in each copy; faces of mirrored ones are turned over.
@@ -93,7 +157,8 @@ def _copied(shape: ShapeContents, transforms: NDArray[np.float64], name: str) ->
         creases=_tiled(cage.creases, np.array([vertex, vertex, 0]), count),
         corners=_tiled(cage.corners, np.array([vertex, 0]), count),
         holes=(cage.holes + _firsts(count, face)).ravel(),
-        texcoords=None if cage.texcoords is None else _texcoords(cage.texcoords, corners, count),
+        texcoords=None if cage.texcoords is None else _attribute(cage.texcoords, corners, count),
+        attributes={name: _attribute(each, corners, count) for name, each in cage.attributes.items()},
         rules=cage.rules,
         scheme=cage.scheme,
         source=CageSource(f"{cage.source.name}, {count} copies"),
@@ -109,8 +174,8 @@ def _tiled(tags: NDArray[np.float64], step: NDArray, count: int) -> NDArray[np.f
     return (tags + step * np.arange(count)[:, None, None]).reshape(-1, tags.shape[1])
 
 
-def _texcoords(texcoords: Attribute, corners: IntArray, count: int) -> Attribute:
-    if texcoords.interpolation != "face_varying":
-        return Attribute(np.tile(texcoords.values, (count, 1)), texcoords.interpolation)
-    indices = np.arange(len(texcoords.values)) if texcoords.indices is None else texcoords.indices
-    return Attribute(texcoords.values, "face_varying", indices[corners].ravel())
+def _attribute(given: Attribute, corners: IntArray, count: int) -> Attribute:
+    if given.interpolation != "face_varying":
+        return Attribute(np.tile(given.values, (count, 1)), given.interpolation)
+    indices = np.arange(len(given.values)) if given.indices is None else given.indices
+    return Attribute(given.values, "face_varying", indices[corners].ravel())

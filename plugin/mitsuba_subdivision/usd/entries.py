@@ -40,8 +40,10 @@ class Entries:
         Provides the limit surfaces.
     triangles : dict of dict by shape, optional
         Parameters of the tessellations of some limit surfaces, instead of the rate of all.
-    texels : dict of float by file, optional
-        Along a unit of texture coordinates; images that have more are loaded smaller.
+    needed : dict of float by file, optional
+        Pixels along the sides of textures; see `texels_for_picture`.
+    texture_size : int, optional
+        Pixels along the sides of textures of materials at most.
     loaded : LoadedShapes, optional
         If given, its objects are used as shapes.
 
@@ -57,12 +59,13 @@ class Entries:
         parameters: dict[str, Any],
         surfaces: Surfaces,
         triangles: Mapping[ShapeContents, dict[str, Any]] | None = None,
-        texels: Mapping[str, float] | None = None,
+        needed: Mapping[str, float] | None = None,
+        texture_size: int | None = None,
         loaded: LoadedShapes | None = None,
     ) -> None:
         self._contents = contents
         self._notes = notes
-        self._textures = Textures(notes, texels)
+        self._textures = Textures(notes, needed, texture_size)
         self._bsdfs = Bsdfs(self._textures, notes)
         self._parameters = parameters
         self._surfaces = surfaces
@@ -75,6 +78,8 @@ class Entries:
 
     def _add_all(self) -> None:
         contents = self._contents
+        materials = dict.fromkeys(each.material for each in contents.all_shapes if each.material is not None)
+        self._textures.read(each for number in materials for each in contents.materials[number].textures())
         for shape in counted(contents.shapes, "Shapes"):
             entry = self._shape(shape)
             if entry is not None:

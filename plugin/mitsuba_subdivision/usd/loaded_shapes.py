@@ -85,7 +85,7 @@ class LoadedShapes:
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
         known = self._before.get(key)
-        if known is None or not _differs_by_place(known, shape, material):
+        if known is None or not _differs_by_position(known, shape, material):
             known = shape, material, self._load(shape, material, bsdf, area, notes)
         elif _has_moved(known[0], shape):
             if shape.cage.scheme is None:
@@ -126,7 +126,7 @@ class LoadedShapes:
         return self._bsdfs[-1][1]
 
 
-def _differs_by_place(known: Loaded, shape: ShapeContents, material: MaterialContents | None) -> bool:
+def _differs_by_position(known: Loaded, shape: ShapeContents, material: MaterialContents | None) -> bool:
     """Whether two shapes are equal except for transforms and control points."""
     return same(known[0], shape, _MOVABLE) and same(known[1], material) and same_topology(known[0].cage, shape.cage)
 

@@ -103,7 +103,7 @@ class _Copies:
 
 
 def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
-    """The layer of a document; None if it cannot be read, which is told."""
+    """The layer of a document; None, with a note, if it cannot be read."""
     import MaterialX
     from pxr import Ar, Sdf, Usd
 

@@ -57,14 +57,14 @@ def cells(points: Values) -> Values:
 def worley(points: Values, jitter: Values, style: int) -> Values:
     """Distance to the nearest of random points, one in each unit square; with style 1, a random number of that one."""
     cell = np.floor(points)
-    place = points - cell
+    within = points - cell
     column, row = np.moveaxis(cell.astype(np.int64), -1, 0)
     least = np.full(points.shape[:-1], np.inf)
     nearest = np.zeros(points.shape)
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
             random = np.stack([_number(_hashed(column + i, row + j, k)) for k in (0, 1)], axis=-1)
-            offset = (random - 0.5) * jitter + 0.5 + (i, j) - place
+            offset = (random - 0.5) * jitter + 0.5 + (i, j) - within
             distance = np.sum(offset**2, axis=-1)
             nearest = np.where((distance < least)[..., None], offset, nearest)
             least = np.minimum(distance, least)

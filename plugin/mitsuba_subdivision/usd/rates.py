@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.errors import CageError
+from ..mesh.connectivity import IntArray
 from ..schemes import SchemeError
-from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, outline_for, segments_for, triangles_for
+from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, segments_for, triangles_for
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .limit_surfaces import Surfaces
@@ -35,8 +37,8 @@ def is_chosen(parameters: dict[str, Any]) -> bool:
 
 def triangles_for_picture(
     contents: SceneContents,
-    surfaces: Surfaces,
-    sensor: SceneNode,
+    segments: Mapping[ShapeContents, IntArray],
+    outline: SceneNode,
     parameters: dict[str, Any],
     *,
     follows_sensor: bool = True,
@@ -48,10 +50,10 @@ def triangles_for_picture(
     Parameters
     ----------
     contents : SceneContents
-    surfaces : Surfaces
-        Provides the limit surfaces.
-    sensor : dict
-        Entry of the scene's sensor.
+    segments : dict of (n,) int array by shape
+        See `segments_of`.
+    outline : dict
+        Of the sensor; see `outline_for`.
     parameters : dict
         Of every limit surface: the shading, and how many segments there are at most.
     follows_sensor : bool
@@ -63,33 +65,39 @@ def triangles_for_picture(
         Cages that cannot be used are missing.
     """
     shading, most = parameters["shading"], parameters["tessellation_rate"]
-    outline = outline_for(sensor)
-    segments = segments_of(contents, surfaces, outline, sensor["near_clip"], shading)
-    found = {shape: {"tessellation_rate": min(needed, most)} for shape, needed in segments.items()}
-    if shading == "exact" and follows_sensor and "displacement" not in parameters:
-        corners = {shape: int(shape.cage.face_sizes.sum()) for shape in segments}
-        highest = highest_rate(np.array([*segments.values()]), np.array([*corners.values()]))
+    needed = {shape: int(segments[shape].max()) for shape in contents.all_shapes if shape in segments}
+    found: dict[ShapeContents, dict[str, Any]] = {
+        shape: {"tessellation_rate": min(rate, most)} for shape, rate in needed.items()
+    }
+    if needed and shading == "exact" and follows_sensor and "displacement" not in parameters:
+        corners = {shape: int(shape.cage.face_sizes.sum()) for shape in needed}
+        highest = highest_rate(np.array([*needed.values()]), np.array([*corners.values()]))
         for shape in contents.shapes:
-            if shape in segments:
-                found[shape] = triangles_for(segments[shape], corners[shape], most, outline, highest)
+            if shape in needed:
+                found[shape] = triangles_for(needed[shape], corners[shape], most, outline, highest)
     return found
 
 
 def segments_of(
     contents: SceneContents, surfaces: Surfaces, outline: SceneNode, near_clip: float, shading: str
-) -> dict[ShapeContents, int]:
+) -> dict[ShapeContents, IntArray]:
     """Segments on each edge of limit surfaces that a picture needs, at most `HIGHEST_RATE`; see `segments_for`.
 
-    Of shapes in groups, for the instance that needs most. Cages that cannot be used are missing.
+    An array ``(n,)`` for the copies of each shape, in the order of ``contents.placed_shapes``. Cages that cannot be
+    used are missing.
     """
-    of_cage: dict[ControlCage, list[tuple[ShapeContents, NDArray[np.float64]]]] = {}
+    of_shape: dict[ShapeContents, list[NDArray[np.float64]]] = {}
     for shape, to_world in contents.placed_shapes:
         if shape.cage.scheme is not None:
-            with suppress(CageError, SchemeError):
-                of_cage.setdefault(surfaces.of(shape.cage).cage, []).append((shape, to_world))
-    found: dict[ShapeContents, int] = {}
-    for cage, copies in of_cage.items():
-        segments = segments_for(cage, np.stack([to_world for _, to_world in copies]), outline, near_clip, shading)
-        for (shape, _), needed in zip(copies, segments.tolist(), strict=True):
-            found[shape] = max(found.get(shape, 1), needed)
+            of_shape.setdefault(shape, []).append(to_world)
+    of_cage: dict[ControlCage, list[ShapeContents]] = {}
+    for shape in of_shape:
+        with suppress(CageError, SchemeError):
+            of_cage.setdefault(surfaces.of(shape.cage).cage, []).append(shape)
+    found: dict[ShapeContents, IntArray] = {}
+    for cage, alike in of_cage.items():
+        copies = np.concatenate([of_shape[shape] for shape in alike])
+        segments = segments_for(cage, copies, outline, near_clip, shading)
+        counts = [len(of_shape[shape]) for shape in alike]
+        found |= dict(zip(alike, np.split(segments, np.cumsum(counts)[:-1]), strict=True))
     return found

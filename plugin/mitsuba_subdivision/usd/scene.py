@@ -24,6 +24,7 @@ def usd_scene(
     size: tuple[int, int] | None = None,
     spp: int = DEFAULT_SPP,
     view: View = DEFAULT_VIEW,
+    texture_size: int | None = None,
     **parameters: Any,
 ) -> SceneNode:
     """A whole USD file as a dictionary for ``mi.load_dict``.
@@ -49,6 +50,9 @@ def usd_scene(
         Samples per pixel.
     view : str or (azimuth, elevation)
         View of the studio's camera, if the stage has no camera.
+    texture_size : int, optional
+        Pixels along the sides of the textures of materials at most; each tile of a UDIM texture is such a texture.
+        Textures that are finer than this camera shows are halved in any case.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
         exact where ``shading="auto"`` is; elsewhere a line on standard error says why. Triangles are as few as the
@@ -67,7 +71,7 @@ def usd_scene(
         If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing is visible.
         If ``MITSUBA_SUBDIVISION_USD_PROCESS`` is set, also if reading crashes or takes longer.
     ValueError
-        If the time, the size or the samples are none, or ``mi`` is no variant.
+        If the time, the size, the samples or the texture size are none, or ``mi`` is no variant.
     OSError
         If the file cannot be read.
 
@@ -84,6 +88,9 @@ def usd_scene(
     >>> scene = mi.load_dict(msub.usd_scene("kitchen.usda", mi))  # doctest: +SKIP
     >>> mi.util.write_bitmap("kitchen.png", mi.render(scene))  # doctest: +SKIP
     """
+    if texture_size is not None and texture_size < 1:
+        raise ValueError(f"texture_size {texture_size}; expected 1 or more")
     with variant_set(mi):
-        source = StageScenes(path, Look(view, size, spp), parameters, time=time, camera=camera)
+        look = Look(view, size, spp, texture_size=texture_size)
+        source = StageScenes(path, look, parameters, time=time, camera=camera)
         return with_meshes(StillPicture(source).scene)

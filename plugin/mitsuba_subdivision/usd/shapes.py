@@ -98,7 +98,7 @@ def _triangles(cage: CageContents) -> IntArray:
     first = np.cumsum(sizes) - sizes
     sizes[cage.holes] = 0
     counts = np.maximum(sizes - 2, 0)
-    index = ragged.places(counts)
+    index = ragged.index_in_row(counts)
     start = np.repeat(first, counts)
     return np.stack([start, start + index + 1, start + index + 2], axis=1)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.sameness import same
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
@@ -35,6 +36,7 @@ class MaterialReader:
     Attributes
     ----------
     materials : list of MaterialContents
+        Of those that are equal, the first.
     """
 
     def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
@@ -60,10 +62,16 @@ class MaterialReader:
         path = str(material.GetPath())
         if path not in self._numbers:
             contents = self._read(material)
-            self._numbers[path] = None if contents is None else len(self.materials)
-            if contents is not None:
-                self.materials.append(contents)
+            self._numbers[path] = None if contents is None else self._numbered(contents)
         return self._numbers[path]
+
+    def _numbered(self, contents: MaterialContents) -> int:
+        """Number of a material; materials that differ by their names only have one."""
+        for number, known in enumerate(self.materials):
+            if same(known, contents, frozenset({"name"})):
+                return number
+        self.materials.append(contents)
+        return len(self.materials) - 1
 
     def _read(self, material: UsdShade.Material) -> MaterialContents | None:
         try:

@@ -120,7 +120,7 @@ class ShapeReader:
             faces = np.array(reader.value(subset.GetIndicesAttr()) or [], dtype=np.int64)
             if len(faces) and not 0 <= faces.min() <= faces.max() < len(owner):
                 raise CageError(
-                    f"{reader.place}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
+                    f"{reader.location}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
                     f"{faces.max()}; expected 0 to {len(owner) - 1}"
                 )
             material = self._materials.bound(subset.GetPrim())
@@ -175,5 +175,10 @@ class ShapeReader:
 
 def is_invertible(matrix: NDArray[np.float64]) -> bool:
     """Whether a transform ``(4, 4)`` is finite and has an inverse."""
+    return bool(are_invertible(matrix))
+
+
+def are_invertible(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Mask of the transforms ``(..., 4, 4)`` that are finite and have an inverse."""
     with np.errstate(all="ignore"):
-        return bool(np.isfinite(matrix).all() and np.linalg.det(matrix[:3, :3]) != 0)
+        return np.isfinite(matrices).all(axis=(-2, -1)) & (np.linalg.det(matrices[..., :3, :3]) != 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,17 +16,17 @@ from ..regression.scene import LoadedScene
 from ..studio.animation import load_quietly
 from ..studio.frame_files import FrameFiles
 from ..studio.look import Look
-from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, shading_for
+from ..studio.picture import MOST_SEGMENTS, outline_for, shading_for
 from ..studio.stage import variant_in_use
 from ..studio.view import View
 from ..variants import SceneNode
-from .contents import SceneContents
+from .contents import SceneContents, ShapeContents
 from .copies import with_copies
 from .entries import Entries
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
 from .notes import Notes
-from .rates import is_chosen, triangles_for_picture, with_rate
+from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
 from .sensors import sensor
 from .stage_reader import StageReader
 from .staging import angles_for, size_for, staged
@@ -94,9 +95,6 @@ class StageScenes:
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
             self._parameters = {**self._parameters, "shading": shading_for(variant_in_use(), self._parameters)}
-        # Scalar variants have numbers of Python, and no programs for instances.
-        if mi.Float is not float:
-            contents = with_copies(contents, self._parameters.get("tessellation_rate", MOST_SEGMENTS), MOST_TRIANGLES)
         self._is_lit |= contents.is_lit
         self._first = self._first or (number, contents)
         return contents
@@ -123,22 +121,53 @@ class StageScenes:
         CageError
             If no mesh can be used.
         """
-        notes, triangles, texels, rest = Notes(), {}, {}, None
+        notes, rest, parameters = Notes(), None, self._parameters
+        triangles: dict[ShapeContents, dict[str, Any]] = {}
+        needed: dict[str, float] = {}
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
             rest = staged(contents, points, self._is_lit, self._look, notes)
-            if is_one_picture and follows_sensor:
-                texels = texels_for_picture(contents, rest["sensor"])
-            if is_one_picture and self._has_free_rates and contents.has_surfaces:
-                triangles = triangles_for_picture(
-                    contents, self._surfaces, rest["sensor"], self._parameters, follows_sensor=follows_sensor
-                )
-        made = Entries(contents, notes, self._parameters, self._surfaces, triangles, texels)
+        if rest is None or not is_one_picture:
+            contents, parameters = self._with_copies(contents, notes)
+        else:
+            contents, triangles, needed = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
+        size = self._look.texture_size
+        made = Entries(contents, notes, parameters, self._surfaces, triangles, needed, size)
         notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
         return {**made.scene, **rest}
+
+    def _for_picture(
+        self, contents: SceneContents, sensor: SceneNode, notes: Notes, follows_sensor: bool
+    ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]], dict[str, float]]:
+        """Contents with copies, and the triangles and the texels that a picture needs."""
+        seen = outline_for(sensor), sensor["near_clip"]
+        needed = texels_for_picture(contents, *seen) if follows_sensor else {}
+        if not self._has_free_rates or not contents.has_surfaces:
+            return self._with_copies(contents, notes)[0], {}, needed
+        shading = self._parameters["shading"]
+        segments = segments_of(contents, self._surfaces, *seen, shading)
+        rates: dict[ShapeContents, int] = {}
+        if mi.Float is not float:
+            most = {shape: np.minimum(each, MOST_SEGMENTS) for shape, each in segments.items()}
+            contents, rates = with_copies(contents, most, shading, notes)
+        triangles = triangles_for_picture(contents, segments, seen[0], self._parameters, follows_sensor=follows_sensor)
+        return contents, triangles | {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}, needed
+
+    def _with_copies(self, contents: SceneContents, notes: Notes) -> tuple[SceneContents, dict[str, Any]]:
+        """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
+        if not mi.Float is not float:
+            return contents, self._parameters
+        rate = int(self._parameters.get("tessellation_rate", MOST_SEGMENTS))
+        copies = Counter(shape for shape, _ in contents.placed_shapes)
+        rates = {shape: np.full(count, rate) for shape, count in copies.items() if shape.cage.scheme is not None}
+        shading = self._parameters.get("shading", "vertex")
+        contents, found = with_copies(contents, rates, shading, notes, lowest=1 if self._has_free_rates else rate)
+        if not self._has_free_rates:
+            return contents, self._parameters
+        return contents, {**self._parameters, "tessellation_rate": min([rate, *found.values()])}
 
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
@@ -146,11 +175,19 @@ class StageScenes:
         """The scenes of some frames; limit surfaces of which only the points move stay loaded."""
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
-        shapes = LoadedShapes(self._parameters)
+        shapes = LoadedShapes(self._with_copies(first, Notes())[1])
         for number in numbers:
-            contents, notes = self.at(number), Notes()
+            notes = Notes()
+            contents, _ = self._with_copies(self.at(number), notes)
             shapes.begin_frame()
-            made = Entries(contents, notes, self._parameters, shapes.surfaces, loaded=shapes)
+            made = Entries(
+                contents,
+                notes,
+                self._parameters,
+                shapes.surfaces,
+                texture_size=self._look.texture_size,
+                loaded=shapes,
+            )
             rest = staged(first, points, self._is_lit, self._look, notes)
             if contents.camera is not None:
                 rest["sensor"] = sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)

@@ -26,7 +26,7 @@ from .polygons import GPRIMS
 from .stage_camera import read_camera
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
-from .stage_meshes import COLORS, ShapeReader, is_invertible
+from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -36,6 +36,8 @@ _SILENT = (
     "", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "Mesh", "PointInstancer", *GPRIMS,
     "SkelRoot", "Skeleton",
 )  # fmt: skip
+
+_SINGULAR = "instances with singular transforms are ignored"
 
 
 @dataclass
@@ -268,17 +270,18 @@ class _StageWalk:
                 f"{self._name}, prim {shortened(str(path))}: {len(kinds)} protoIndices, but {len(transforms)} "
                 "transforms; expected as many positions, orientations and scales"
             )
-        placed = to_root @ self._to_world(prim)
+        matrices = to_root @ self._to_world(prim) @ np.array(transforms).reshape(-1, 4, 4).transpose(0, 2, 1)
+        is_shown = np.array(mask, dtype=bool) if mask else np.ones(len(kinds), dtype=bool)
+        is_usable = are_invertible(matrices)
+        for row in np.flatnonzero(is_shown & ~is_usable):
+            self._notes.add(_SINGULAR, f"{path}/{row}")
         for number, target in enumerate(targets):
             prototype = self._stage.GetPrimAtPath(target)
             if not prototype or number not in kinds:
                 continue
             group = self._prototype(f"{path} {target}", prototype)
-            for row in np.flatnonzero(kinds == number):
-                if not mask or mask[int(row)]:
-                    matrix = placed @ np.array(transforms[int(row)]).T
-                    if self._is_invertible(matrix, f"{path}/{row}"):
-                        found.instances.append(InstanceContents(f"{name}/{row}", group, matrix))
+            for row in np.flatnonzero((kinds == number) & is_shown & is_usable):
+                found.instances.append(InstanceContents(f"{name}/{row}", group, matrices[row]))
 
     def _time_of_instances(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
         """Time at which to evaluate an instancer; at the earliest time, velocities would extrapolate to infinity."""
@@ -294,7 +297,7 @@ class _StageWalk:
         """Whether a transform is invertible; records a problem if it is not."""
         if is_invertible(matrix):
             return True
-        self._notes.add("instances with singular transforms are ignored", place)
+        self._notes.add(_SINGULAR, place)
         return False
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:

@@ -69,11 +69,11 @@ def staged(contents: SceneContents, points: NDArray[np.float64], is_lit: bool, l
             continue
         # The stage's own camera may be so far away that lights of a studio would be in its picture.
         is_near = camera is not None and entries[name]["type"] == "rectangle"
-        found[name] = _far_away(entries[name], bounds.mean(axis=0)) if is_near else entries[name]
+        found[name] = _distant_light(entries[name], bounds.mean(axis=0)) if is_near else entries[name]
     return found
 
 
-def _far_away(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
+def _distant_light(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
     """A distant light with the irradiance of a rectangle light that faces the target."""
     matrix = np.array(light["to_world"].matrix, dtype=np.float64)
     towards = target - matrix[:3, 3]

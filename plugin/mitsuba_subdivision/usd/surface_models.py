@@ -47,7 +47,7 @@ NEUTRAL: dict[str, Input] = {
 
 
 class Model(NamedTuple):
-    """How a model's inputs become those of `NEUTRAL`, and those that do not, with the values that mean nothing."""
+    """The map from a model's inputs to those of `NEUTRAL`, and the neutral values of inputs without a counterpart."""
 
     inputs: Callable[[Given], dict[str, Input]]
     left: Mapping[str, Input]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 import os
 import re
 import zipfile
@@ -12,9 +14,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .image_reduction import halvings, reduced
+
 UDIM = "<UDIM>"
 # A file within an archive: archive.usdz[folder/file.png].
 _IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
+_JPEG = b"\xff\xd8"
+# Of blocks of 8 by 8 pixels, one value.
+_MOST_SCALE = 8
 # Tile 1001 + u + 10 v lies at texture coordinates from (u, v) to (u + 1, v + 1).
 _FIRST_TILE, _TILES_IN_ROW, _TILE_ROWS = 1001, 10, 10
 
@@ -38,13 +45,21 @@ class TextureImage:
     is_there: NDArray[np.bool_] | None = None
 
 
-def read_texture_image(path: str) -> TextureImage:
+def read_texture_image(
+    path: str, color_space: str = "auto", needed: float = math.inf, most: int | None = None
+) -> TextureImage:
     """Read the image of a texture.
 
     Parameters
     ----------
     path : str
         ``a.usdz[b.png]`` for a file in an archive. With "<UDIM>" in it, all tiles that there are.
+    color_space : "auto", "raw" or "sRGB"
+        In which files are halved.
+    needed : float
+        Pixels along the sides of a file that its use needs; files that have more are halved, see `halvings`.
+    most : int, optional
+        Pixels along the sides of a file at most.
 
     Raises
     ------
@@ -52,8 +67,8 @@ def read_texture_image(path: str) -> TextureImage:
         If it cannot be read, or there is no tile.
     """
     if UDIM not in path:
-        return TextureImage(_pixels(path), np.eye(3))
-    tiles = {tile: _pixels(name) for tile, name in _tiles(path).items()}
+        return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))
+    tiles = {tile: _pixels(name, color_space, needed, most) for tile, name in _tiles(path).items()}
     if not tiles:
         raise FileNotFoundError("there are no tiles")
     return _joined(tiles)
@@ -133,21 +148,41 @@ def _full(dtype: np.dtype) -> int:
     return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
 
 
-def _pixels(path: str) -> NDArray:
-    pixels = np.array(_opened(path))
-    return pixels[..., None] if pixels.ndim == 2 else pixels
+def is_srgb_image(pixels: NDArray, color_space: str) -> bool:
+    """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
+    return color_space == "sRGB" or (color_space == "auto" and pixels.dtype == np.uint8 and pixels.shape[2] >= 3)
 
 
-def _opened(path: str) -> mi.Bitmap:
+def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDArray:
     inside = _IN_ARCHIVE.match(path)
-    if not inside:
+    if inside:
+        with zipfile.ZipFile(inside[1]) as archive:
+            content = archive.read(inside[2])
+    else:
         # Mitsuba's own message about a missing file is several lines long.
-        with Path(path).open("rb"):
-            pass
-        return mi.Bitmap(path)
-    with zipfile.ZipFile(inside[1]) as archive:
-        content = archive.read(inside[2])
-    stream = mi.MemoryStream()
-    stream.write(content)
-    stream.seek(0)
-    return mi.Bitmap(stream)
+        content = Path(path).read_bytes()
+    pixels = _scaled_jpeg(content, needed, most) if content.startswith(_JPEG) else None
+    if pixels is None:
+        stream = mi.MemoryStream()
+        stream.write(content)
+        stream.seek(0)
+        pixels = np.array(mi.Bitmap(stream))
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    return reduced(pixels, needed, most, is_srgb=is_srgb_image(pixels, color_space))
+
+
+def _scaled_jpeg(content: bytes, needed: float, most: int | None) -> NDArray[np.uint8] | None:
+    """A JPEG file decoded at a scale, which takes a third of the time; None if all of it is needed.
+
+    The last halving is left to `reduced`, as scales are means of encoded values.
+    """
+    try:
+        from PIL import Image
+    except ImportError:
+        return None
+    with Image.open(io.BytesIO(content)) as image:
+        scale = min(1 << max(halvings(image.size, needed, most) - 1, 0), _MOST_SCALE)
+        if scale == 1 or image.mode not in ("L", "RGB") or any(side % scale for side in image.size):
+            return None
+        image.draft(image.mode, (image.width // scale, image.height // scale))
+        return np.array(image)

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..srgb import decoded
 from ..variants import SceneNode
 from .baking import Baked, baked
 from .contents import NodeContents, TextureContents, leaves
+from .image_reduction import linear_values
 from .nodes import affine
 from .notes import Notes
-from .texture_detail import reduced
-from .texture_image import TextureImage, read_texture_image, with_alpha
+from .texture_image import TextureImage, is_srgb_image, read_texture_image, with_alpha
 
-# Integers up to this are decoded by a table.
-_TABULATED = 65535
 # From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
 _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 
@@ -31,16 +30,25 @@ class Textures:
     Parameters
     ----------
     notes : Notes
-    texels : dict of float by file, optional
-        Along a unit of texture coordinates; images that have more are loaded smaller.
+    needed : dict of float by file, optional
+        Pixels along the sides of textures of materials that a picture shows; see `texels_for_picture`.
+    most : int, optional
+        Pixels along their sides at most.
     """
 
-    def __init__(self, notes: Notes, texels: Mapping[str, float] | None = None) -> None:
-        self._notes, self._texels = notes, texels or {}
+    def __init__(self, notes: Notes, needed: Mapping[str, float] | None = None, most: int | None = None) -> None:
+        self._notes, self._needed, self._most = notes, needed or {}, most
         self._pictures: dict[str, TextureImage | None] = {}
         # In eight bits, by file, channel and whether they are decoded.
         self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
         self._expressions: dict[int, tuple[NodeContents, Baked]] = {}
+
+    def read(self, uses: Iterable[TextureContents]) -> None:
+        """Read the pictures of textures on all processors."""
+        first = {each.file: each for each in uses if each.file not in self._pictures}
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for file, found in zip(first, pool.map(self._read, first, first.values()), strict=True):
+                self._keep(file, found)
 
     def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
         """A texture of colours, or the fallback of a picture that cannot be read.
@@ -121,7 +129,7 @@ class Textures:
         picture = self._picture(path)
         if picture is None:
             return None
-        values = _linear(with_alpha(picture.pixels), _is_srgb(picture.pixels, "auto"))[..., :3] * scale
+        values = linear_values(with_alpha(picture.pixels), is_srgb_image(picture.pixels, "auto"))[..., :3] * scale
         bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
         bitmap.set_srgb_gamma(False)
         return bitmap
@@ -130,7 +138,7 @@ class Textures:
         """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
         to_uv, pixels = picture.to_uv @ texture.to_uv, picture.pixels
         channels = ["rgba".index(each) for each in texture.channel]
-        is_decoded = _is_srgb(pixels, texture.color_space) and channels != [3]
+        is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
         is_same = all(texture.scale[each] == 1 and texture.bias[each] == 0 for each in channels)
         if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
             return self._bitmap(_values(picture, texture), to_uv, texture.wrap, is_raw)
@@ -157,28 +165,29 @@ class Textures:
     def _picture(self, path: str, use: TextureContents | None = None) -> TextureImage | None:
         """A picture, as fine as its use needs; None if it cannot be read."""
         if path not in self._pictures:
-            try:
-                self._pictures[path] = self._reduced(read_texture_image(path), use)
-            except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
-                reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-                self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
-                self._pictures[path] = None
+            self._keep(path, self._read(path, use))
         return self._pictures[path]
 
-    def _reduced(self, picture: TextureImage, use: TextureContents | None) -> TextureImage:
-        if use is None or use.file not in self._texels or picture.is_there is not None:
-            return picture
-        # Of texture coordinates, this many units lie along the picture.
-        units = 1 / np.linalg.norm((picture.to_uv @ use.to_uv)[:2, :2], axis=0).max()
-        is_srgb = _is_srgb(picture.pixels, use.color_space)
-        return replace(picture, pixels=reduced(picture.pixels, self._texels[use.file] * units, is_srgb=is_srgb))
+    def _keep(self, path: str, found: TextureImage | Exception) -> None:
+        if isinstance(found, Exception):
+            reason = str(found).strip().splitlines()[-1] if str(found).strip() else type(found).__name__
+            self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
+        self._pictures[path] = None if isinstance(found, Exception) else found
+
+    def _read(self, path: str, use: TextureContents | None) -> TextureImage | Exception:
+        try:
+            if use is None:
+                return read_texture_image(path)
+            return read_texture_image(path, use.color_space, self._needed.get(path, np.inf), self._most)
+        except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
+            return error
 
 
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
     """``(h, w, k)`` linear values of the channels, scaled and moved; the fallback where there is no tile."""
     channels = ["rgba".index(each) for each in texture.channel]
     pixels = _selected(picture.pixels, channels)
-    values = _linear(pixels, _is_srgb(picture.pixels, texture.color_space), channels)
+    values = linear_values(pixels, is_srgb_image(picture.pixels, texture.color_space), channels)
     scale, bias, fallback = (
         np.array(each, dtype=np.float32)[channels] for each in (texture.scale, texture.bias, texture.fallback)
     )
@@ -199,26 +208,3 @@ def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
     if len(channels) == 1 and channels[0] < 3:
         return pixels[..., :1]
     return with_alpha(pixels)[..., channels]
-
-
-def _is_srgb(picture: NDArray, color_space: str) -> bool:
-    """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
-    return color_space == "sRGB" or (color_space == "auto" and picture.dtype == np.uint8 and picture.shape[2] >= 3)
-
-
-def _linear(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 1, 2, 3)) -> NDArray[np.float32]:
-    """Values of channels as linear numbers; alpha, the channel 3, is linear already."""
-    if pixels.dtype.kind != "u":
-        values = pixels.astype(np.float32)
-        if is_srgb:
-            color = [place for place, channel in enumerate(channels) if channel < 3]
-            values[..., color] = decoded(values[..., color])
-        return values
-    most = np.iinfo(pixels.dtype).max
-    if most > _TABULATED:
-        return (pixels / most).astype(np.float32)
-    levels = np.arange(most + 1) / most
-    if not is_srgb:
-        return levels.astype(np.float32)[pixels]
-    table = np.stack([levels if channel == 3 else decoded(levels) for channel in channels]).astype(np.float32)
-    return table[np.arange(len(channels)), pixels]

@@ -13,12 +13,12 @@ from .surface_area import SurfaceAreas, largest_area_elements, piece_areas
 
 # Pieces are halved until their area elements are nowhere larger than this, in means of the piece; but no more often.
 UNEVEN, MOST_HALVINGS = 1.25, 3
-# Around extraordinary points so many levels are parts of their own.
+# Around extraordinary points this many levels are cells of their own.
 TIP_LEVELS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class SamplePlaces:
+class SamplingCells:
     """Parallelograms, or triangles, of parameters that cover a surface.
 
     Attributes
@@ -26,7 +26,7 @@ class SamplePlaces:
     half_edge : (n,) int64
         The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
     matrices, offsets : (n, 2, 2), (n, 2) float64
-        From the whole domain to the place, in the element's parameters.
+        From the whole domain to the cell, in the element's parameters.
     areas : (n,) float64
         Of the surface there.
     """
@@ -37,8 +37,8 @@ class SamplePlaces:
     areas: FloatArray
 
     @classmethod
-    def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplePlaces:
-        """Cover a surface; around each extraordinary point beyond some levels with one place."""
+    def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplingCells:
+        """Cover a surface; around each extraordinary point beyond some levels with one cell."""
         parts = _even_parts(pieces.regular, areas.regular)
         for tips, of_tips in zip(pieces.tips, areas.tips, strict=True):
             for level in range(TIP_LEVELS):
@@ -51,7 +51,7 @@ class SamplePlaces:
 def _even_parts(
     pieces: PolynomialPieces, areas: FloatArray
 ) -> list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
-    """Columns of places whose area elements vary little."""
+    """Columns of cells whose area elements vary little."""
     tolerance, parts = 1e-9 * float(areas.mean()) if len(areas) else 0.0, []
     for halving in range(MOST_HALVINGS + 1):
         is_even = pieces.basis.domain.area * largest_area_elements(pieces) <= UNEVEN * areas

@@ -13,6 +13,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ...kernels.types import Mask, Value
+from ...variants import Variant
+
 _ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)
 # Results that the answers return.
 _PLACE, _VALUE = (8, 9), (10, 11, 12)
@@ -26,19 +29,26 @@ class TrialError(Exception):
 class Trial:
     """Answers that record their arguments."""
 
-    def __init__(self, variant: Any) -> None:
+    def __init__(self, variant: Variant) -> None:
         self._variant = variant
         self.asked: list[Any] = []
         self.fails = False
 
-    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+    def complete(
+        self,
+        si: mi.SurfaceInteraction3f,
+        ray: mi.Ray3f,
+        preliminary: mi.PreliminaryIntersection3f,
+        flags: int,
+        active: Mask,
+    ) -> None:
         """Note the arguments, and answer."""
         if self.fails:
             raise TrialError
         self.asked = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
         si.uv = self._variant.Point2f(*_PLACE)
 
-    def attribute(self, name: str, si: Any, active: Any) -> Any:
+    def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value:
         """Note the arguments, and answer."""
         if self.fails:
             raise TrialError
@@ -46,7 +56,7 @@ class Trial:
         return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
 
 
-def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | None:
+def trial_problem(variant: Variant, attach: Callable[[mi.Mesh, Trial], None]) -> str | None:
     """Difference between Mitsuba's virtual functions and the expected ones; None if there is none.
 
     Parameters
@@ -62,7 +72,7 @@ def trial_problem(variant: Any, attach: Callable[[Any, Trial], None]) -> str | N
     preliminary.t, preliminary.prim_uv = variant.Float(_DISTANCE), variant.Point2f(*_UV)
     flags, active, place = int(mi.RayFlags.UV), variant.Mask(True), variant.Point2f(*_PLACE)
 
-    def interaction() -> Any:
+    def interaction() -> mi.SurfaceInteraction3f:
         return shape.compute_surface_interaction(ray, preliminary, flags, active)
 
     expected = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
@@ -96,7 +106,7 @@ def _raises(ask: Callable[[], Any]) -> bool:
     return False
 
 
-def _triangle(variant: Any) -> Any:
+def _triangle(variant: Variant) -> mi.Mesh:
     """A mesh of one triangle, with attributes."""
 
     class Corners(variant.TraversalCallback):

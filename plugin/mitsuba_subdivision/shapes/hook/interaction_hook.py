@@ -9,11 +9,11 @@ So a shape gets a virtual function table of its own: a copy of its class's, with
 function that Python overrides. Inside an instance, Mitsuba calls the shapes of all groups. So that only the shapes of
 its own group answer, a `TaggingTrampoline` in the groups' table adds a tag to the flags that a group passes on.
 
-All symbols are looked up by name in the loaded libraries, functions by
-their names and arguments. Where one is not found, on other platforms or after a change of Mitsuba, nothing is touched;
-and before the first shape of a variant is, a triangle is asked in every way.
+All symbols are looked up by name in the loaded libraries, functions by their names and arguments. Where one is not
+found, on other platforms or after a change of Mitsuba, nothing is changed. Before the first shape of a variant is
+changed, every function of a triangle is tried (`hook_trial`).
 
-Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), and this module goes.
+Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), which makes this module obsolete.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import drjit as dr
 import mitsuba as mi
 
-from .collection import paused_collection
+from ...kernels.types import Mask, Value
+from ...variants import Variant
+from ..garbage_collection import paused_collection
 from .hook_trial import trial_problem
-from .own_error import clear_frames, origin, raise_itself
+from .original_error import clear_frames, origin, raise_itself
 from .trampoline import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
 # Functions of the library of Mitsuba's Python bindings: from a Python object to its C++ instance, and back; and the
@@ -124,7 +126,14 @@ class Answers(Protocol):
     An error is raised where Python called Mitsuba. Arguments lie in memory of C++ and must not be kept.
     """
 
-    def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Any) -> None:
+    def complete(
+        self,
+        si: mi.SurfaceInteraction3f,
+        ray: mi.Ray3f,
+        preliminary: mi.PreliminaryIntersection3f,
+        flags: int,
+        active: Mask,
+    ) -> None:
         """Complete a surface interaction.
 
         Called after Mitsuba has filled in that of the triangle, while a kernel is traced; in scalar variants for every
@@ -132,7 +141,7 @@ class Answers(Protocol):
         """
         ...
 
-    def attribute(self, name: str, si: Any, active: Any) -> Any:
+    def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
         """Value of a mesh attribute at a surface interaction, or None for Mitsuba's own value.
 
         In scalar variants Mitsuba's own is taken.
@@ -156,7 +165,7 @@ class InteractionHook:
         If there is a `hook_problem`, or the class lacks one of the functions.
     """
 
-    def __init__(self, variant: Any, example: Any) -> None:
+    def __init__(self, variant: Variant, example: mi.Mesh) -> None:
         problem = hook_problem()
         if problem is not None:
             raise RuntimeError(problem)
@@ -181,13 +190,13 @@ class InteractionHook:
         if self._is_jit:
             self._tag_groups()
 
-    def attach(self, shape: Any, answers: Answers) -> None:
+    def attach(self, shape: mi.Mesh, answers: Answers) -> None:
         """Override a shape's functions. The shape keeps the answers alive."""
         self._answers[self._bindings.pointer_of(shape)] = answers
         self._tags[answers] = set()
         self._table_of(shape).value = ctypes.addressof(self._table) + _BEFORE * _WORD
 
-    def _table_of(self, shape: Any) -> ctypes.c_void_p:
+    def _table_of(self, shape: object) -> ctypes.c_void_p:
         """Location of a shape's pointer to its virtual function table."""
         return ctypes.c_void_p.from_address(self._bindings.pointer_of(shape))
 
@@ -202,7 +211,7 @@ class InteractionHook:
             raise RuntimeError(f"{names} of {type(structure).__name__} are not where it is")
         return found
 
-    def _mask_at(self, value: int) -> Any:
+    def _mask_at(self, value: int) -> Mask:
         """A mask that is passed by its address in variants with a backend, and as a byte in others."""
         return self._object_at(self._variant.Mask, value) if self._is_jit else bool(value & 0xFF)
 
@@ -305,7 +314,7 @@ class InteractionHook:
         return found[0]
 
 
-def _member_finder(variant: Any) -> Callable[[Any], list[Any]]:
+def _member_finder(variant: Variant) -> Callable[[mi.Shape], list[mi.Shape]]:
     """Function that finds the shapes of a group."""
 
     class Members(variant.TraversalCallback):
@@ -313,12 +322,12 @@ def _member_finder(variant: Any) -> Callable[[Any], list[Any]]:
 
         def __init__(self) -> None:
             super().__init__()
-            self.found: list[Any] = []
+            self.found: list[mi.Shape] = []
 
         def put(self, _name: str, value: Any, _flags: int, _cpp_type: Any = None) -> None:
             self.found.append(value)
 
-    def find(group: Any) -> list[Any]:
+    def find(group: mi.Shape) -> list[mi.Shape]:
         members = Members()
         group.traverse(members)
         return members.found
@@ -354,12 +363,12 @@ def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
 
 
 # Never emptied: shapes need their functions for their whole lifetime.
-_hooks: dict[Any, InteractionHook] = {}
+_hooks: dict[Variant, InteractionHook] = {}
 # Mitsuba makes the shapes of a scene in parallel.
 _lock = threading.Lock()
 
 
-def interaction_hook(variant: Any, example: Any) -> InteractionHook:
+def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
     """The hook of a variant's shapes, built for the first of them."""
     with _lock:
         if variant not in _hooks:

@@ -1,11 +1,11 @@
-"""Places all over a surface."""
+"""Locations all over a surface."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def grid_places(surface, segments):
+def grid_locations(surface, segments):
     """A grid of parameters on every patch, and the corner of an element that each is seen from."""
     elements, domain = surface.patches.elements, surface.scheme.domain
     j, i = np.indices((segments + 1, segments + 1)).reshape(2, -1)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import drjit as dr
 
-from .interaction_hook import hook_problem, interaction_hook
+from ..variants import Variant
+from .hook.interaction_hook import hook_problem, interaction_hook
 
 
-def exact_shading_problem(variant: Any) -> str | None:
+def exact_shading_problem(variant: Variant) -> str | None:
     """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading.
 
     Parameters
@@ -25,7 +25,7 @@ def exact_shading_problem(variant: Any) -> str | None:
 
 
 @cache
-def _trial_problem(variant: Any) -> str | None:
+def _trial_problem(variant: Variant) -> str | None:
     # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
     class Example(variant.Mesh):
         """Mesh derived in Python."""
