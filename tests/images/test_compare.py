@@ -18,6 +18,7 @@ from mitsuba_subdivision.images.flip_tier import flip, flip_exposures
 from mitsuba_subdivision.images.image import Image
 from mitsuba_subdivision.images.panel import Panel
 from mitsuba_subdivision.images.png import srgb
+from mitsuba_subdivision.images.probe_tier import normal_angle
 from mitsuba_subdivision.images.report import write_report
 from mitsuba_subdivision.images.tier import Status, TierResult
 from mitsuba_subdivision.images.tiers import TIERS, Tier
@@ -84,6 +85,12 @@ def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):
     found = compare(reference, random_image(np_rng, 4), ["tile"]).tier("tile")
     smallest = min(scale["smallest_p"] for name, scale in found.numbers["scales"].items() if name != "whole")
     np.testing.assert_allclose(found.maps["evidence"].max(), -np.log10(smallest), rtol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [1e-6, 30, 179])
+def test_angles_between_normals_are_those_of_a_turn(degrees):
+    turned = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0])
+    assert math.isclose(normal_angle(np.array([1.0, 0, 0]), turned), degrees, rel_tol=1e-9)
 
 
 def test_probes_that_hit_nothing_are_alike(reference, np_rng):
