@@ -118,6 +118,7 @@ MAY_IMPORT = {
     "plyfile": {"files"},
     "pxr": {"files", "usd"},
     "MaterialX": {"usd"},
+    "mitsuba_oidn": {"studio"},
     "PIL": {"usd"},
 }
 
@@ -243,6 +244,11 @@ def package_of(relative):
 def test_modules_do_not_import_in_circles():
     known = f"{PACKAGE}.shapes."  # Protocols of `vertices`, for type checking.
     assert [module for module in circles(module_graph(ROOT)) if not module.startswith(known)] == []
+
+
+def test_no_module_looks_up_limits_of_numbers_while_dr_jit_renders():
+    """NumPy before 2.3 warns of subnormals where it looks them up in arithmetic without any, which Dr.Jit sets."""
+    assert not [path for path in ROOT.rglob("*.py") if "finfo(" in path.read_text(encoding="utf-8")]
 
 
 def test_a_circle_of_modules_is_found(tmp_path):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
-    from .studio import studio_scene
+    from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
     from .tessellation import Tessellation, VertexMatrices
     from .usd import usd_scene
@@ -62,6 +62,7 @@ __all__ = [
     "register",
     "register_scheme",
     "register_variant",
+    "render_denoised",
     "studio_scene",
     "usd_scene",
 ]
@@ -89,6 +90,7 @@ _MODULES = {
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "evaluation.scheme_check",
+    "render_denoised": "studio",
     "studio_scene": "studio",
     "usd_scene": "usd.scene",
 }

@@ -149,7 +149,6 @@ def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode)
 DECAYING = (0.2, 1, 1.2, 1.7)
 
 
-@pytest.mark.core
 @EVERY_CAGE
 @pytest.mark.parametrize("mode", MODES[:-1])
 def test_semi_sharp_features_decay_at_seams_as_in_the_reference(scheme, cage, mode):

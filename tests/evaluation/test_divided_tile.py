@@ -11,8 +11,6 @@ from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.schemes.domain import IDENTITY
 
-pytestmark = pytest.mark.core
-
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # Weights are sums of products of up to 24 matrices.
 ROUNDING = 1e-11
@@ -65,6 +63,7 @@ def test_pieces_and_corners_are_the_surface(name):
             assert np.abs((found - expected) @ points).max() < ROUNDING * np.abs(points).max()
 
 
+@pytest.mark.core
 @EVERY_SURFACE
 def test_control_points_of_convex_rules_contain_the_surface(name):
     """All weights of pieces over the control points of the part that holds them are positive, and sum to one."""
@@ -79,6 +78,7 @@ def test_control_points_of_convex_rules_contain_the_surface(name):
             assert np.abs(pieces.sum(axis=2) - 1).max() < ROUNDING
 
 
+@pytest.mark.core
 def test_tiles_that_are_divided_alike_are_the_same():
     scheme, signatures = tables(surface_named("cube"))
     (element,) = divided_elements(scheme, signatures)

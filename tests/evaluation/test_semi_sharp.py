@@ -105,7 +105,6 @@ def slow_mesh(scheme, cage):
     )
 
 
-@pytest.mark.core
 @EVERY_CAGE
 def test_refinement_is_that_of_the_rules_vertex_by_vertex(scheme, cage):
     cage = with_bumps(cage)

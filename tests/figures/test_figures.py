@@ -200,6 +200,7 @@ def test_progress_goes_to_terminals_only(options, capsys, monkeypatch):
     assert "50 %" in capsys.readouterr().err
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_a_refinement_step_has_the_points_of_the_report(valence):
     from mitsuba_subdivision.figures.refinement import RefinementStep
@@ -213,6 +214,7 @@ def test_a_refinement_step_has_the_points_of_the_report(valence):
         assert len(np.unique(edges.reshape(-1, 2).round(6), axis=0)) == len(points)
 
 
+@pytest.mark.core
 def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
     from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence
     from mitsuba_subdivision.figures.domains import sub_domain

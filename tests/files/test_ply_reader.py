@@ -121,7 +121,7 @@ end_header
     path = tmp_path / "cage.ply"
     path.write_bytes(content)
 
-    lengths = PlyHeader.read(content, "").list_lengths(content)
+    lengths = PlyHeader.read(content, "").tables(content)[0]
     assert list(lengths) == ["vertex", "between", *(["face"] if len(set(corner_counts)) == 1 else [])]
     with pytest.warns(CageWarning, match='"id" of faces, "none" of faces, the list "pair" of vertices, the list "one"'):
         found = read_ply(path)
@@ -129,7 +129,7 @@ end_header
     np.testing.assert_array_equal(found.face_vertices, np.concatenate(faces))
     np.testing.assert_array_equal(found.positions[:, 1], points[:, 1])
     np.testing.assert_array_equal(found.attributes["weight"].values[:, 0], weights)
-    monkeypatch.setattr(PlyHeader, "list_lengths", lambda *_: {})
+    monkeypatch.setattr(PlyHeader, "tables", lambda *_: ({}, 0))
     with pytest.warns(CageWarning):
         assert same(found, read_ply(path))
 
@@ -139,7 +139,7 @@ def test_elements_without_rows_are_tables(tmp_path):
     empty = b"element edge 0\nproperty list char int a\nproperty float b\nend_header\n"
     content = (tmp_path / "cube.ply").read_bytes().replace(b"end_header\n", empty)
     (tmp_path / "empty.ply").write_bytes(content)
-    lengths = PlyHeader.read(content, "").list_lengths(content)
+    lengths = PlyHeader.read(content, "").tables(content)[0]
     assert lengths == {"vertex": {}, "face": {"vertex_indices": 4}, "edge": {"a": 0}}
     assert same(read_ply(tmp_path / "empty.ply"), read_ply(tmp_path / "cube.ply"))
 
@@ -429,3 +429,17 @@ def test_failure_leaves_the_existing_file(tmp_path):
         write_polygons(path, {"x": np.zeros(3), "y": np.zeros(2)}, np.array([3]), np.arange(3))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_mixed_polygons_across_windows_are_read_as_plyfile_reads_them(tmp_path, monkeypatch, np_rng):
+    faces = np.empty(300, dtype=[("vertex_indices", object)])
+    faces["vertex_indices"] = [np_rng.integers(0, 5, size).astype("u2") for size in np_rng.integers(0, 9, 300)]
+    points = np.array([tuple(row) for row in np_rng.normal(size=(5, 3))], dtype=[("x", "f8"), ("y", "f8"), ("z", "f8")])
+    elements = [plyfile.PlyElement.describe(points, "vertex"), plyfile.PlyElement.describe(faces, "face")]
+    path = tmp_path / "cage.ply"
+    plyfile.PlyData(elements).write(path)
+    monkeypatch.setattr("mitsuba_subdivision.files.ply_lists._WINDOW", 64)
+    found = read_ply(path)
+    monkeypatch.setattr(PlyHeader, "tables", lambda *_: ({}, 0))
+    assert same(found, read_ply(path))
+    assert found.face_sizes.tolist() == [len(face) for face in faces["vertex_indices"]]

@@ -1,6 +1,7 @@
 """USD control cages, read and written."""
 
 import re
+import struct
 import sys
 
 import numpy as np
@@ -493,6 +494,21 @@ def test_malformed_files_name_the_file(tmp_path, suffix):
         path.write_bytes(content)
         with pytest.raises(CageError, match=rf'bad\{suffix}".*: .*expected a USD file'):
             ControlCage.from_file(path)
+
+
+def test_sections_that_announce_more_than_they_can_hold_are_refused(tmp_path):
+    cube().save(tmp_path / "cube.usdc")
+    content = (tmp_path / "cube.usdc").read_bytes()
+    (table,) = struct.unpack_from("<q", content, 16)
+    (count,) = struct.unpack_from("<Q", content, table)
+    sections = [struct.unpack_from("<16sqq", content, table + 8 + 32 * i) for i in range(count)]
+    assert count == 6
+    for label, begin, _ in sections:
+        # USD would reserve 10 GB for the fields.
+        (tmp_path / "bad.usdc").write_bytes(content[:begin] + struct.pack("<Q", 1 << 29) + content[begin + 8 :])
+        name = label.rstrip(b"\0").decode()
+        with pytest.raises(CageError, match=f'bad.usdc": the section "{name}" of .* announces 536870912 entries'):
+            ControlCage.from_file(tmp_path / "bad.usdc")
 
 
 def test_syntax_errors_name_their_line(read):

@@ -33,6 +33,7 @@ def value(cage, points=None):
     return float(np.array(folds(cage)(mi.Float(np.ravel(points)))).ravel()[0])
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "pages",
     [((0, 1, 2, 3), (1, 0, 4, 5)), ((0, 1, 2), (1, 0, 4)), ((0, 1, 2, 3), (1, 0, 4)), ((3, 0, 1, 2), (5, 1, 0, 4))],

@@ -19,6 +19,7 @@ def surface():
     return LimitSurface(torus(6, 5))
 
 
+@pytest.mark.core
 def test_coordinates_and_points_are_inverse(surface):
     points = surface.cage.positions
     steps = LargeSteps(surface.cage.laplacian(), 3.0)
@@ -38,6 +39,7 @@ def test_a_step_is_that_of_mitsuba(surface, np_rng):
     np.testing.assert_allclose(np.array(found), np.array(expected), atol=SINGLE)
 
 
+@pytest.mark.core
 def test_derivatives_are_solutions_of_the_same_system(surface, np_rng):
     """In reverse and in forward mode, as the matrix is symmetric."""
     steps = LargeSteps(surface.stiffness(), 2.0)
@@ -73,6 +75,7 @@ def test_lambda_must_be_positive(surface):
         LargeSteps(surface.cage.laplacian(), 0)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("name", ["laplacian", "bending", "anchor"])
 def test_regularizers_are_quadratic_forms(surface, np_rng, name):
     regularizer = Regularizer.named(name, surface)

@@ -144,3 +144,10 @@ def test_malformed_meshes_are_refused(target):
         to_mesh(target.cage, positions, [[0, 1, 2], [0, 1, 30]])
     with pytest.raises(ValueError, match="the mesh has no area"):
         to_mesh(target.cage, positions, [[0, 0, 0]])
+
+
+def test_an_anchor_of_great_weight_holds_every_control_point(target):
+    """Where a regulariser is least, it must not pull: its matrix and its right side have the same factor."""
+    start = moved(target.cage)
+    fit = PointFit(start, target.sample(300, 1).p, regularizers={"bending": 0, "anchor": 1e9}).run(1)
+    np.testing.assert_allclose(fit.control_points, start.positions, atol=1e-6)

@@ -10,6 +10,7 @@ def test_one_number_stays():
     assert [schedule(step) for step in (0, 7)] == [0.5, 0.5]
 
 
+@pytest.mark.core
 def test_positive_numbers_lie_on_an_exponential():
     """So that a rate falls by the same factor at every step."""
     schedule = Schedule.of([(10, 1.0), (20, 1e-2)], "rate")

@@ -36,6 +36,7 @@ def statuses(found):
     return {tier.name: tier.status.value for tier in found.tiers}
 
 
+@pytest.mark.core
 def test_unchanged_images_pass(reference, np_rng):
     found = compare(reference, random_image(np_rng, 4, "test"))
     assert statuses(found) == {"probe": "pass", "paired": "pass", "tile": "pass"}
@@ -169,6 +170,7 @@ PROBES = {
 }
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(("changes", "status", "word"), PROBES.values(), ids=PROBES)
 def test_probe(reference, np_rng, changes, status, word):
     found = compare(reference, random_image(np_rng, probe=changed_probe(**changes())), ["probe"])

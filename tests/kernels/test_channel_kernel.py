@@ -15,8 +15,6 @@ from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import mixed_torus, triangulated
 from reference.refined_cages import sheet, spokes
 
-pytestmark = pytest.mark.core
-
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
 # Of values below one: some tens of products. Single precision has 2^29 times the rounding.
 ROUNDING = {DOUBLE: 2e-14, SINGLE: 2e-6}
@@ -96,6 +94,7 @@ def test_values_are_the_channels(surface, variant, np_rng):
         np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING[variant])
 
 
+@pytest.mark.core
 def test_values_by_linear_rules_are_the_channels(surface, np_rng):
     if surface.scheme.element == "vertex":
         pytest.skip("a scheme without linear interpolation")
@@ -120,6 +119,7 @@ def test_derivatives_are_differences(surface, np_rng):
             np.testing.assert_allclose(derivative, expected, rtol=0, atol=DIFFERENCES)
 
 
+@pytest.mark.core
 def test_scalar_variants_compute_the_same_one_by_one(surface, np_rng):
     element, uv, corner = random_locations(surface, np_rng, 10, deepest=6)
     kernel = surface.on_device("scalar_rgb")
@@ -132,6 +132,7 @@ def test_scalar_variants_compute_the_same_one_by_one(surface, np_rng):
                 np.testing.assert_allclose(np.ravel(np.array(one)), other[k], rtol=0, atol=1e-12)
 
 
+@pytest.mark.core
 def test_values_differ_across_seams_only(np_rng):
     """The same place, seen from two elements."""
     cage = mixed_torus()
@@ -165,6 +166,7 @@ def test_values_differ_across_seams_only(np_rng):
     assert differs[~is_seam].max() <= ROUNDING[DOUBLE]
 
 
+@pytest.mark.core
 def test_kinds_of_channels_have_kernels_of_their_own():
     surface = LimitSurface(
         ControlCage(

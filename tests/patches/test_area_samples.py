@@ -136,3 +136,15 @@ def test_a_surface_without_area_has_no_points():
 
 def test_no_points_can_be_drawn():
     assert LimitSurface(cube()).sample(0).p.shape == (0, 3)
+
+
+def test_points_of_a_flat_sheet_are_uniform_however_its_parameters_run():
+    """Columns of growing width: within an element, tangents grow, up to twice as long."""
+    cage = sheet(4, 2)
+    surface = LimitSurface(cage.with_positions(cage.positions ** [2, 1, 1]))
+    samples = surface.sample(4 * COUNT, 3)
+    element = np.arange(surface.patches.elements.face_count)
+    ends = [surface.evaluate(element, np.tile(uv, (len(element), 1))).p[:, 0] for uv in ([0.0, 0], [1.0, 1])]
+    low, high = np.sort(ends, axis=0)[:, samples.element]
+    along = (samples.p[:, 0] - low) / (high - low)
+    assert stats.kstest(along, "uniform").pvalue > SIGNIFICANCE

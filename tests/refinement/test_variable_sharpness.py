@@ -138,7 +138,6 @@ def check_points(variable, rng):
         assert np.abs(variable.matrix(sharpness) @ control_points - found).max() <= ROUNDING
 
 
-@pytest.mark.core
 @EVERY_CAGE
 def test_points_are_those_of_the_tagged_cage_refined(name, np_rng):
     check_points(with_every_second_tag(*cage_of(name)), np_rng)

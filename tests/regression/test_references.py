@@ -11,7 +11,6 @@ REFERENCES = SCENES.parent / "renders" / "references"
 LARGEST, ALL_BYTES = 96, 5_000_000
 
 
-@pytest.mark.core
 @pytest.mark.parametrize("name", ["valence3", "valence5", "rook", "barrel"])
 def test_scene(render_regression, name):
     render_regression(SCENES / f"{name}.xml", parameters={"resolution": RESOLUTION})

@@ -160,8 +160,10 @@ def hits(shape):
     return np.array([np.array(each).ravel() for each in found])
 
 
+# Vertices of the other cages follow in test_an_update_equals_a_new_shape; hits compile kernels for seconds.
 @exact
 @every_variant
+@pytest.mark.parametrize("cage", ["refined", "loop", "adaptive mixed"], indirect=True)
 def test_hits_follow(cage):
     made, parameters = cage
     shape = make(made(), shading="exact", **parameters)

@@ -67,7 +67,6 @@ def assert_as_if_alone(shape, found, i):
         np.testing.assert_allclose(loaded[name], values, rtol=0, atol=SINGLE, err_msg=name)
 
 
-@pytest.mark.core
 @llvm
 @parallel
 def test_many_shapes_load(parallel):

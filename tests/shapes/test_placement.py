@@ -149,6 +149,16 @@ def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
         np.testing.assert_array_equal(buffer(shape, each), buffer(make(cage), each))
 
 
+@pytest.mark.usefixtures("variants_all_rgb", "scalar_kernels")
+def test_the_middle_of_a_far_cage_is_turned_with_it():
+    cage = named_cages.cube()
+    cage, transform = cage.with_positions(cage.positions + SHIFT), transformation("turned")
+    shape = make(cage, to_world=transform)
+    p, n = placed(LimitSurface(cage).tessellate(RATE), transform)
+    np.testing.assert_allclose(buffer(shape, "vertex_positions"), p, atol=SINGLE * np.abs(p).max())
+    assert largest_angle(buffer(shape, "vertex_normals"), n) <= NORMAL_ERROR
+
+
 @pytest.mark.parametrize("cage", [named_cages.extraordinary(3), seamed()], ids=["smooth", "seamed"])
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_other_evaluators_are_placed_as_well(cage):

@@ -238,6 +238,7 @@ def test_nodes_of_the_document_itself_are_graphs(tmp_path):
     assert (found.inputs["roughness"], found.inputs["metalness"]) == (pytest.approx(0.6), pytest.approx(0.2))
 
 
+@pytest.mark.core
 def test_networks_inside_a_stage(tmp_path):
     """Identifiers of definitions, interface inputs, a library's graph (contrast) and an attribute of the mesh."""
     text = """def Material "Red" {

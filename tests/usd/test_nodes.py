@@ -28,6 +28,7 @@ class Points:
 GREY = [0.2, 0.5, 0.7]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("category", "kind", "inputs", "expected"),
     [
@@ -81,6 +82,7 @@ def test_operations_take_arrays_of_points():
         assert operation(category, "color3", {**given, name: wide}).shape == (2, 3, 3)
 
 
+@pytest.mark.core
 def test_ramps_and_splits_lie_as_the_specification_says():
     points = Points([[0.25, 0.75], [1.5, -1]])
     ramp = node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV)

@@ -85,6 +85,7 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
     assert rate == 1 or error(max(1, rate // 2)) > ERRORS[shading]
 
 
+@pytest.mark.core
 def test_segments_follow_the_size_in_the_picture():
     cage = named_cages.torus(8, 5)
     near, far, larger = (_rate(_shape(cage), each, "exact") for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))

@@ -91,6 +91,7 @@ METALS = [
 ]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(("model", "given"), METALS)
 def test_metals_reflect_their_colour_head_on_and_all_at_grazing_angles(model, given):
     np.testing.assert_allclose(both(model, 0, **given)[0], COLOR, rtol=1e-3)
@@ -126,6 +127,7 @@ GLASSES = [
 ]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(("model", "given"), GLASSES)
 def test_glass_has_the_fresnel_reflectance_and_its_colour_at_each_side(model, given):
     """Of the index 1.5: 0.04 is reflected head-on; what gets through is compressed into a smaller solid angle."""

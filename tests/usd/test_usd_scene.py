@@ -619,6 +619,16 @@ def test_lights_light_a_plane_as_the_closed_form_says(stage, text, irradiance):
     assert found == pytest.approx(0.5 / np.pi * irradiance, rel=0.02)
 
 
+def test_a_stretched_cylinder_is_as_long_and_as_wide_as_its_axes_say(stage):
+    """It lies along x: its scale there makes it longer, and the scales of y and z wider."""
+    lamp = light("CylinderLight", ["float inputs:length = 2", "float inputs:radius = 0.25"])
+    text = lamp.replace("scale = (1.0, 1.0, 1.0)", "scale = (3, 2, 2)")
+    assert text != lamp
+    scene = mi.load_dict(msub.usd_scene(stage(CAMERA + text + mesh("square", SQUARE)), mi))
+    (box,) = (shape.bbox() for shape in scene.shapes() if shape.is_emitter())
+    np.testing.assert_allclose(box.max - box.min, [6, 1, 1], rtol=1e-6)
+
+
 def test_domes_turn_their_picture_as_usd_does(stage, tmp_path):
     """Pixels of a latlong picture by the directions of UsdLux: +z in the middle, +x to its left, +y above."""
     picture = np.zeros((16, 32, 3), np.float32)

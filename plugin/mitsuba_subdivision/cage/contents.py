@@ -36,6 +36,8 @@ class CageContents:
         0-based faces that are not part of the surface.
     texcoords : Attribute or None
     attributes : dict of str to Attribute
+    materials : dict of str to (n,) int
+        0-based faces of each material that the file names.
     rules : dict of str to str
         Names and values as in `RULES`, for those rules that the file chooses.
     scheme : str or None
@@ -52,6 +54,7 @@ class CageContents:
     holes: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     texcoords: Attribute | None = None
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    materials: Mapping[str, IntArray] = field(default_factory=dict)
     rules: Mapping[str, str] = field(default_factory=dict)
     scheme: str | None = None
     source: CageSource = field(default_factory=CageSource)

@@ -23,7 +23,7 @@ from .rules import RULES
 from .source import CageSource
 from .structure import CageStructure
 from .tags import validated_tags
-from .validation import flattened_faces, validated_faces, validated_holes, validated_positions
+from .validation import flattened_faces, validated_face_indices, validated_faces, validated_holes, validated_positions
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,6 +76,8 @@ class ControlCage:
         Texture coordinates, ``(n, 2)``. A bare array has one row for each vertex, subdivided as points are.
     attributes : dict of str to Attribute or (n_v, k) array, optional
         Further data. A bare array again has one row for each vertex.
+    materials : dict of str to (n,) int, optional
+        0-based faces of each material, by its name; a shape can show those of one of them.
     face_varying : str
         Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
@@ -103,6 +105,7 @@ class ControlCage:
         In increasing order.
     texcoords : Attribute or None
     attributes : dict of str to Attribute
+    materials : dict of str to (n,) int64
     scheme : str or None
     source : CageSource
 
@@ -130,6 +133,7 @@ class ControlCage:
     holes: IntArray
     texcoords: Attribute | None
     attributes: Mapping[str, Attribute]
+    materials: Mapping[str, IntArray]
     scheme: str | None
     source: CageSource
 
@@ -146,6 +150,7 @@ class ControlCage:
         holes: Sequence[int] | NDArray = (),
         texcoords: Attribute | ArrayLike | None = None,
         attributes: Mapping[str, Attribute | ArrayLike] | None = None,
+        materials: Mapping[str, Sequence[int] | NDArray] | None = None,
         face_varying: str = "corners_plus1",
         scheme: str | None = None,
         strict: bool = False,
@@ -179,6 +184,10 @@ class ControlCage:
             structure=structure,
             texcoords=validated_texcoords(texcoords, topology, source, order),
             attributes=validated_attributes(attributes, topology, source, order),
+            materials={
+                name: validated_face_indices(topology, faces, "material face", source)
+                for name, faces in (materials or {}).items()
+            },
             scheme=scheme,
             source=source,
             **{each.name: getattr(structure, each.name) for each in fields(structure)},
@@ -427,6 +436,7 @@ class ControlCage:
             holes=self.holes,
             texcoords=self.texcoords,
             attributes=self.attributes,
+            materials=self.materials,
             rules={name: getattr(self, name) for name in RULES},
             scheme=self.scheme,
             source=self.source,

@@ -128,18 +128,29 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
     CageError
         If an index is not an integer or out of range, or all faces are holes.
     """
-    given = _integers(_flat(holes, "holes", source), "holes", source)
-    for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
-        raise CageError(
-            f"{source.at_tag('holes', row)}: hole {int(given[row]) + source.index_base} is no face; expected one of "
-            f"{topology.face_count} faces (numbers count from {source.index_base})"
-        )
-    is_hole = np.zeros(topology.face_count, dtype=bool)
-    is_hole[given] = True
-    faces = np.flatnonzero(is_hole)
+    faces = validated_face_indices(topology, holes, "hole", source)
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected at least one that is not")
-    return read_only(faces)
+    return faces
+
+
+def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, source: CageSource) -> IntArray:
+    """Check 0-based faces, and return each once, in increasing order; a message calls them ``noun``.
+
+    Raises
+    ------
+    CageError
+        If an index is not an integer or out of range.
+    """
+    given = _integers(_flat(indices, f"{noun}s", source), f"{noun}s", source)
+    for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
+        raise CageError(
+            f"{source.at_tag(f'{noun}s', row)}: {noun} {int(given[row]) + source.index_base} is no face; expected one "
+            f"of {topology.face_count} faces (numbers count from {source.index_base})"
+        )
+    is_chosen = np.zeros(topology.face_count, dtype=bool)
+    is_chosen[given] = True
+    return read_only(np.flatnonzero(is_chosen))
 
 
 def require_range(indices: NDArray, count: int, where: str) -> None:

@@ -63,6 +63,13 @@ def validate_pass_options(options: argparse.Namespace) -> None:
         raise RegressionError("--pass renders one pass, --passes and --dask render all; expected one of them")
     if options.reference and options.filter not in (None, BOX):
         raise RegressionError(f'references have the filter "{BOX}", not "{options.filter}"')
+    if options.denoise and wants_passes(options):
+        raise RegressionError(
+            "--denoise removes the noise that passes and references measure; expected no --pass, --passes, --dask or "
+            "--reference beside it"
+        )
+    if options.denoise and options.filter not in (None, BOX):
+        raise RegressionError(f'--denoise needs the filter "{BOX}", not "{options.filter}"')
     if options.sensor and wants_passes(options):
         raise RegressionError(
             "--sensor is for whole images; expected no --pass, --passes, --dask or --reference beside it"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -82,6 +83,11 @@ def add_parser(commands: Commands) -> None:
         help="value of a parameter of the scene; can be repeated",
     )
     render.add_argument("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
+    render.add_argument(
+        "--denoise",
+        action="store_true",
+        help="render with the box filter, and remove noise by Open Image Denoise",
+    )
     add_variant(render, "-m", "--mode")
     render.add_argument("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
     render.add_argument(
@@ -174,6 +180,12 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
                 f"{other}"
             )
     validate_pass_options(options)
+    if options.denoise:
+        from ..regression.scene import BOX
+        from ..studio.denoising import require_denoiser
+
+        require_denoiser()
+        options.filter = BOX
     has_frames = options.turntable or options.frames
     from ..studio.video import VIDEO_SUFFIXES
 
@@ -308,13 +320,21 @@ def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | 
 def _write_image(options: argparse.Namespace, loaded: LoadedScene, path: Path, spp: int | None = None) -> None:
     import mitsuba as mi
 
+    from ..images.exr import METADATA_ATTRIBUTE
     from ..regression.rendering import render_image
 
     with _threads(options.threads):
         image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), options.seed)
+        if options.denoise:
+            from ..studio.denoising import denoised
+
+            image = denoised(loaded, image, options.seed)
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
-        mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits).write(str(beside))
+        bitmap = mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
+        if options.denoise:
+            bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
+        bitmap.write(str(beside))
 
 
 @contextmanager

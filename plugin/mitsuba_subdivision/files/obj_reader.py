@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,7 @@ def read_obj(path: str | Path) -> CageContents:
       are dropped.
     - ``f`` statements give faces of any size, with face corners in the forms ``v``, ``v/vt``, ``v//vn`` and
       ``v/vt/vn``. Indices count from 1, or backwards from the last statement above the line (-1).
+    - ``usemtl`` statements name the material of the faces that follow; faces before the first one have the name "".
     - ``t`` statements are OpenSubdiv's tags.
 
     All other statements are skipped. A backslash at the end of a line continues the line, except in a comment.
@@ -77,6 +79,7 @@ def read_obj(path: str | Path) -> CageContents:
         corners.sizes,
         vertices,
         texcoords=_texcoords(obj, corners, texcoords, is_texcoord),
+        materials=_materials(obj, is_face),
         source=CageSource(obj.name, 1, lines[is_vertex], lines[is_face], tag_lines),
         **tags,
     )
@@ -97,6 +100,19 @@ def _read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
         arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
         parse_tag(tags, obj.name, obj.line(start), arguments)
     return tags.as_contents(), tags.lines
+
+
+def _materials(obj: ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]:
+    """Faces of each material that the file names."""
+    if b"usemtl" not in obj.text:
+        return {}
+    used = list(re.finditer(rb"^[ \t]*usemtl\b(.*)$", obj.text, re.MULTILINE))
+    names = ["", *(each[1].strip().decode(errors="backslashreplace") for each in used)]
+    number = np.searchsorted([each.start() for each in used], obj.statement_start[is_face], side="right")
+    distinct = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    number = np.array([distinct[name] for name in names])[number]
+    found = {name: np.flatnonzero(number == i) for name, i in distinct.items()}
+    return {name: faces for name, faces in found.items() if len(faces)}
 
 
 def _read_numbers(

@@ -43,6 +43,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
             "texcoords": contents.texcoords is not texcoords,
             **{f'attribute "{name}"': True for name in contents.attributes},
             "scheme": contents.scheme is not None,
+            "materials": bool(contents.materials),
         },
     )
     with whole_file(Path(path)) as beside:

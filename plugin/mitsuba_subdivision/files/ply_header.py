@@ -126,14 +126,16 @@ class PlyHeader:
         """Names of the properties of an element that are lists."""
         return [each.name for each in self.elements[element].properties if each.is_list]
 
-    def list_lengths(self, content: bytes) -> dict[str, dict[str, int]]:
-        """Length of each list of those first elements of a binary file that are tables.
+    def tables(self, content: bytes) -> tuple[dict[str, dict[str, int]], int]:
+        """Length of each list of those first elements of a binary file that are tables, and where these end.
 
         Returns
         -------
-        dict of str to dict of str to int
-            By elements and their properties: of all elements before the first one that has a list of other lengths, or
+        lengths : dict of str to dict of str to int
+            By elements and their properties: of all elements before the first one that has lists of other lengths, or
             more rows than fit into the file. Empty for ASCII files.
+        end : int
+            First byte after these elements.
         """
         found: dict[str, dict[str, int]] = {}
         begin = self.size
@@ -143,7 +145,7 @@ class PlyHeader:
                 break
             found[element.name], row = table
             begin += element.count * row
-        return found
+        return found, begin
 
     def lines(self, element: str) -> NDArray[np.int64] | None:
         """1-based line of each row of an element of an ASCII file; None for a binary file."""

@@ -19,6 +19,7 @@ from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
 from ..mesh.connectivity import IntArray
 from .ply_header import EXPECTED, PlyHeader
+from .ply_lists import lists_of_rows
 from .ply_names import COLOR, NORMAL, POSITION, TEXCOORDS, grouped
 
 if TYPE_CHECKING:
@@ -64,18 +65,23 @@ def read_ply(path: str | Path) -> CageContents:
     header = PlyHeader.read(content, name)
     # When the cage is validated, numbers that are not finite become errors that name their place.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _contents(_elements(content, header), header)
+        return _contents(content, header)
 
 
-def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContents:
+def _contents(content: bytes, header: PlyHeader) -> CageContents:
     name = header.name
-    vertex, face = (_element(elements, wanted, name) for wanted in ("vertex", "face"))
+    lists = [each for each in _FACE_LISTS if "face" in header.elements and each in header.lists("face")]
+    polygons = lists_of_rows(header, content, "face", lists[0]) if lists else None
+    if polygons is not None:
+        header, content = PlyHeader.read(polygons.rest, name), polygons.rest
+    elements = _elements(content, header)
+    vertex = _element(elements, "vertex", name)
+    face = _element(elements, "face", name) if polygons is None else elements["face"]
     numbers = [other for other in vertex.data.dtype.names if other not in header.lists("vertex")]
     missing = [axis for axis in POSITION if axis not in numbers]
     if missing:
         found = _listed(numbers)
         raise CageError(f'{name}: the element "vertex" has no property "{missing[0]}"; expected x, y, z among {found}')
-    lists = [name for name in _FACE_LISTS if name in header.lists("face")]
     if not lists:
         raise CageError(
             f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; expected one, a list of '
@@ -87,7 +93,9 @@ def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContent
     ]
     if left_out:
         warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
-    sizes, vertices = _polygons(face.data[lists[0]], name)
+    sizes, vertices = polygons[:2] if polygons is not None else _polygons(face.data[lists[0]])
+    if vertices.dtype.kind not in "iu":
+        raise CageError(f"{name}: the vertex indices of faces have type {vertices.dtype}; expected integers")
     texcoords, attributes = _vertex_data(vertex.data, numbers)
     return CageContents(
         _columns(vertex.data, POSITION),
@@ -100,7 +108,7 @@ def _contents(elements: dict[str, PlyElement], header: PlyHeader) -> CageContent
 
 
 def _elements(content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
-    name, lengths = header.name, header.list_lengths(content)
+    name, lengths = header.name, header.tables(content)[0]
     are_tables = lengths.keys() == header.elements.keys()
     try:
         from plyfile import PlyData, PlyParseError
@@ -156,7 +164,7 @@ def _listed(names: Sequence[str]) -> str:
     return shortened(", ".join(names), 200)
 
 
-def _polygons(lists: NDArray, name: str) -> tuple[IntArray, IntArray]:
+def _polygons(lists: NDArray) -> tuple[IntArray, IntArray]:
     """Sizes and concatenated vertices of all faces, of which each is a row of a table or an array of its own."""
     if lists.ndim == 2:
         sizes = np.full(len(lists), lists.shape[1])
@@ -164,8 +172,6 @@ def _polygons(lists: NDArray, name: str) -> tuple[IntArray, IntArray]:
     else:
         sizes = np.fromiter((len(polygon) for polygon in lists), np.int64, len(lists))
         vertices = np.concatenate(list(lists))
-    if vertices.dtype.kind not in "iu":
-        raise CageError(f"{name}: the vertex indices of faces have type {vertices.dtype}; expected integers")
     return sizes, vertices
 
 

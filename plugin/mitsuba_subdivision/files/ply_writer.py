@@ -48,6 +48,7 @@ def write_ply(contents: CageContents, path: str | Path) -> None:
             "holes": bool(len(contents.holes)),
             **{rule: contents.rules.get(rule, values[0]) != values[0] for rule, values in RULES.items()},
             "scheme": contents.scheme is not None,
+            "materials": bool(contents.materials),
             "texcoords": contents.texcoords is not texcoords,
             **{f'attribute "{name}"': name not in attributes for name in contents.attributes},
         },

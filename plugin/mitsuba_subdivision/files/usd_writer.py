@@ -48,6 +48,7 @@ def write_usd(contents: CageContents, path: str | Path) -> None:
                 'crease_method "chaikin"': contents.rules.get("crease_method") == "chaikin",
                 f'scheme "{contents.scheme}"': contents.scheme not in (None, *SCHEMES.values()),
                 **{f'attribute "{name}"': name not in attributes for name in contents.attributes},
+                "materials": bool(contents.materials),
             },
         )
         scheme = next((name for name, scheme in SCHEMES.items() if scheme == contents.scheme), "catmullClark")

@@ -48,8 +48,11 @@ def compare(
     Raises
     ------
     ImageError
-        If the sizes differ, a tier is unknown, or the images lack what a chosen tier compares.
+        If an image is denoised, the sizes differ, a tier is unknown, or the images lack what a chosen tier compares.
     """
+    for image in (reference, test):
+        if image.metadata.get("denoised"):
+            raise ImageError(f'"{image.name}" is denoised, which removes what is compared; expected one as rendered')
     if reference.size != test.size:
         sizes = [f'"{image.name}" has {image.size[0]} x {image.size[1]} pixels' for image in (reference, test)]
         raise ImageError(f"{sizes[0]} and {sizes[1]}; expected the same size")

@@ -12,6 +12,7 @@ from .element_walk import ElementWalk, Location
 from .types import Float, Index, Mask
 
 if TYPE_CHECKING:
+    from ..mesh.connectivity import IntArray
     from ..tessellation import VertexTable
     from ..tessellation.adaptive_grid import AdaptiveGrid
     from .array_types import ArrayTypes
@@ -111,3 +112,24 @@ class UniformLocations:
         u, v = a + b1 * (b - a) + b2 * (c - a)
         location = self._walk.at(element, u, v, corner, active)
         return self._walk.carried(location, active) if self._leave_corners else location
+
+
+class SomeTriangles:
+    """Parameters on some triangles of a tessellation.
+
+    Parameters
+    ----------
+    locations : TriangleLocations
+        Of all.
+    kept : (n,) int64
+        Their numbers.
+    types : ArrayTypes
+    """
+
+    def __init__(self, locations: TriangleLocations, kept: IntArray, types: ArrayTypes) -> None:
+        self._locations, self._kept, self._types = locations, types.indices(kept), types
+
+    def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
+        """See `TriangleLocations`."""
+        number = self._types.fetch(self._types.index, self._kept, triangle, active)
+        return self._locations(number, b1, b2, active)

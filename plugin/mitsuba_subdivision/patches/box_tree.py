@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,7 +94,7 @@ def squared_gaps(points: FloatArray, lower: FloatArray, upper: FloatArray) -> Fl
 def _along_curve(points: FloatArray) -> NDArray[np.uint64]:
     """Morton codes of points in their bounding box."""
     low = points.min(axis=0)
-    size = max(float((points - low).max()), np.finfo(np.float64).tiny)
+    size = max(float((points - low).max()), sys.float_info.min)
     cell = np.minimum((points - low) / size * 2**CURVE_BITS, 2**CURVE_BITS - 1).astype(np.uint64)
     found = np.zeros(len(points), dtype=np.uint64)
     for bit in range(CURVE_BITS):

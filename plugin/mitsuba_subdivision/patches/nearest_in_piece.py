@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -233,4 +234,4 @@ def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
     """
     along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
     lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
-    return (along / np.maximum(lengths, np.finfo(np.float64).tiny)).max(axis=1)
+    return (along / np.maximum(lengths, sys.float_info.min)).max(axis=1)

@@ -107,6 +107,7 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
         face_sizes=refinement.topology.face_sizes,
         face_vertices=corners.vertex,
         holes=np.flatnonzero(cage.is_hole[element]),
+        materials={name: np.flatnonzero(np.isin(element, faces)) for name, faces in cage.materials.items()},
     )
     contents, found = _with_tags(cage, contents, refinement, corners)
     if not np.array_equal(found.is_hole, cage.is_hole[element]):

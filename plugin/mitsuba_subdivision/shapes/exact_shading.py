@@ -20,7 +20,7 @@ from ..kernels.element_walk import Location
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
-from ..kernels.triangle_locations import TriangleLocations, triangle_locations
+from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
 from ..kernels.vectors import dot
 from ..mesh.connectivity import IntArray
@@ -113,10 +113,12 @@ class ExactShading:
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
         self._sign = 1.0
 
-    def set_triangles(self, table: VertexTable) -> None:
-        """Set the shape's triangles, before the first hit."""
+    def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
+        """Set the shape's triangles, before the first hit: those of a table, or some of them."""
         walk, types = self.kernel.walk, self.kernel.types
         self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
+        if kept is not None:
+            self._triangles = SomeTriangles(self._triangles, kept, types)
 
     def welded_table(self, table: VertexTable) -> AttributeTable:
         """Triangles without copies of vertices, because normals and texture coordinates are evaluated at hits.

@@ -200,6 +200,20 @@ PARAMETERS = (
         default_text="values that do not depend on time, or the first ones",
     ),
     Parameter(
+        "material",
+        "string",
+        "Show only the faces of this material, one that ``usemtl`` names in an OBJ file. Shapes of the same file and "
+        "parameters, one for each material, meet without cracks",
+        default_text="all faces",
+    ),
+    Parameter(
+        "shown_faces",
+        "tensor",
+        "Show only these faces, 0-based integers. Unlike holes, the others are evaluated: shapes that differ in this "
+        "parameter only meet without cracks",
+        default_text="all faces",
+    ),
+    Parameter(
         "scheme",
         "string",
         "Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by "

@@ -52,6 +52,8 @@ class Parameters:
     displacement : str, mi.Texture or None
         Texture, or mesh attribute ``vertex_NAME``, with the heights.
     displacement_scale : float
+    shown : (n_f,) bool or None
+        Elements whose triangles are kept; None for all.
     """
 
     surface: LimitSurface
@@ -64,6 +66,7 @@ class Parameters:
     sample_offset: float
     displacement: Any
     displacement_scale: float
+    shown: NDArray[np.bool_] | None
 
 
 def read_parameters(props: mi.Properties) -> Parameters:
@@ -107,8 +110,9 @@ def read_parameters(props: mi.Properties) -> Parameters:
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
     source = os.path.basename(str(props["filename"])) if "filename" in props else "control cage"
+    surface = LimitSurface(cage, scheme)
     return Parameters(
-        LimitSurface(cage, scheme),
+        surface,
         source,
         to_world,
         tessellation,
@@ -118,7 +122,37 @@ def read_parameters(props: mi.Properties) -> Parameters:
         offset,
         displacement,
         scale,
+        _shown(props, surface),
     )
+
+
+def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | None:
+    """Mask of the faces that are shown; None for all."""
+    given = [name for name in ("material", "shown_faces") if name in props]
+    if not given:
+        return None
+    if len(given) > 1:
+        raise ValueError('parameters "material" and "shown_faces" contradict each other; expected only one of them')
+    cage, (name,) = surface.cage, given
+    if surface.scheme.element != "face":
+        raise ValueError(
+            f'parameter "{name}" chooses faces; expected none for the scheme "{surface.scheme.name}", whose surface '
+            "belongs to vertices"
+        )
+    if name == "material":
+        material = value_of(props, name)
+        if material not in cage.materials:
+            names = ", ".join(f'"{each}"' for each in cage.materials) or "none"
+            raise ValueError(f'parameter "material" is "{material}"; expected one of {names} in {cage.source.name}')
+        faces = cage.materials[material]
+    else:
+        faces = _tensor(props, name, (-1,))
+        wrong = faces[(faces < 0) | (faces >= cage.face_count)]
+        if len(wrong):
+            raise ValueError(f'parameter "{name}" has {wrong[0]}; expected 0 to {cage.face_count - 1}')
+    shown = np.zeros(cage.face_count, dtype=bool)
+    shown[faces] = True
+    return shown
 
 
 def _displacement(props: mi.Properties) -> tuple[Any, float]:

@@ -178,13 +178,14 @@ def make_subdivision(variant: Variant) -> type:
             surface = parameters.surface
             bound = None if self._displacement is None else self._displacement.bound()
             table = self._tessellation.table(surface, control_points, to_world, bound)
+            kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
             if self._exact is None:
                 attributes = surface.attribute_table(table)
             else:
                 attributes = self._exact.welded_table(table)
-                self._exact.set_triangles(table)
+                self._exact.set_triangles(table, kept)
             self._cage.set_triangles(table, attributes)
-            self._triangles = Triangles(variant, table, attributes)
+            self._triangles = Triangles(variant, table, attributes, kept)
             float_type = variant.Float if is_jit else None
             is_exact = self._exact is not None
             vertices = vertices_of(table, attributes, parameters, self._displacement, float_type, is_exact=is_exact)

@@ -11,11 +11,12 @@ import numpy as np
 
 from ..kernels.alignment import aligned
 from ..kernels.types import FloatBuffer, IndexBuffer
-from ..mesh.shared import Shared
+from ..mesh.shared import Content, Shared
 from ..variants import Variant
 from .vertices import split_weld_targets
 
 if TYPE_CHECKING:
+    from ..mesh.connectivity import IntArray
     from ..tessellation import AttributeTable, VertexTable
 
 
@@ -35,6 +36,8 @@ class Triangles:
     table : VertexTable
     attributes : AttributeTable
         Its vertices, with copies along seams or without.
+    kept : (n,) int64, optional
+        The triangles that the mesh has; by default all.
 
     Attributes
     ----------
@@ -44,8 +47,12 @@ class Triangles:
     has_texcoords : bool
     """
 
-    def __init__(self, variant: Variant, table: VertexTable, attributes: AttributeTable) -> None:
+    def __init__(
+        self, variant: Variant, table: VertexTable, attributes: AttributeTable, kept: IntArray | None = None
+    ) -> None:
         self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
+        self._kept = slice(None) if kept is None else kept
+        self._name = None if kept is None else Content(kept)
         self.table, self.layout, self._attributes = table, attributes.layout, attributes
         self.patch_count, self.has_texcoords = table.patch_count, "texcoords" in attributes.values
         # Keeps shared arrays alive.
@@ -55,22 +62,23 @@ class Triangles:
         """Vertices of all triangles, flat; with reversed orientation on request."""
 
         def make() -> SharedArray:
-            triangles = self.layout.triangles[:, [0, 2, 1]] if are_turned else self.layout.triangles
+            triangles = self.layout.triangles[self._kept]
+            triangles = triangles[:, [0, 2, 1]] if are_turned else triangles
             if not self._is_jit:
                 return SharedArray(triangles.ravel())
             return SharedArray(self._variant.UInt32(aligned(triangles, dtype=np.uint32)))
 
-        return self._shared("faces", (self.layout, self._variant, are_turned), make)
+        return self._shared("faces", (self.layout, self._variant, are_turned, self._name), make)
 
     @property
     def element(self) -> FloatBuffer:
         """Element of each triangle, as floats."""
 
         def make() -> SharedArray:
-            element = aligned(self.table.element, dtype=np.float32)
+            element = aligned(self.table.element[self._kept], dtype=np.float32)
             return SharedArray(self._variant.Float(element) if self._is_jit else element)
 
-        return self._shared("element", (self.table, self._variant), make)
+        return self._shared("element", (self.table, self._variant, self._name), make)
 
     @property
     def weld_target(self) -> IndexBuffer | None:

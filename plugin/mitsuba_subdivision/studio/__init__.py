@@ -1,6 +1,7 @@
 """A neutral studio around a model: camera, lights and backdrop, turntables, and the command ``render``."""
 
+from .denoising import render_denoised
 from .scene import studio_scene
 from .stage import studio
 
-__all__ = ["studio", "studio_scene"]
+__all__ = ["render_denoised", "studio", "studio_scene"]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import pickle
+import re
 import tempfile
 import warnings
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -25,6 +26,7 @@ from .animation import load_quietly, set_parameters
 from .frame_files import FrameFiles
 from .look import Look
 from .model import Model
+from .obj_materials import material_bsdf, material_emitter
 from .stage import DEFAULT_SIZE, studio
 from .view import View
 
@@ -154,7 +156,8 @@ class CageScenes:
                 continue
             if loaded is None:
                 loaded = load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
-            moved = {"surface.control_points": positions}
+            surfaces = [name for name in scene if re.fullmatch(r"surface(_\d+)?", name)]
+            moved = {f"{name}.control_points": positions for name in surfaces}
             if self._look.cage:
                 moved["cage.control_points"] = model.wire.positions(positions)
             set_parameters(loaded.scene, moved)
@@ -190,16 +193,38 @@ class CageScenes:
         """Entries of the limit surface and of the drawn cage."""
         look = self._look
         triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
-        surface = {**model.as_shape(triangles, look.shading, in_memory=in_memory), "bsdf": _material(look.checker)}
+        surface = model.as_shape(triangles, look.shading, in_memory=in_memory)
+        surfaces = {} if look.checker else _in_materials(model, surface, in_memory)
+        surfaces = surfaces or {"surface": {**surface, "bsdf": _material(look.checker)}}
         if not look.cage:
-            return {"surface": surface}
+            return surfaces
         wire = {
             "type": "subdivision",
             **model.wire.cage.as_properties(mi),
             "tessellation_rate": WIRE_RATE,
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}},
         }
-        return {"surface": surface, "cage": wire}
+        return {**surfaces, "cage": wire}
+
+
+def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
+    """A shape for each material of a cage: "surface", "surface_2" and so on. All have the same vertices."""
+    found: SceneNode = {}
+    if not model.materials:
+        return found
+    # Any, as the stubs call it an object.
+    tensor: Any = mi.TensorXu
+    for name, faces in model.cage.materials.items():
+        material = model.materials.get(name)
+        shown = {"shown_faces": tensor(faces.astype(np.uint32))} if in_memory else {"material": name}
+        emitter = None if material is None else material_emitter(material)
+        found["surface" if not found else f"surface_{len(found) + 1}"] = {
+            **surface,
+            **(shown if len(model.cage.materials) > 1 else {}),
+            "bsdf": _material(False) if material is None else material_bsdf(material, name),
+            **({} if emitter is None else {"emitter": emitter}),
+        }
+    return found
 
 
 def _material(checker: bool) -> SceneNode:

@@ -16,6 +16,7 @@ from ..cage.contents import CageContents
 from ..surface import LimitSurface
 from ..tessellation import VertexTable
 from ..variants import SceneNode
+from .obj_materials import Material, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, triangles_for
 from .up_axis import up_axis_of
 from .wire import CageWire
@@ -73,6 +74,13 @@ class Model:
             self.surface = LimitSurface(ControlCage.from_file(cage, prim=prim, time=time, **rules))
         else:
             self.surface = LimitSurface(ControlCage.from_arrays(**{**contents.as_arguments(), **rules}))
+
+    @cached_property
+    def materials(self) -> dict[str, Material]:
+        """Materials that the libraries of an OBJ file describe, by name."""
+        is_obj = self.path is not None and self.path.suffix.lower() == ".obj"
+        by_face = self.surface.scheme.element == "face" or len(self.cage.materials) == 1
+        return read_materials(self.path) if self.path and is_obj and self.cage.materials and by_face else {}
 
     @property
     def cage(self) -> ControlCage:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 
-# In place of zero, where it would divide.
-TINY = np.finfo(np.float64).tiny
+# In place of zero, where it would divide. Not NumPy's finfo: where Dr.Jit computes without subnormals, NumPy before 2.3
+# warns of it.
+TINY = sys.float_info.min
 # Excess over an integer that counts as rounding error and does not round a rate up.
 RATE_ROUNDING = 1e-9
 # Offsets of the integers to try from the one below the best real number.

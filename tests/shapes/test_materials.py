@@ -1,0 +1,107 @@
+"""Shapes of single materials of a cage: together they are the surface of all."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage
+from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
+from mitsuba_subdivision.figures.output import scene_path
+
+MATERIALS = {"": [0], "red": [1, 4], "dark blue": [2, 3, 5]}
+# Sums of some hundred areas in single precision.
+ROUNDING = 1e-6
+TESSELLATIONS = {
+    "uniform": {"tessellation_rate": 3},
+    "adaptive": {"tessellation": "adaptive", "max_edge": 0.4},
+    "exact": {"tessellation": "adaptive", "max_edge": 0.4, "shading": "exact"},
+}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A cube with materials, of which one is used twice, and a crease between two."""
+    cube().save(tmp_path / "plain.obj")
+    lines = (tmp_path / "plain.obj").read_text().splitlines()
+    faces = [line for line in lines if line.startswith("f ")]
+    names = {face: name for name, of_name in MATERIALS.items() for face in of_name}
+    text = [line for line in lines if not line.startswith("f ")]
+    for face, line in enumerate(faces):
+        text += [*([f"  usemtl {names[face]} "] if names[face] else []), line]
+    (tmp_path / "cube.obj").write_text("\n".join([*text, "t crease 2/1/0 0 1 10", ""]))
+    return str(tmp_path / "cube.obj")
+
+
+def shape(**parameters):
+    return mi.load_dict({"type": "subdivision", **parameters})
+
+
+def triangles(part):
+    """Positions of the corners of all triangles, as numbers with all their bits, in one order."""
+    found = mi.traverse(part)
+    positions = np.array(found["vertex_positions"]).reshape(-1, 3)
+    corners = positions[np.array(found["faces"]).reshape(-1, 3)].reshape(-1, 9)
+    return corners[np.lexsort(corners.T)]
+
+
+def test_files_name_the_material_of_each_face(file):
+    cage = ControlCage.from_file(file)
+    assert {name: faces.tolist() for name, faces in cage.materials.items()} == MATERIALS
+    refined = cage.refined().materials
+    assert {name: len(faces) for name, faces in refined.items()} == {"": 4, "red": 8, "dark blue": 12}
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize("name", TESSELLATIONS)
+def test_materials_share_their_vertices_bit_by_bit(file, name):
+    whole = shape(filename=file, **TESSELLATIONS[name])
+    parts = [shape(filename=file, material=material, **TESSELLATIONS[name]) for material in MATERIALS]
+    together = np.concatenate([triangles(part) for part in parts])
+    np.testing.assert_array_equal(together[np.lexsort(together.T)], triangles(whole))
+    areas = [float(part.surface_area()) for part in parts]
+    assert sum(areas) == pytest.approx(float(whole.surface_area()), rel=ROUNDING)
+    assert min(areas) > 0
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_hits_of_materials_are_those_of_the_whole(np_rng):
+    filename = str(scene_path("human").parent / "cages" / "star.obj")
+    faces = ControlCage.from_file(filename).face_count
+    tensor = mi.TensorXu
+    chosen = np_rng.permutation(faces)
+    settings = {"filename": filename, "tessellation_rate": 2, "shading": "exact"}
+    parts = {f"part_{i}": each for i, each in enumerate(np.split(chosen, [faces // 3]))}
+    scenes = [
+        mi.load_dict({"type": "scene", "whole": {"type": "subdivision", **settings}}),
+        mi.load_dict(
+            {
+                "type": "scene",
+                **{
+                    key: {"type": "subdivision", **settings, "shown_faces": tensor(each.astype(np.uint32))}
+                    for key, each in parts.items()
+                },
+            }
+        ),
+    ]
+    hits = 0
+    for origin, direction in np_rng.normal(size=(20, 2, 3)):
+        ray = mi.Ray3f(origin.tolist(), (direction - origin).tolist())
+        expected, found = (scene.ray_intersect(ray) for scene in scenes)
+        assert expected.is_valid() == found.is_valid()
+        if found.is_valid():
+            hits += 1
+            np.testing.assert_array_equal([*found.p, *found.sh_frame.n], [*expected.p, *expected.sh_frame.n])
+    assert hits
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_unknown_materials_and_faces_are_errors(file):
+    with pytest.raises(RuntimeError, match='"material" is "green"; expected one of "", "red", "dark blue"'):
+        shape(filename=file, material="green")
+    with pytest.raises(RuntimeError, match='parameter "shown_faces" has 6; expected 0 to 5'):
+        shape(filename=file, shown_faces=mi.TensorXu(np.array([6], np.uint32)))
+    with pytest.raises(RuntimeError, match='"material" and "shown_faces" contradict each other'):
+        shape(filename=file, material="red", shown_faces=mi.TensorXu(np.array([1], np.uint32)))
+    with pytest.raises(
+        RuntimeError, match='expected none for the scheme "doo_sabin", whose surface belongs to vertices'
+    ):
+        shape(**tetrahedron().as_properties(mi), scheme="doo_sabin", shown_faces=mi.TensorXu(np.array([1], np.uint32)))
