@@ -4,6 +4,7 @@
 not compiled into Mitsuba, or has no backend on this machine, is skipped.
 """
 
+import gc
 import os
 
 # All cores have tests to run: a BLAS of several threads in each process has them wait for each other, which takes twice
@@ -22,6 +23,16 @@ from mitsuba_subdivision.llvm import llvm_problem
 def pytest_runtest_setup(item):
     if os.name != "posix" and item.get_closest_marker("posix"):
         pytest.skip("there are no programs of the shell, signals, pipes or links as on POSIX")
+
+
+@pytest.fixture
+def no_other_scene():
+    """Free the scenes of earlier tests.
+
+    Dr.Jit 1.5 cannot propagate derivatives forward through a ray while the shapes of another scene have derivatives,
+    Mitsuba's own included, and its next derivative ends the process.
+    """
+    gc.collect()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from mitsuba_subdivision.inspection import inspect
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, Unsupported
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE, AffineMap, ParameterDomain
 from mitsuba_subdivision.schemes.scheme import OptionalMembers, PhantomPoint
-from mitsuba_subdivision.schemes.scheme_members import optional_member
+from mitsuba_subdivision.schemes.scheme_members import optional_member, require_members
 from reference.refined_cages import sheet, tagged
 
 REQUIRED = (
@@ -219,6 +219,11 @@ def test_a_member_of_another_kind_or_shape_is_named(member, number):
         register_scheme(scheme)
     with pytest.raises(SchemeError):
         LimitSurface(cube(), scheme)
+
+
+def test_three_faces_may_meet_at_a_regular_vertex():
+    # As in schemes on hexagons.
+    require_members(Members(CatmullClark(), regular_valence=3))
 
 
 SMOOTH = CatmullClark()

@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage import rules
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from reference.exact_samples import faces_of
 
@@ -280,3 +281,12 @@ def test_time_of_tags_grows_with_their_number(tmp_path):
     cage = ControlCage.from_file(path)
     assert time.process_time() - start < 1
     assert cage.tags.edges.max() == 2.5
+
+
+def test_a_rule_that_no_tag_stands_for_is_lost_with_a_warning(tmp_path, monkeypatch):
+    """As a new boundary rule would be, which OpenSubdiv's tags do not know."""
+    monkeypatch.setitem(rules.RULES, "boundary", (*rules.RULES["boundary"], "new"))
+    cage = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="new")
+    with pytest.warns(CageWarning, match="no place for boundary new"):
+        cage.save(tmp_path / "cage.obj")
+    assert ControlCage.from_file(tmp_path / "cage.obj").boundary == rules.RULES["boundary"][0]

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from images.random_images import METADATA, SIZE, dome, random_image, truth
 from mitsuba_subdivision.images import ImageError
-from mitsuba_subdivision.images.compare import compare
+from mitsuba_subdivision.images.compare import compare, relmse
 from mitsuba_subdivision.images.flip_tier import flip, flip_exposures
 from mitsuba_subdivision.images.image import Image
 from mitsuba_subdivision.images.panel import Panel
 from mitsuba_subdivision.images.png import srgb
+from mitsuba_subdivision.images.probe_tier import normal_angle
 from mitsuba_subdivision.images.report import write_report
 from mitsuba_subdivision.images.tier import Status, TierResult
 from mitsuba_subdivision.images.tiers import TIERS, Tier
@@ -62,6 +63,43 @@ def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
     found = compare(reference, random_image(np_rng, 8, mean=mean), ["tile"]).tier("tile")
     assert found.status is Status.FAIL
     assert found.worst[0] >= 4
+
+
+def test_the_relative_error_of_a_grey_image_has_a_closed_form():
+    b, e = 0.3, 0.01
+    grey = np.full((4, 4, 3), b)
+    assert math.isclose(relmse(grey, (1 + e) * grey), (e * b) ** 2 / (b**2 + 0.01), rel_tol=1e-12)
+
+
+def test_exposures_are_those_that_flip_chooses():
+    flip_evaluator = pytest.importorskip("flip_evaluator")
+    pixels = (truth() * np.geomspace(0.01, 90, SIZE)[:, None, None]).astype(np.float32)[1:, 1:]
+    chosen = flip_evaluator.evaluate(pixels, pixels, "HDR")[2]
+    found = flip_exposures(pixels)
+    # Rounded to thousandths. The number of pixels is odd, so that there is one median.
+    assert abs(found["start"] - chosen["startExposure"]) < 0.001
+    assert abs(found["stop"] - chosen["stopExposure"]) < 0.001
+    assert found["count"] == chosen["numExposures"] > 2
+
+
+def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):
+    found = compare(reference, random_image(np_rng, 4), ["tile"]).tier("tile")
+    smallest = min(scale["smallest_p"] for name, scale in found.numbers["scales"].items() if name != "whole")
+    np.testing.assert_allclose(found.maps["evidence"].max(), -np.log10(smallest), rtol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [1e-6, 30, 179])
+def test_angles_between_normals_are_those_of_a_turn(degrees):
+    turned = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0])
+    assert math.isclose(normal_angle(np.array([1.0, 0, 0]), turned), degrees, rel_tol=1e-9)
+
+
+def test_probes_that_hit_nothing_are_alike(reference, np_rng):
+    nothing = np.uint32(2**32 - 1)
+    sky = dome()
+    sky = replace(sky, **{name: np.full_like(sky.shape, nothing) for name in ("shape", "triangle", "element")})
+    found = compare(replace(reference, probe=sky), random_image(np_rng, 4, probe=sky), ["probe"])
+    assert found.status is Status.PASS
 
 
 def test_a_change_below_the_floor_is_single_precision(reference, np_rng):

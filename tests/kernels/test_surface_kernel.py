@@ -34,6 +34,8 @@ BARS = {
 }
 # Some tens of roundings in single precision.
 BORDER_NORMAL = 2e-6
+# Of the cage's size: what single precision cannot tell apart in coordinates of this size.
+ONE_POINT = 2.0**-24
 # Stam's first term in double precision: what rounding leaves of a sum that should be zero, times 2^5 for level 5.
 FIRST_TERM = 1e-11
 # Central differences in double precision: truncation of about the step squared, rounding over the step.
@@ -112,6 +114,25 @@ def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(nam
     found, expected = evaluated(kernel, *on_device(kernel.types, *locations)), surface.evaluate(*locations)
     assert expected.level.max() > 18
     np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BORDER_NORMAL)
+
+
+@pytest.mark.parametrize("name", ["hexagon", "valence 2", "half disc of 6", "corner", "loop half disc of 6"])
+def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
+    """Next to a corner whose normal is a convention, or a slow limit, exact normals differ from it at every level.
+
+    Kernels have the corner's own normal where the point is the corner in single precision, and only there.
+    """
+    surface, kernel = surface_named(name), kernel_named(name, SINGLE)
+    element, uv, corner = random_locations(surface, np_rng, 8000)
+    uv = (uv * 2.0 ** -np_rng.uniform(0, 100, (8000, 1))).astype(np.float32).astype(float)
+    found = evaluated(kernel, *on_device(kernel.types, element, uv, corner))
+    expected, at_corner = surface.evaluate(element, uv, corner), surface.evaluate(element, 0 * uv, corner)
+    differs = np.linalg.norm(vectors(found.n) - expected.n, axis=1) > BARS[SINGLE]["normal"]
+    assert differs.any()
+    np.testing.assert_allclose(vectors(found.n)[differs], at_corner.n[differs], rtol=0, atol=BORDER_NORMAL)
+    size = np.ptp(surface.cage.positions, axis=0).max()
+    assert np.linalg.norm(expected.p - at_corner.p, axis=1)[differs].max() <= ONE_POINT * size
+    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[SINGLE]["point"])
 
 
 @pytest.mark.core

@@ -34,7 +34,20 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 
-from .fidelity_cages import ISLANDS, SURFACES, bipyramid, cube, fan, features, grid, lattice, scattered
+from .fidelity_cages import (
+    ISLANDS,
+    SURFACES,
+    bipyramid,
+    book,
+    cube,
+    fan,
+    features,
+    grid,
+    joined,
+    lattice,
+    scattered,
+    strip,
+)
 from .peers import PeerCage, evaluate, find
 
 pytestmark = [
@@ -252,3 +265,56 @@ def test_other_surfaces_are_told_apart(name, change):
     ours = surface_of(change(cage)).evaluate(element, uv, corner)
     theirs = evaluate(cage, element, uv, corner, method="refine", level=LEVEL)
     assert distance(ours.p, theirs.p).max() > POINT * box(cage)
+
+
+def _apart(ours, theirs, element):
+    """The faces on which surfaces differ."""
+    return set(element[distance(ours.p, theirs.p) > POINT].tolist())
+
+
+def _triangles(cage):
+    return replace(cage, faces=[half for a, b, c, d in cage.faces for half in ([a, b, c], [a, c, d])], scheme="loop")
+
+
+@pytest.mark.parametrize(
+    ("cage", "against"),
+    [(grid(3, 3), {4}), (strip(2), {4, 5, 6}), (_triangles(grid(3, 3)), {8}), (_triangles(strip(2)), {5, 6, 7})],
+    ids=["inside a sheet", "part of a ring", "Loop, inside a sheet", "Loop, part of a ring"],
+)
+def test_faces_against_their_neighbours_differ_by_one_rule(cage, against):
+    """OpenSubdiv takes such faces as they are, with a corner at both ends of the sharp edges around them.
+
+    As in its shapes `catmark_nonman_edges` and `loop_nonman_edges`. Here they are turned, and their surface is the one
+    that OpenSubdiv has of the turned faces. It has the other one if the edges and their ends are tagged.
+    """
+    given = replace(cage, faces=[face[::-1] if k in against else face for k, face in enumerate(cage.faces)])
+    turned = surface_of(given)
+    element, uv, _ = lattice(cage, STEPS)
+    size, begins = len(cage.faces[0]), turned.cage.face_vertices[turned.cage.topology.face_offsets[:-1]]
+    corner = np.array([face.index(vertex) for face, vertex in zip(cage.faces, begins, strict=True)])[element]
+    ours = turned.evaluate(element, uv, -corner % size)
+    # From the same vertex of a face that is the other way round, u and v are exchanged.
+    other_way = np.isin(element, list(against))
+    there = np.where(other_way[:, None], uv[:, ::-1], uv), np.where(other_way, size - 1, 0)
+    explicit = evaluate(given, element, *there, method="refine", level=LEVEL)
+    assert not _apart(ours, evaluate(cage, element, uv, method="refine", level=LEVEL), element)
+
+    others = [{*face} for k, face in enumerate(cage.faces) if k not in against]
+    around = [edge for k in against for edge in zip(cage.faces[k], np.roll(cage.faces[k], -1), strict=True)]
+    edges = [edge for edge in around if any({*edge} <= face for face in others)]
+    ends = {vertex for edge in edges for vertex in edge}
+    assert _apart(ours, explicit, element) == {k for k, face in enumerate(cage.faces) if ends & {*face}}
+    tagged = replace(cage, creases=[(*edge, 10) for edge in edges], corners=[(vertex, 10) for vertex in ends])
+    assert not _apart(surface_of(tagged).evaluate(element, uv), explicit, element)
+
+
+@pytest.mark.parametrize("triangles", [False, True])
+def test_fans_beside_a_spine_differ_by_one_rule(triangles):
+    """OpenSubdiv moves them along the spine, whose far points are none of theirs; here the vertex is a corner."""
+    cage = joined(book(3, triangles), fan(5, triangles=triangles), {0: 1})
+    element, uv, corner = lattice(cage, STEPS)
+    ours = surface_of(cage).evaluate(element, uv, corner)
+    explicit = evaluate(cage, element, uv, corner, method="refine", level=LEVEL)
+    assert _apart(ours, explicit, element) == {k for k, face in enumerate(cage.faces) if 1 in face}
+    held = evaluate(replace(cage, corners=[(1, 10)]), element, uv, corner, method="refine", level=LEVEL)
+    assert not _apart(ours, held, element)

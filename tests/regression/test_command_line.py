@@ -242,6 +242,7 @@ SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
         (with_metadata(sampling={**SAMPLING, "batch": 0}), "expected a seed, the samples of a batch, and ranges"),
         (with_metadata(sampling={**SAMPLING, "batches": [[5, 2]]}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "batches": [1, 2]}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "batches": [[2, 5], [6]]}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "seed": "0"}), "expected a seed, the samples of a batch"),
         (with_metadata(files=[1]), r"files is \[1\]; expected checksums by name"),
         (with_metadata(variant=7), "variant is 7; expected a name"),

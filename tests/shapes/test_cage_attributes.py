@@ -273,6 +273,7 @@ def weights_of(cage, name, scheme):
     return surface.tessellate(4).attributes["unit"]
 
 
+@pytest.mark.usefixtures("no_other_scene")
 @every_ad_variant
 @pytest.mark.parametrize("cage", ["cube", "mixed", "refined", "loop"], indirect=True)
 @pytest.mark.parametrize("name", NAMES)

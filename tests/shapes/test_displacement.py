@@ -322,6 +322,7 @@ def test_flipped_normals_move_the_surface_the_same_way(flip):
     np.testing.assert_array_equal(p, vertices(make(cage, "vertex_height"))[0])
 
 
+@pytest.mark.usefixtures("no_other_scene")
 @every_variant
 def test_nothing_moves_where_there_is_no_normal():
     # Two faces glued back to back: the surface is folded along the border between them.

@@ -670,6 +670,7 @@ def test_variants_agree(variant, request):
 # Stam's form
 
 
+@pytest.mark.usefixtures("no_other_scene")
 @pytest.mark.parametrize("valence", [3, 5])
 @llvm
 def test_stams_form_goes_wrong_as_it_is_published(valence):
@@ -772,6 +773,7 @@ def test_every_view_has_its_gradients():
     np.testing.assert_allclose(sums[1:], [2 * sums[0], 3 * sums[0]], rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.usefixtures("no_other_scene")
 @pytest.mark.parametrize("by", ["shape.control_points", "shape.to_world"])
 @llvm
 def test_derivatives_of_hits_by_parameters_are_differences(by):
@@ -812,6 +814,7 @@ def test_derivatives_of_hits_by_parameters_are_differences(by):
     assert found[1] == pytest.approx(found[0], rel=1e-3)
 
 
+@pytest.mark.usefixtures("no_other_scene")
 @llvm
 def test_gradients_of_renders_by_to_world_are_the_same_both_ways():
     scene = scene_of(make(cube(), tessellation_rate=2), "direct", sky(), {"fov": 10, "resolution": 8})

@@ -13,7 +13,8 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.shapes import cage_files, nesting
+from mitsuba_subdivision.files.formats import FORMATS
+from mitsuba_subdivision.shapes import nesting
 from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
@@ -304,7 +305,7 @@ def test_each_shape_warns_of_its_file(tmp_path):
 
 def test_names_of_formats_that_refer_to_no_other_files():
     """USD files do, and these may change alone."""
-    assert cage_files.SUFFIXES == (".obj", ".ply")
+    assert {suffix for suffix, each in FORMATS.items() if not each.refers_to_files} == {".obj", ".ply"}
 
 
 @llvm

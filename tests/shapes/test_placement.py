@@ -263,6 +263,7 @@ def test_control_points_that_are_not_finite_are_an_error_and_change_nothing(valu
 # Derivatives
 
 
+@pytest.mark.usefixtures("no_other_scene")
 @pytest.mark.parametrize("name", ["none", "identity", "turned", "mirrored"])
 @pytest.mark.parametrize("cage", [named_cages.extraordinary(3), seamed()], ids=["smooth", "seamed"])
 @pytest.mark.usefixtures("variants_all_ad_rgb")

@@ -6,6 +6,7 @@ import argparse
 import math
 
 from ..llvm import best_variant
+from ..schemes import SCHEME_CLASSES
 from ..shapes.parameter_table import HIGHEST_RATE
 
 
@@ -42,7 +43,7 @@ def set_variant(name: str | None) -> None:
 def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:
     """Add the options that choose one surface of a file: ``--scheme``, ``--prim``, ``--time``, ``--rate``."""
     parser.add_argument(
-        "--scheme", help="catmull_clark, doo_sabin or loop (default: the file's, otherwise catmull_clark)"
+        "--scheme", help=f"one of {', '.join(SCHEME_CLASSES)} (default: the file's, otherwise catmull_clark)"
     )
     parser.add_argument(
         "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"

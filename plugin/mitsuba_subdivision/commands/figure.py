@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..figures import FIGURES, FigureOptions, require_options
 from ..messages import print_result
+from ..schemes import SCHEME_CLASSES
 from ..whole_file import require_folder, require_writable
 from .arguments import add_variant, positive, set_variant
 from .parser import table
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
-SCHEMES = ("catmull_clark", "doo_sabin", "loop")
 
 
 def add_parser(commands: Commands) -> None:
@@ -43,9 +43,9 @@ def add_parser(commands: Commands) -> None:
     figure.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
     figure.add_argument(
         "--scheme",
-        choices=SCHEMES,
+        choices=list(SCHEME_CLASSES),
         metavar="SCHEME",
-        help=f"{', '.join(SCHEMES[:-1])} or {SCHEMES[-1]} (default: catmull_clark)",
+        help=f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)",
     )
     figure.add_argument(
         "--format",

@@ -38,6 +38,8 @@ class Format:
         A function with the parameters of `files.triangle_writer.write_triangles`.
     has_prims : bool
         Whether a file may hold several meshes, and values at several times.
+    refers_to_files : bool
+        Whether what a file says may depend on other files.
     up : "y" or "z", optional
         Axis that points up in the files that modelling programs write by default; None if files store it.
     """
@@ -46,10 +48,11 @@ class Format:
     write: str | None = None
     write_triangles: str | None = None
     has_prims: bool = False
+    refers_to_files: bool = False
     up: str | None = None
 
 
-_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", has_prims=True)
+_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", True, True)
 # Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
 FORMATS = {
     ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles", up="y"),
@@ -58,7 +61,7 @@ FORMATS = {
     ".usda": _USD,
     ".usdc": _USD,
     # An archive of finished USD files, which can be read but not written.
-    ".usdz": Format(_USD.read, has_prims=True),
+    ".usdz": Format(_USD.read, has_prims=True, refers_to_files=True),
 }
 
 

@@ -191,9 +191,16 @@ def tag_statements(contents: CageContents) -> str:
         default = RULES[rule][0]
         value = contents.rules.get(rule, default)
         if value != default:
-            given = next(key for key, name in values.items() if name == value)
-            lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
+            given = next((key for key, name in values.items() if name == value), None)
+            if given is not None:
+                lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
     return "".join(lines)
+
+
+def rules_without_tag(contents: CageContents) -> list[str]:
+    """Rules of a cage whose value no tag of OBJ stands for, as "rule value"."""
+    tagged = {rule: (RULES[rule][0], *values.values()) for rule, values in _RULE_TAGS.values()}
+    return [f"{rule} {value}" for rule, value in contents.rules.items() if value not in tagged.get(rule, ())]
 
 
 def _row_count(where: str, name: str, integers: list[int], floats: list[float]) -> int:

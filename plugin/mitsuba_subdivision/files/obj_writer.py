@@ -12,7 +12,7 @@ from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..whole_file import whole_file
 from .losses import warn_of_losses
-from .obj_tags import tag_statements
+from .obj_tags import rules_without_tag, tag_statements
 
 # Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
 ROWS = 1 << 16
@@ -44,6 +44,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
             **{f'attribute "{name}"': True for name in contents.attributes},
             "scheme": contents.scheme is not None,
             "materials": bool(contents.materials),
+            **dict.fromkeys(rules_without_tag(contents), True),
         },
     )
     with whole_file(Path(path)) as beside:

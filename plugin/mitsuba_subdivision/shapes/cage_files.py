@@ -15,13 +15,12 @@ import numpy as np
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
 from ..cage.errors import noting_warnings, warn
+from ..files.formats import FORMATS
 from ..mesh.shared import Shared
 
 # A file modified less than this many nanoseconds ago may change without a new modification time: the resolution of
 # file times is some milliseconds, and two seconds on some systems.
 SETTLED = 2_000_000_000
-# Suffixes of files that refer to no other files.
-SUFFIXES = (".obj", ".ply")
 
 _CAGES: Shared[ControlCage] = Shared()
 # Warnings that each cage issued when it was built, repeated for each shape.
@@ -41,7 +40,8 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
     CageWarning
         Likewise, for each shape.
     """
-    if os.path.splitext(path)[1].lower() not in SUFFIXES:
+    found_format = FORMATS.get(os.path.splitext(path)[1].lower())
+    if found_format is None or found_format.refers_to_files:
         return ControlCage.from_file(path, **options)
     found = os.stat(path)
     if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:

@@ -459,6 +459,8 @@ class LimitSurface:
     def on_device(self, variant: ModuleType | str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and intersected by rays, in the variant's precision.
 
+        Where points are an extraordinary vertex by single precision, normals are those of the vertex in every variant.
+
         Parameters
         ----------
         variant : module or str
