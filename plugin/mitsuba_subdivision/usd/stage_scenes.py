@@ -183,7 +183,7 @@ class StageScenes:
 
     def _with_copies(self, contents: SceneContents, notes: Notes) -> tuple[SceneContents, dict[str, Any]]:
         """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
-        if not mi.Float is not float:
+        if mi.Float is float:
             return contents, self._parameters
         rate = int(self._parameters.get("tessellation_rate", MOST_SEGMENTS))
         copies = Counter(shape for shape, _ in contents.placed_shapes)
