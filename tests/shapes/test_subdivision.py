@@ -302,7 +302,7 @@ def sample_scene(cage, integrator="direct"):
     return mi.load_dict(
         {
             "type": "scene",
-            # Without outlines seen indirectly: the cube has none, and Mitsuba never frees a scene with samples of these.
+            # Mitsuba never frees a scene with samples of indirect outlines; the cube has none to see.
             "integrator": {"type": integrator, **({"sppi": 0} if integrator.endswith("_projective") else {})},
             "sensor": {
                 "type": "perspective",
