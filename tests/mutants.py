@@ -12,6 +12,7 @@ import argparse
 import ast
 import random
 import re
+import resource
 import sqlite3
 import subprocess
 import sys
@@ -33,6 +34,8 @@ OPERATORS = re.compile(
 # Tests that one call of pytest gets: so many are quick to collect, and the first ones kill most mutants.
 FIRST_TESTS = 40
 
+# In bytes, for the tests of one mutant: some mutants allocate without end.
+MEMORY = 6 << 30
 
 # Functions whose calls, and conditions whose blocks, leave results as they are.
 SILENT = ("warnings.warn", "TYPE_CHECKING")
@@ -124,6 +127,7 @@ def run_tests() -> int:
     """Run the tests that cover the mutant; 0 if all pass."""
     import pytest
 
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     tests = covering_tests(*mutated_lines())
     options = ["-x", "-q", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-p", "no:xdist"]
     return pytest.main([*options, *tests[:FIRST_TESTS]]) or (
