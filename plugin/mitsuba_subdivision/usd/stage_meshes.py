@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Primvars that are the colour of meshes without a material.
 COLORS = ("displayColor", "displayOpacity")
+# Faces times parts of a mesh, up to which each part evaluates the whole surface.
+MOST_SHARED_FACES = 1_000_000
 
 
 class ShapeReader:
@@ -102,7 +104,8 @@ class ShapeReader:
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
             shown = None
-            if len(materials) > 1 and cage.scheme is None:
+            is_small = len(materials) * len(cage.face_sizes) <= MOST_SHARED_FACES
+            if len(materials) > 1 and (cage.scheme is None or not is_small):
                 cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             elif len(materials) > 1:
                 # All parts evaluate the whole surface, so that they agree in every bit where they meet.
