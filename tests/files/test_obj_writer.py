@@ -28,6 +28,21 @@ def test_a_warning_names_what_has_no_place(tmp_path):
     assert ControlCage.from_file(tmp_path / "cage.obj").texcoords is None
 
 
+def test_materials_are_read_back(tmp_path):
+    materials = {"": [0], "red 100%": [1, 4], "großes Glas": [2, 3, 5]}
+    square = cube().face_vertices.reshape(-1, 4)
+    ControlCage(cube().positions, square, materials=materials).save(tmp_path / "cage.obj")
+    found = ControlCage.from_file(tmp_path / "cage.obj")
+    np.testing.assert_array_equal(found.face_vertices, square.ravel())
+    assert [faces.tolist() for faces in found.materials.values()] == list(materials.values())
+    found.save(tmp_path / "again.obj")
+    assert ControlCage.from_file(tmp_path / "again.obj").materials.keys() == found.materials.keys()
+    with pytest.warns(CageWarning, match='no place for material "a#b", further materials of a face of the cage'):
+        ControlCage(cube().positions, square, materials={"a": [0, 1], "a#b": [1]}).save(tmp_path / "cage.obj")
+    found = ControlCage.from_file(tmp_path / "cage.obj").materials
+    assert {name: faces.tolist() for name, faces in found.items()} == {"": [1, 2, 3, 4, 5], "a": [0]}
+
+
 def test_existing_file_is_replaced_and_nothing_else_is_left(tmp_path):
     path = tmp_path / "cage.obj"
     write_obj(cube().contents, path)

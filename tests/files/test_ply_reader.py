@@ -205,6 +205,17 @@ def test_a_warning_names_what_is_left_out(read):
         read(text)
 
 
+@pytest.mark.parametrize("name", ["material_index", "material_id", "texnumber"])
+@pytest.mark.parametrize("before", [False, True])
+def test_integers_of_faces_are_materials(read, name, before):
+    prop = f"property short {name}\n"
+    text = SHEET.replace("property list", f"{prop}property list") if before else SHEET.replace("end_", f"{prop}end_")
+    for row, number in (("4 0 1 2 3", "7"), ("3 1 4 2", "-1")):
+        text = text.replace(row, f"{number} {row}" if before else f"{row} {number}")
+    found = read(text).materials
+    assert {name: faces.tolist() for name, faces in found.items()} == {"": [1], "material_7": [0]}
+
+
 def test_other_elements_are_skipped(read):
     edges = "element edge 1\nproperty int vertex1\nproperty int vertex2\n"
     text = SHEET.replace("element face", edges + "element face").replace("4 0 1 2 3", "0 1\n4 0 1 2 3")
@@ -382,6 +393,35 @@ def test_round_trip_is_exact(any_cage, tmp_path, np_rng):
     for name, attribute in attributes.items():
         np.testing.assert_array_equal(again.attributes[name].values, attribute.values)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_materials_are_read_back(any_cage, tmp_path, np_rng):
+    """By both readers of binary files: of tables, and of lists of different lengths."""
+    count = any_cage.face_count
+    owner = np_rng.integers(-1, 3, count)
+    names = {"": -1, "material_0": 0, "material_12": 1, "material_2": 2}
+    materials = {name: np.flatnonzero(owner == number) for name, number in names.items() if (owner == number).any()}
+    cage = ControlCage.from_arrays(any_cage.positions, any_cage.face_sizes, any_cage.face_vertices, materials=materials)
+    cage.save(tmp_path / "cage.ply")
+    again = ControlCage.from_file(tmp_path / "cage.ply")
+    np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)
+    assert again.materials.keys() == materials.keys()
+    for name, faces in materials.items():
+        np.testing.assert_array_equal(again.materials[name], faces)
+
+
+def test_names_of_materials_have_no_place(tmp_path):
+    named = ControlCage(
+        cube().positions, cube().face_vertices.reshape(-1, 4), materials={"red": [1], "material_0": [2]}
+    )
+    with pytest.warns(CageWarning, match='no place for the name of material "red" of the cage; written'):
+        named.save(tmp_path / "cage.ply")
+    found = ControlCage.from_file(tmp_path / "cage.ply").materials
+    assert {name: faces.tolist() for name, faces in found.items()} == {
+        "": [0, 3, 4, 5],
+        "material_0": [2],
+        "material_1": [1],
+    }
 
 
 def test_faces_of_more_than_255_vertices(tmp_path):

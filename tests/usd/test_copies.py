@@ -45,6 +45,13 @@ def test_copies_of_one_rate_are_one_shape():
     np.testing.assert_allclose(few.positions, np.concatenate(expected))
 
 
+def test_copies_of_a_part_show_its_faces_only():
+    part = ShapeContents("/cube", cube(), np.eye(4), shown_faces=np.array([1, 4]))
+    found, _ = with_copies(scene(group=[part]), {}, "exact", Notes())
+    expected = np.add.outer(6 * np.arange(COUNT), [1, 4]).ravel()
+    np.testing.assert_array_equal(found.shapes[0].shown_faces, expected)
+
+
 def test_few_instances_stay():
     shape = ShapeContents("/cube", cube(), np.eye(4))
     contents = scene(group=[shape], count=LEAST_INSTANCES - 1)

@@ -59,6 +59,14 @@ class CageContents:
     scheme: str | None = None
     source: CageSource = field(default_factory=CageSource)
 
+    @property
+    def material_of_face(self) -> IntArray:
+        """``(n_f,)`` index of each face's material among ``materials``, the last one of several; -1 for none."""
+        found = np.full(len(self.face_sizes), -1)
+        for number, faces in enumerate(self.materials.values()):
+            found[faces] = number
+        return found
+
     def as_arguments(self) -> dict[str, Any]:
         """Contents as the arguments of `ControlCage.from_arrays`, in which each rule is an argument of its own."""
         return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "rules"} | {**self.rules}

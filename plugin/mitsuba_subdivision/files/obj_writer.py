@@ -31,24 +31,26 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
     Warns
     -----
     CageWarning
-        If the cage has more than OBJ files can hold: attributes, a scheme, or texture coordinates that are not
-        face-varying.
+        If the cage has more than OBJ files can hold: attributes, a scheme, texture coordinates that are not
+        face-varying, several materials of one face, or names of materials that are not one line of text.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "face_varying":
         texcoords = None
+    owner = contents.material_of_face
     warn_of_losses(
         path,
         {
             "texcoords": contents.texcoords is not texcoords,
             **{f'attribute "{name}"': True for name in contents.attributes},
             "scheme": contents.scheme is not None,
-            "materials": bool(contents.materials),
+            **{f'material "{name}"': not _is_possible(name) for name in contents.materials},
+            "further materials of a face": sum(map(len, contents.materials.values())) > (owner >= 0).sum(),
             **dict.fromkeys(rules_without_tag(contents), True),
         },
     )
     with whole_file(Path(path)) as beside:
-        beside.write_bytes(_cage_text(contents, texcoords).encode("ascii"))
+        beside.write_bytes(_cage_text(contents, texcoords).encode())
 
 
 def write_obj_triangles(
@@ -85,8 +87,19 @@ def _cage_text(contents: CageContents, texcoords: Attribute | None) -> str:
         indices, corner = np.stack([indices, rows + 1], axis=1).ravel(), " %d/%d"
     sizes = contents.face_sizes.tolist()
     form = {size: "f" + corner * size + "\n" for size in set(sizes)}
-    faces = "".join(form[size] for size in sizes) % tuple(indices.tolist())
+    lines = [form[size] for size in sizes]
+    # The last name is of faces without a material, whose index is -1.
+    names = [*(name.replace("%", "%%") if _is_possible(name) else "" for name in contents.materials), ""]
+    of_face = np.array(names, dtype=object)[contents.material_of_face]
+    for face in np.flatnonzero(of_face != np.append([""], of_face[:-1])):
+        lines[face] = f"usemtl {of_face[face]}\n{lines[face]}"
+    faces = "".join(lines) % tuple(indices.tolist())
     return header + vertices + texcoord_lines + faces + tag_statements(contents)
+
+
+def _is_possible(name: str) -> bool:
+    """Whether a ``usemtl`` statement with this name of a material is read back as it was."""
+    return name == name.strip() and name.isprintable() and "#" not in name and not name.endswith("\\")
 
 
 def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:

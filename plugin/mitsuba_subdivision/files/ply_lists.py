@@ -15,15 +15,18 @@ _WINDOW = 1 << 16
 
 
 class Lists(NamedTuple):
-    """Lists of one property in all rows of an element, and the file without these rows."""
+    """Lists of one property in all rows of an element, numbers beside them, and the file without these rows."""
 
     sizes: IntArray
     values: NDArray
     rest: bytes
+    numbers: NDArray | None
 
 
-def lists_of_rows(header: PlyHeader, content: bytes, element: str, name: str) -> Lists | None:
+def lists_of_rows(header: PlyHeader, content: bytes, element: str, name: str, beside: str | None) -> Lists | None:
     """Read the lists ``name`` of an element of a binary file that has only tables before it.
+
+    And the numbers ``beside``, another property of the same rows.
 
     None if the element is a table itself, another one that is none stands before it, or the file is damaged.
     """
@@ -47,7 +50,7 @@ def lists_of_rows(header: PlyHeader, content: bytes, element: str, name: str) ->
     lines = content[: header.size].split(newline)
     lines[found.line - 1] = f"element {element} 0".encode()
     rest = newline.join(lines) + content[header.size : begin] + content[ends[-1] :]
-    return Lists(sizes, values, rest)
+    return Lists(sizes, values, rest, None if beside is None else rows.numbers(starts, beside))
 
 
 class _Rows:
@@ -61,6 +64,16 @@ class _Rows:
         count = len(self._content) - kind.itemsize + 1
         numbers: NDArray = np.ndarray(count, kind.newbyteorder(self._byte_order), self._content, 0, (1,))
         return numbers[np.minimum(offsets, count - 1)].astype(kind)
+
+    def numbers(self, starts: IntArray, name: str) -> NDArray:
+        """Values of a property that is one number, for rows that begin at some bytes."""
+        at = starts
+        for each in self._element.properties:
+            if each.name == name:
+                return self.at(each.type, at)
+            lengths = 0 if each.items is None else self.at(each.type, at).astype(np.int64) * each.items.itemsize
+            at = at + each.type.itemsize + lengths
+        raise KeyError(name)
 
     def lists(self, starts: IntArray, name: str | None = None) -> tuple[IntArray, IntArray, IntArray]:
         """Where a list's numbers begin, its length, and where the row ends, for rows that begin at some bytes."""

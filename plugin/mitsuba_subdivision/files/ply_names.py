@@ -13,6 +13,8 @@ NORMAL = ("nx", "ny", "nz")
 COLOR = ("red", "green", "blue", "alpha")
 # Pairs for texture coordinates; of several pairs in a file, the first in this order is read.
 TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+# Properties of faces for their material, of common files and of MeshLab; the first one in a file is read.
+MATERIAL = ("material_index", "material_id", "texnumber")
 
 _RESERVED = {*POSITION, *NORMAL, *COLOR, *(name for pair in TEXCOORDS for name in pair)}
 

@@ -20,7 +20,7 @@ from ..cage.source import CageSource
 from ..mesh.connectivity import IntArray
 from .ply_header import EXPECTED, PlyHeader
 from .ply_lists import lists_of_rows
-from .ply_names import COLOR, NORMAL, POSITION, TEXCOORDS, grouped
+from .ply_names import COLOR, MATERIAL, NORMAL, POSITION, TEXCOORDS, grouped
 
 if TYPE_CHECKING:
     from plyfile import PlyElement
@@ -40,6 +40,9 @@ def read_ply(path: str | Path) -> CageContents:
     - ``nx``, ``ny`` and ``nz`` are dropped, as the normals of the surface follow from its points.
     - ``name_0``, ``name_1`` and so on are one attribute "name".
     - Any other number is an attribute of its own.
+
+    Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
+    or "" for negative numbers.
 
     Parameters
     ----------
@@ -71,7 +74,13 @@ def read_ply(path: str | Path) -> CageContents:
 def _contents(content: bytes, header: PlyHeader) -> CageContents:
     name = header.name
     lists = [each for each in _FACE_LISTS if "face" in header.elements and each in header.lists("face")]
-    polygons = lists_of_rows(header, content, "face", lists[0]) if lists else None
+    integers = [
+        each.name
+        for each in (header.elements["face"].properties if lists else [])
+        if each.items is None and each.type.kind in "iu"
+    ]
+    owner = next((each for each in MATERIAL if each in integers), None)
+    polygons = lists_of_rows(header, content, "face", lists[0], owner) if lists else None
     if polygons is not None:
         header, content = PlyHeader.read(polygons.rest, name), polygons.rest
     elements = _elements(content, header)
@@ -88,7 +97,7 @@ def _contents(content: bytes, header: PlyHeader) -> CageContents:
             f"integers, among {_listed(face.data.dtype.names)}"
         )
     left_out = [
-        *(f'"{other}" of faces' for other in face.data.dtype.names if other != lists[0]),
+        *(f'"{other}" of faces' for other in face.data.dtype.names if other not in (lists[0], owner)),
         *(f'the list "{other}" of vertices' for other in header.lists("vertex")),
     ]
     if left_out:
@@ -96,6 +105,9 @@ def _contents(content: bytes, header: PlyHeader) -> CageContents:
     sizes, vertices = polygons[:2] if polygons is not None else _polygons(face.data[lists[0]])
     if vertices.dtype.kind not in "iu":
         raise CageError(f"{name}: the vertex indices of faces have type {vertices.dtype}; expected integers")
+    materials = {}
+    if owner is not None:
+        materials = _materials(face.data[owner] if polygons is None or polygons.numbers is None else polygons.numbers)
     texcoords, attributes = _vertex_data(vertex.data, numbers)
     return CageContents(
         _columns(vertex.data, POSITION),
@@ -103,6 +115,7 @@ def _contents(content: bytes, header: PlyHeader) -> CageContents:
         vertices,
         texcoords=texcoords,
         attributes=attributes,
+        materials=materials,
         source=CageSource(name, 0, header.lines("vertex"), header.lines("face")),
     )
 
@@ -173,6 +186,15 @@ def _polygons(lists: NDArray) -> tuple[IntArray, IntArray]:
         sizes = np.fromiter((len(polygon) for polygon in lists), np.int64, len(lists))
         vertices = np.concatenate(list(lists))
     return sizes, vertices
+
+
+def _materials(numbers: NDArray) -> dict[str, IntArray]:
+    """Faces of each material, by its name."""
+    numbers = np.maximum(np.asarray(numbers).astype(np.int64), -1)
+    distinct, counts = np.unique(numbers, return_counts=True)
+    faces = np.split(np.argsort(numbers, kind="stable"), np.cumsum(counts)[:-1])
+    names = ["" if each < 0 else f"material_{each}" for each in distinct.tolist()]
+    return dict(zip(names, faces, strict=True))
 
 
 def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | None, dict[str, Attribute]]:

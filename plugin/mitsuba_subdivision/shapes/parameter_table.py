@@ -202,8 +202,8 @@ PARAMETERS = (
     Parameter(
         "material",
         "string",
-        "Show only the faces of this material, one that ``usemtl`` names in an OBJ file. Shapes of the same file and "
-        "parameters, one for each material, meet without cracks",
+        "Show only the faces of this material, one that ``usemtl`` names in an OBJ file, or ``material_0`` and so on "
+        "of a PLY file. Shapes of the same file and parameters, one for each material, meet without cracks",
         default_text="all faces",
     ),
     Parameter(

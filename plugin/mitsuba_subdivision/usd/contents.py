@@ -159,6 +159,8 @@ class ShapeContents:
         Attributes with one value for the whole mesh.
     radiance : list of 3 floats or None
         If the mesh is a light.
+    shown_faces : (n,) int or None
+        Of a limit surface, the faces with this material; None for all. Of a polygon mesh, the others are holes.
     """
 
     name: str
@@ -168,6 +170,7 @@ class ShapeContents:
     material: int | None = None
     constants: dict[str, list[float]] = field(default_factory=dict)
     radiance: list[float] | None = None
+    shown_faces: NDArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

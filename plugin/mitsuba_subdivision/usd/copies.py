@@ -58,9 +58,9 @@ def with_copies(
     lowest : int
     """
     placed = _of_instances(contents, rates)
-    of_cage: dict[int, list[ShapeContents]] = {}
+    of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
-        of_cage.setdefault(id(shape.cage), []).append(shape)
+        of_cage.setdefault((id(shape.cage), id(shape.shown_faces)), []).append(shape)
     many = [each for each in of_cage.values() if len(each) >= LEAST_INSTANCES and _is_sound(each[0].cage)]
     for alike in many:
         needed = np.concatenate([rates.get(each, _ONE) for each in alike])
@@ -163,7 +163,8 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
         scheme=cage.scheme,
         source=CageSource(f"{cage.source.name}, {count} copies"),
     )
-    return ShapeContents(name, copied, np.eye(4), normals, shape.material, shape.constants, shape.radiance)
+    shown = None if shape.shown_faces is None else (shape.shown_faces + _firsts(count, face)).ravel()
+    return replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, shown_faces=shown)
 
 
 def _firsts(count: int, step: int) -> IntArray:

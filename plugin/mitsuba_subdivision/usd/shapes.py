@@ -50,9 +50,13 @@ def subdivision(
     """
     # Validated here, so that messages name the prim.
     surfaces.note_warnings(shape, notes)
+    # Any, as the stubs call it an object.
+    tensor: Any = mi.TensorXu
+    shown = shape.shown_faces
     return {
         "type": "subdivision",
         **surfaces.properties(shape.cage),
+        **({} if shown is None else {"shown_faces": tensor(shown.astype(np.uint32))}),
         **parameters,
         "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
         "bsdf": bsdf,

@@ -101,9 +101,13 @@ class ShapeReader:
                     f"texture coordinates {choice.texcoords[0]} are missing; others are used", prim.GetPath()
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
-            if len(materials) > 1:
+            shown = None
+            if len(materials) > 1 and cage.scheme is None:
                 cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
-            shapes.append(self._shape(prim, to_world, cage, normals, material))
+            elif len(materials) > 1:
+                # All parts evaluate the whole surface, so that they agree in every bit where they meet.
+                shown = np.flatnonzero(owner == number)
+            shapes.append(replace(self._shape(prim, to_world, cage, normals, material), shown_faces=shown))
         return shapes
 
     def _materials_of_faces(self, mesh: UsdGeom.Mesh, reader: MeshReader) -> tuple[list[int | None], IntArray]:
