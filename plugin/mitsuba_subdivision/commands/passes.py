@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ..images.tolerances import Tolerances
 from ..messages import print_result
 from ..whole_file import require_writable
 from .arguments import positive
+
+if TYPE_CHECKING:
+    from ..regression.scene import LoadedScene
 
 TOLERANCES = f"Tolerances: {', '.join(Tolerances().as_dict())}."
 
@@ -80,8 +85,10 @@ def validate_pass_options(options: argparse.Namespace) -> None:
         raise RegressionError("--tolerance is stored with a reference; expected --reference beside it")
 
 
-def render_by_passes(options: argparse.Namespace) -> None:
+def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene] | None = None) -> None:
     """Render by passes according to the options of ``render``, in the current variant, and write the image.
+
+    A model is loaded by ``load``, here and on the workers of a cluster.
 
     Raises
     ------
@@ -98,7 +105,7 @@ def render_by_passes(options: argparse.Namespace) -> None:
 
     filter_name = BOX if options.reference else options.filter
     parameters = dict(options.parameters)
-    loaded = load_scene(options.scene, parameters, filter_name)
+    loaded = load() if load else load_scene(options.scene, parameters, filter_name)
     require_writable(options.output, loaded.file_paths)
     spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
     tolerances = Tolerances().with_values(dict(options.tolerances))
@@ -115,6 +122,7 @@ def render_by_passes(options: argparse.Namespace) -> None:
             sampling,
             options.passes or 0,
             filter_name,
+            load=load,
             **settings,
         )
     elif options.share:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +50,7 @@ _OF_MODELS = (
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that do not apply to a model's scene.
-_OF_SCENES = ("parameters", "sensor", "share", "passes", "dask", "batch", "reference", "tolerances")
+_OF_SCENES = ("parameters", "sensor", "share", "passes", "batch", "reference", "tolerances")
 
 
 def add_parser(commands: Commands) -> None:
@@ -261,6 +262,16 @@ def _render_model(options: argparse.Namespace) -> None:
             hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         require_writable(options.output, [options.scene])
+    if options.dask:
+        if options.frames or options.turntable or options.shutter or options.save_scene:
+            raise ValueError(
+                "--dask renders one picture of a model; expected no --frames, --turntable, --shutter or --save-scene"
+            )
+        # Plain data, from which each worker builds the scene again.
+        given = {name: value for name, value in vars(options).items() if name not in ("run", "parser")}
+        with _threads(options.threads):
+            render_by_passes(options, partial(_load_still, given | {"scene": options.scene.resolve()}))
+        return
     source = _source(options)
     shown: FrameRange | Turntable | StillPicture
     if options.frames or options.shutter:
@@ -278,6 +289,14 @@ def _render_model(options: argparse.Namespace) -> None:
         return
     _write_image(options, shown.frames(shown.numbers, options.filter), options.output)
     print_result(options.output)
+
+
+def _load_still(options: dict[str, Any]) -> LoadedScene:
+    """The scene of a still picture, by the options of the command; also runs on workers."""
+    from ..studio.animation import StillPicture
+
+    given = argparse.Namespace(**options)
+    return next(StillPicture(_source(given)).frames([1], given.filter))
 
 
 def _source(options: argparse.Namespace) -> SceneSource[Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from ..images.image import Image
 from ..progress import timed
 from . import RegressionError
 from .passes import Sampling, merge_passes, render_pass
-from .scene import load_scene
+from .scene import LoadedScene, load_scene
 
 # A worker may have several threads. But Mitsuba has one variant at a time, and an LLVM variant takes all cores.
 _lock = threading.Lock()
@@ -27,6 +27,7 @@ def render_on_cluster(
     filter_name: str | None = None,
     *,
     with_probe: bool = False,
+    load: Callable[[], LoadedScene] | None = None,
 ) -> Image:
     """Render the passes of an image on the workers of a cluster, and merge them.
 
@@ -41,6 +42,8 @@ def render_on_cluster(
         Each worker must find the scene under this path, and have this package.
     count : int
         Number of passes; 0 for as many as the workers have threads.
+    load : callable, optional
+        Loads what is not a Mitsuba scene on each worker; must be picklable.
 
     Raises
     ------
@@ -64,7 +67,10 @@ def render_on_cluster(
         numbers = list(range(1, count + 1))
         # Not pure, in the sense of Dask: a repeated request renders again.
         futures = client.map(
-            _work, numbers, pure=False, job=(path, dict(parameters), variant, sampling, count, filter_name, with_probe)
+            _work,
+            numbers,
+            pure=False,
+            job=(path, dict(parameters), variant, sampling, count, filter_name, with_probe, load),
         )
         with timed("Rendering on the cluster"):
             return merge_passes(client.gather(futures))
@@ -74,7 +80,8 @@ def _work(number: int, job: tuple[Any, ...]) -> Image:
     """Render one pass; runs on a worker."""
     import mitsuba as mi
 
-    path, parameters, variant, sampling, count, filter_name, with_probe = job
+    path, parameters, variant, sampling, count, filter_name, with_probe, load = job
     with _lock:
         mi.set_variant(variant)
-        return render_pass(load_scene(path, parameters, filter_name), sampling, number, count, with_probe=with_probe)
+        loaded = load() if load else load_scene(path, parameters, filter_name)
+        return render_pass(loaded, sampling, number, count, with_probe=with_probe)
