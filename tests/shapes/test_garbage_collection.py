@@ -6,7 +6,7 @@ import threading
 import mitsuba as mi
 import pytest
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes import subdivision
+from mitsuba_subdivision.shapes import subdivision_shape
 from mitsuba_subdivision.shapes.garbage_collection import paused_collection
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
@@ -15,13 +15,13 @@ pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 @pytest.fixture
 def seen_in_constructor(monkeypatch):
     """Whether the collector runs whenever a shape reads its parameters."""
-    read_parameters, found = subdivision.read_parameters, []
+    read_parameters, found = subdivision_shape.read_parameters, []
 
     def noted(props):
         found.append(gc.isenabled())
         return read_parameters(props)
 
-    monkeypatch.setattr(subdivision, "read_parameters", noted)
+    monkeypatch.setattr(subdivision_shape, "read_parameters", noted)
     return found
 
 

@@ -62,7 +62,7 @@ def register_variant(variant: ModuleType | str) -> type:
     with _lock, paused_collection():
         for needed in (QUERY_VARIANT, name):
             if needed not in _registered:
-                from .subdivision import make_subdivision
+                from .subdivision_shape import make_subdivision
 
                 module = getattr(mi, needed)
                 shape = make_subdivision(module)
