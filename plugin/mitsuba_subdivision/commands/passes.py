@@ -27,7 +27,11 @@ def add_pass_options(render: argparse.ArgumentParser) -> None:
         "--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together'
     )
     group.add_argument("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
-    group.add_argument("--dask", metavar="ADDRESS", help="render the passes on the Dask cluster of this scheduler")
+    group.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="render the passes, or one picture of a model, on the Dask cluster of this scheduler",
+    )
     group.add_argument(
         "--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)"
     )

@@ -160,7 +160,8 @@ class ShapeContents:
     radiance : list of 3 floats or None
         If the mesh is a light.
     shown_faces : (n,) int or None
-        Of a limit surface, the faces with this material; None for all. Of a polygon mesh, the others are holes.
+        Faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon meshes and
+        of large surfaces have the other faces as holes.
     """
 
     name: str

@@ -104,12 +104,12 @@ class ShapeReader:
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
             shown = None
-            is_small = len(materials) * len(cage.face_sizes) <= MOST_SHARED_FACES
-            if len(materials) > 1 and (cage.scheme is None or not is_small):
-                cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
-            elif len(materials) > 1:
-                # All parts evaluate the whole surface, so that they agree in every bit where they meet.
-                shown = np.flatnonzero(owner == number)
+            if len(materials) > 1:
+                if cage.scheme is not None and len(materials) * len(owner) <= MOST_SHARED_FACES:
+                    # All parts evaluate the whole surface, so that they agree in every bit where they meet.
+                    shown = np.flatnonzero(owner == number)
+                else:
+                    cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             shapes.append(replace(self._shape(prim, to_world, cage, normals, material), shown_faces=shown))
         return shapes
 
