@@ -17,10 +17,10 @@ from ..files.usd_skinning import Skinning
 from ..files.usd_stage import usd_errors_at
 from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
-from .notes import Notes
 from .polygons import GPRIMS, read_gprim, read_normals
 from .stage_lights import read_emission
 from .stage_materials import MaterialReader
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -42,11 +42,11 @@ class ShapeReader:
     code : Usd.TimeCode
         The same time, for all but the cage.
     materials : MaterialReader
-    notes : Notes
+    notes : StageWarnings
     """
 
     def __init__(
-        self, name: str, time: float | None, code: Usd.TimeCode, materials: MaterialReader, notes: Notes
+        self, name: str, time: float | None, code: Usd.TimeCode, materials: MaterialReader, notes: StageWarnings
     ) -> None:
         self._name = name
         self._time = time

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..srgb import decoded
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_library import library, numbers
-from .nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
-from .notes import Notes
+from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
+from .stage_warnings import StageWarnings
 from .texture_image import UDIM
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ class NetworkReader:
     Parameters
     ----------
     time : Usd.TimeCode
-    notes : Notes
+    notes : StageWarnings
     """
 
-    def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
+    def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time = time
         self._notes = notes
         self._known: dict[tuple[str, str], Input | None] = {}

@@ -21,12 +21,12 @@ from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messag
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
-from .notes import Notes
 from .polygons import GPRIMS
 from .stage_camera import read_camera
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -109,7 +109,7 @@ def open_checked(path: str | Path) -> Usd.Stage:
 
 def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str | None) -> SceneContents:
     """Read a stage that is open; see `read_stage`."""
-    notes = Notes()
+    notes = StageWarnings()
     with usd_errors_at(name), usd_messages_of(name), timed("Reading") as at:
         contents = _StageWalk(stage, name, time, notes, at).contents(camera)
     notes.warn(name)
@@ -118,7 +118,7 @@ def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str
 
 class _StageWalk:
     def __init__(
-        self, stage: Usd.Stage, name: str, time: float | None, notes: Notes, at: Callable[[str], None]
+        self, stage: Usd.Stage, name: str, time: float | None, notes: StageWarnings, at: Callable[[str], None]
     ) -> None:
         from pxr import Usd, UsdGeom
 
