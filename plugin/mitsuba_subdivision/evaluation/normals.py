@@ -16,6 +16,8 @@ TANGENT_ROUNDING = {32: 2.0**-19, 64: 2.0**-40}
 # Control points that are sums of others are off by two roundings of their coordinates, however near to each other they
 # stand. So their extent is taken to be at least this part of their distance from the origin.
 LEAST_EXTENT = {32: 2.0**-3, 64: 2.0**-11}
+# The least number of full precision, in place of a length of zero.
+LEAST_LENGTH = {32: 2.0**-126, 64: 2.0**-1022}
 
 
 def unit_normals(
@@ -42,7 +44,7 @@ def unit_normals(
         cage still has normals.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        longest = np.maximum(np.abs(tangents).max(axis=1), np.finfo(tangents.dtype).tiny)
+        longest = np.maximum(np.abs(tangents).max(axis=1), LEAST_LENGTH[8 * tangents.dtype.itemsize])
         pair = tangents / longest[:, None]
         (a, b, c), (x, y, z) = pair
         normal = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
