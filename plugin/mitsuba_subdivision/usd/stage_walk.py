@@ -183,8 +183,8 @@ class _StageWalk:
                 try:
                     self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
                 except (CageError, TypeError, ValueError) as error:
-                    place = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
-                    message = str(error) if isinstance(error, CageError) else f"{place}{error}"
+                    location = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
+                    message = str(error) if isinstance(error, CageError) else f"{location}{error}"
                     self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
             elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
                 kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
@@ -299,11 +299,11 @@ class _StageWalk:
         firsts = [samples[0] for samples in (each.GetTimeSamples() for each in moving) if samples]
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
-    def _is_invertible(self, matrix: NDArray[np.float64], place: object) -> bool:
+    def _is_invertible(self, matrix: NDArray[np.float64], prim: object) -> bool:
         """Whether a transform is invertible; records a problem if it is not."""
         if is_invertible(matrix):
             return True
-        self._notes.add(_SINGULAR, place)
+        self._notes.add(_SINGULAR, prim)
         return False
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:
