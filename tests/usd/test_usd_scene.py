@@ -289,7 +289,7 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
         + mesh("unseen", CUBE + 'token visibility = "invisible"')
         + mesh("guide", CUBE + 'uniform token purpose = "guide"')
         + mesh("proxy", CUBE + 'uniform token purpose = "proxy"')
-        + mesh("rendered", CUBE + 'uniform token purpose = "render"')
+        + mesh("rendered", CUBE + 'uniform token purpose = "render"\nuniform token model:drawMode = "cards"')
         + mesh("bilinear", CUBE + 'uniform token subdivisionScheme = "bilinear"')
         + mesh("broken", CUBE.replace("5]", "50]"))
         + f'def Scope "off" {{ token visibility = "invisible"\n {mesh("below", CUBE)} }}\n'
@@ -300,7 +300,8 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     names = {"seen", "rendered", "bilinear", "unseen", "guide", "proxy", "broken", "off_below"} & scene.keys()
     assert names == {"seen", "rendered", "bilinear"}
     messages = [str(each.message) for each in record]
-    assert len(messages) == 3
+    assert len(messages) == 4
+    assert any("draw modes of models are ignored; their meshes are shown (/rendered)" in text for text in messages)
     assert any("BasisCurves are ignored (/c0, /c1, /c2 and 2 more)" in message for message in messages)
     assert any("scheme bilinear become polygons (/bilinear)" in message for message in messages)
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
