@@ -849,3 +849,19 @@ def test_messages_of_one_kind_are_one(stage):
     (message,) = (str(each.message) for each in record)
     assert "prim /broken0: " in message
     assert message.endswith("; likewise 4 other prims (/broken1, /broken2, /broken3 and 1 more)")
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_scene_of_the_chess_set_finds_the_set_on_the_search_path(tmp_path):
+    from pxr import Ar
+
+    (tmp_path / "OpenChessSet").mkdir()
+    stand_in = f'#usda 1.0\n( defaultPrim = "set" )\ndef Xform "set" {{\ndef Mesh "king" {{{CUBE}}}\n}}\n'
+    (tmp_path / "OpenChessSet" / "chess_set.usda").write_text(stand_in)
+    Ar.DefaultResolver.SetDefaultSearchPath([str(tmp_path)])
+    try:
+        scene = msub.usd_scene(msub.example_file("chess_set.usda"), mi)
+    finally:
+        Ar.DefaultResolver.SetDefaultSearchPath([])
+    assert "Scene_ChessSet_king" in scene
+    assert {"thinlens", "envmap", "directional"} <= {each["type"] for each in scene.values() if isinstance(each, dict)}
