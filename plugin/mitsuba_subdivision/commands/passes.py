@@ -110,6 +110,7 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     from ..regression.scene import BOX, load_scene
 
     filter_name = BOX if options.reference else options.filter
+    is_model = load is not None
     if load is None:
         # Workers may be in another folder.
         path = options.scene.resolve() if options.dask else options.scene
@@ -120,6 +121,11 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     tolerances = Tolerances().with_values(dict(options.tolerances))
     number, count = options.share or (1, options.passes or 1)
     batch = options.batch or min(BATCH, max(1, spp // max(2, count)))
+    if is_model:
+        from ..studio.studio_entries import sampler
+
+        # Mitsuba would round each batch up, and more samples than recorded would count.
+        batch = sampler(batch)["sample_count"]
     sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
     settings = {"with_probe": options.reference}
     if options.dask:
