@@ -20,8 +20,15 @@ REQUIRED = (
     *("edge_turn", "unsupported", "refine", "children", "regular_basis"),
 )
 OPTIONAL = {
-    CatmullClark: ("phantom_points", "splits_corners", "has_convex_rules", "crease_method", "triangle_rule"),
-    Loop: ("phantom_points", "has_convex_rules", "crease_method"),
+    CatmullClark: (
+        "phantom_points",
+        "splits_corners",
+        "has_convex_rules",
+        "has_local_borders",
+        "crease_method",
+        "triangle_rule",
+    ),
+    Loop: ("phantom_points", "has_convex_rules", "has_local_borders", "crease_method"),
     DooSabin: ("phantom_points", "regular_border_faces", "has_convex_rules"),
 }
 CLOSED = {CatmullClark: cube(), Loop: extraordinary_triangles(5), DooSabin: cube()}
@@ -193,6 +200,7 @@ WRONG = {
     "regular_border_faces": [None, 0, "2", 1.5],
     "splits_corners": [None, 1, "yes"],
     "has_convex_rules": [None, 1, "yes"],
+    "has_local_borders": [None, 1, "yes"],
     "crease_method": [1, "normal", ["uniform"]],
     "triangle_rule": [0.47, "smoothed"],
     "unsupported": [None, 3],

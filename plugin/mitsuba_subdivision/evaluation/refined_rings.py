@@ -121,26 +121,35 @@ class RefinedRings:
         self._sharpness: dict[int, FanSharpnessRows] = {}
 
     def child(self, ring: int, number: int) -> tuple[Signature, FloatArray]:
-        """Signature of a child of one of the elements, and its control points over the element's: ``(K_child, K)``.
+        """`signature` and `stencils` of a child of one of the elements."""
+        return self.signature(ring, number), self.stencils(ring, number)
+
+    def signature(self, ring: int, number: int) -> Signature:
+        """Signature of a child of one of the elements."""
+        signature, _, around = self._pattern.child(number)
+        semi = self._topology.semi_sharpness
+        if semi is None:
+            return signature
+        if number not in self._sharpness:
+            self._sharpness[number] = FanSharpnessRows(self._topology, self._half_edges[:, around], semi)
+        return with_sharpness(signature, self._sharpness[number], ring)
+
+    def stencils(self, ring: int, number: int) -> FloatArray:
+        """Control points of a child over those of the element, ``(K_child, K)``.
 
         Raises
         ------
         SchemeError
             If weights of a control point do not sum to one.
         """
-        signature, vertices, around = self._pattern.child(number)
+        _, vertices, _ = self._pattern.child(number)
         if isinstance(self._stencils, StencilTable):
             stencils = self._stencils.dense(vertices)
         else:
             stencils = self._stencils[ring, vertices]
         if not self._rows_sum_to_one:
             _require_rows_to_one(self._pattern, stencils)
-        semi = self._topology.semi_sharpness
-        if semi is None:
-            return signature, stencils
-        if number not in self._sharpness:
-            self._sharpness[number] = FanSharpnessRows(self._topology, self._half_edges[:, around], semi)
-        return with_sharpness(signature, self._sharpness[number], ring), stencils
+        return stencils
 
 
 @lru_cache(maxsize=1024)

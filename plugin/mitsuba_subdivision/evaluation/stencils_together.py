@@ -163,7 +163,7 @@ def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, u
         child, in_child = np.where(is_only, 0, child), np.where(is_only, uv[inner].T, in_child).T
         pairs, pair = np.unique(4 * parent + child, return_inverse=True)
         numbers: dict[DividedElement, int] = {}
-        below = [numbers.setdefault(elements[key // 4].child(key % 4)[0], len(numbers)) for key in pairs.tolist()]
+        below = [numbers.setdefault(elements[key // 4].child_element(key % 4), len(numbers)) for key in pairs.tolist()]
         element_below, uv_below, number = _distinct(np.array(below)[pair], in_child)
         in_pairs = np.split(np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))[:-1])
         groups: list[tuple[int, int, IntArray, int, IntArray]] = [
