@@ -120,6 +120,15 @@ class DividedElement:
             self._stencils[number] = stencils
         return element, stencils
 
+    def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
+        """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element."""
+        if self.control_count * rows.shape[2] <= KEPT_WEIGHTS:
+            return rows @ self.child(number)[1]
+        # Nearly all weights of so many are zero.
+        rings, _ = self.base._rings
+        found = rings.table(number).matrix.T @ rows.reshape(-1, rows.shape[2]).T
+        return found.T.reshape(*rows.shape[:2], -1)
+
     def child_element(self, number: int) -> DividedElement:
         """One of the children."""
         if number not in self._children:

@@ -119,6 +119,7 @@ class RefinedRings:
         self._stencils, self._rows_sum_to_one = stencils, rows_sum_to_one
         # By the numbers of the children.
         self._sharpness: dict[int, FanSharpnessRows] = {}
+        self._tables: dict[int, StencilTable] = {}
 
     def child(self, ring: int, number: int) -> tuple[Signature, FloatArray]:
         """`signature` and `stencils` of a child of one of the elements."""
@@ -142,14 +143,23 @@ class RefinedRings:
         SchemeError
             If weights of a control point do not sum to one.
         """
-        _, vertices, _ = self._pattern.child(number)
         if isinstance(self._stencils, StencilTable):
-            stencils = self._stencils.dense(vertices)
-        else:
-            stencils = self._stencils[ring, vertices]
+            return self.table(number).dense(np.arange(self.table(number).row_count))
+        stencils = self._stencils[ring, self._pattern.child(number)[1]]
         if not self._rows_sum_to_one:
-            _require_rows_to_one(self._pattern, stencils)
+            _require_rows_to_one(self._pattern, stencils.sum(axis=1))
         return stencils
+
+    def table(self, number: int) -> StencilTable:
+        """`stencils` of a child of an element that was refined alone."""
+        if number not in self._tables:
+            if not isinstance(self._stencils, StencilTable):
+                raise TypeError("one-rings that were refined together; expected one refined alone")
+            found = self._stencils.chosen(self._pattern.child(number)[1])
+            sums = np.bincount(found.rows, found.weights, minlength=found.row_count)
+            _require_rows_to_one(self._pattern, sums.astype(np.float64))
+            self._tables[number] = found
+        return self._tables[number]
 
 
 @lru_cache(maxsize=1024)
@@ -339,8 +349,7 @@ class RingMesh:
         return found if end == len(half_edges) else None
 
 
-def _require_rows_to_one(pattern: RingPattern, stencils: FloatArray) -> None:
-    sums = stencils.sum(axis=1)
+def _require_rows_to_one(pattern: RingPattern, sums: FloatArray) -> None:
     error = np.abs(sums - 1)
     # Written so that a sum that is not a number is refused as well.
     if not error.max() <= ROW_SUM:

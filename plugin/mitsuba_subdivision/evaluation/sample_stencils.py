@@ -201,10 +201,10 @@ def _evaluate_pieces(scheme: Scheme, depths: list[_Depth]) -> None:
             own = slice(begin, begin + len(own_uv))
             begin = own.stop
             seen = _by_parent(rows[:, own], piece.domain.matrix)
-            depth.stencils[number][:] = seen @ (piece.stencils if patch is None else piece.coordinates)
-            by_piece = magnitude[:, own] @ np.abs(piece.stencils).sum(axis=1)
+            depth.stencils[number][:] = piece.over_controls(seen)
+            by_piece = magnitude[:, own] @ piece.absolute_sums
             if patch is not None:
-                by_piece = CANCELLED * by_piece + np.abs(rows[1:, own] @ piece.coordinates).sum(axis=2)
+                by_piece = CANCELLED * by_piece + np.abs(piece.over_controls(rows[1:, own])).sum(axis=2)
             depth.frame_weights[:, depth.samples(number)] = np.abs(piece.domain.matrix).T @ by_piece
 
 
@@ -229,10 +229,10 @@ def _rows(scheme: Scheme, patch: IrregularPatch | None, uv: FloatArray) -> tuple
 def _lift(above: _Depth, below: _Depth) -> None:
     """Find the weights of samples above that lie in children, which are elements below."""
     for element, number, samples, child, samples_below in above.groups:
-        _, stencils = above.elements[element].child(number)
         matrix = above.elements[element].domains[number].matrix
-        rows = _by_parent(below.stencils[child][:, samples_below - below.first[child]], matrix) @ stencils
-        above.stencils[element][:, samples - above.first[element]] = rows
+        rows = _by_parent(below.stencils[child][:, samples_below - below.first[child]], matrix)
+        found = above.elements[element].over_controls(rows, number)
+        above.stencils[element][:, samples - above.first[element]] = found
         above.frame_weights[:, samples] = np.abs(matrix).T @ below.frame_weights[:, samples_below]
 
 

@@ -21,6 +21,7 @@ from .glued_faces import GluedFaces
 from .semi_sharpness import SemiSharpness
 from .signature import (
     NEAR_FACES,
+    ElementKind,
     FanHalfEdges,
     Signature,
     TaggedFan,
@@ -90,8 +91,13 @@ class OneRing:
         # of the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        for chunk in chunks_of(len(half_edges)):
-            self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
+        if len(half_edges) == 1:
+            # Around vertices of high valence every face may be the only one of its signature.
+            kind: ElementKind = "face" if any(corner for corner, _ in self.faces) else "vertex"
+            columns[:, 0] = self.vertices_around(topology, fan_half_edges(topology, int(half_edges[0]), kind))
+        else:
+            for chunk in chunks_of(len(half_edges)):
+                self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
         for centre, first, last in self.cut_fans:
             columns[first], columns[last] = topology.border_neighbours(columns[centre])
         return columns.T
