@@ -14,12 +14,12 @@ from ..tessellation.memory import SMALL, available_memory
 # Bytes for each pair of control points of a one-ring: its subdivision matrix, its eigenbasis, and what makes these.
 # Measured at valences of 200 to 1,600 under all schemes, those below of 200 to 800; Doo-Sabin's rules are matrices
 # themselves.
-PAIR_BYTES = {"face": 83, "vertex": 290}
+PAIR_BYTES = {"face": 65, "vertex": 300}
 # The same where every face has an eigenbasis of its own, for each of them: at the end of a crease, and on borders under
 # schemes without `has_local_borders`.
-OWN_BASIS_BYTES = 55
+OWN_BASIS_BYTES = 40
 # The same in all where edges or the vertex are semi-sharp, so that every face has stencils of its own.
-OWN_STENCIL_BYTES = 1200
+OWN_STENCIL_BYTES = 1500
 # Eigenbases that need more take minutes.
 MOST_BYTES = 8 << 30
 
