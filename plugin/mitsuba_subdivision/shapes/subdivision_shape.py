@@ -270,7 +270,7 @@ def make_subdivision(variant: Variant) -> type:
             self._placement = Placement.of(self.to_world, matrix, self._points.centre)
             if is_jit:
                 # Literals would be compiled into kernels.
-                dr.make_opaque(self.to_world, self._placement.matrix)
+                dr.make_opaque(self.to_world, self._placement.matrix, self._placement.inverse)
 
         def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
             """Evaluate the moving buffers, and update exact shading."""
