@@ -205,9 +205,18 @@ WRONG = {
 def test_every_optional_member_has_a_default_and_is_damaged_here():
     declared = OptionalMembers.__annotations__
     assert set(declared) <= set(WRONG)
-    assert {name: optional_member(object(), name) for name in declared} == {
-        name: vars(OptionalMembers)[name] for name in declared
-    }
+    defaults = {name: optional_member(object(), name) for name in declared}
+    assert defaults == {name: vars(OptionalMembers)[name] for name in declared}
+    # Nothing is claimed of a scheme that does not say so.
+    assert not any(defaults.values())
+
+
+@EVERY_SCHEME
+def test_our_schemes_have_convex_rules_and_say_so(original):
+    scheme = original()
+    weights = scheme.refine(CLOSED[original].topology).stencils.matrix.toarray()
+    assert weights.min() >= 0
+    assert scheme.has_convex_rules
 
 
 @pytest.mark.parametrize(

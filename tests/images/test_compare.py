@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import re
 import subprocess
 import sys
 import types
@@ -25,6 +26,8 @@ from mitsuba_subdivision.images.tiers import TIERS, Tier
 from mitsuba_subdivision.images.tolerances import Tolerances
 
 LIMITS = Tolerances()
+# Of a mean of 3,072 squares, and of the variance that few batches measure: five standard deviations and more.
+NOISE = 0.25
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +37,15 @@ def reference():
 
 def statuses(found):
     return {tier.name: tier.status.value for tier in found.tiers}
+
+
+@pytest.mark.parametrize(("first", "second"), [(4, 4), (4, 16), (400, 4)])
+def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
+    """Whatever the numbers of samples: the variance of a difference is the sum of both."""
+    images = (random_image(np_rng, first, "reference"), random_image(np_rng, second, "test"))
+    (line,) = compare(*images).notes
+    measured, expected = map(float, re.fullmatch(r"relMSE (\S+); noise alone would make it (\S+)", line).groups())
+    assert abs(measured / expected - 1) < NOISE
 
 
 @pytest.mark.core

@@ -3,6 +3,9 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from mitsuba_subdivision.mesh import connectivity
+from mitsuba_subdivision.mesh.connectivity import Topology
+from mitsuba_subdivision.mesh.edge_pairing import paired
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
@@ -99,6 +102,20 @@ def test_edges_are_numbered_without_gaps(any_cage):
     edges, lowest = np.unique(topology.edge, return_index=True)
     np.testing.assert_array_equal(edges, np.arange(topology.edge_count))
     np.testing.assert_array_equal(topology.edge_half_edge, lowest)
+
+
+def test_pairs_of_vertices_have_distinct_numbers_below_their_count(any_cage, monkeypatch):
+    def checked(keys_of, count, key_count):
+        keys = keys_of(slice(0, count))
+        t = any_cage.topology
+        ends = np.sort([t.face_vertices, t.face_vertices[t.next]], axis=0)
+        assert len(np.unique(keys)) == len(np.unique(ends, axis=1).T)
+        assert keys.min() >= 0
+        assert keys.max() < key_count
+        return paired(keys_of, count, key_count)
+
+    monkeypatch.setattr(connectivity, "paired", checked)
+    assert Topology(any_cage.vertex_count, any_cage.face_sizes, any_cage.face_vertices).edge_count
 
 
 def test_euler_characteristic():
