@@ -48,6 +48,31 @@ def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
     assert abs(measured / expected - 1) < NOISE
 
 
+def test_equal_images_have_no_worst_pixel(reference):
+    assert compare(reference, reference).worst is None
+
+
+def test_the_worst_pixel_is_none_that_only_one_image_hits(reference, np_rng):
+    """A pixel of the outline is missing, and a normal in the middle is turned."""
+    probe = dome()
+    y, x = np.argwhere(probe.hit)[0]
+    shape, normal = probe.shape.copy(), probe.normal.copy()
+    shape[y, x] = 2**32 - 1
+    normal[y, x], normal[16, 12] = 0, -normal[16, 12]
+    found = compare(reference, random_image(np_rng, probe=replace(probe, shape=shape, normal=normal)))
+    assert statuses(found)["probe"] == "fail"
+    assert (found.worst.x, found.worst.y) == (12, 16)
+
+
+def test_evidence_is_of_the_scale_that_is_clearest(reference):
+    """Its smallest probability is the least of all in units of its limit, which depends on the number of tests."""
+    for seed in range(20):
+        (tile,) = compare(reference, random_image(np.random.default_rng(seed)), tiers=["tile"]).tiers
+        scales = [scale for name, scale in tile.numbers["scales"].items() if name != "whole"]
+        clearest = min(scales, key=lambda scale: scale["smallest_p"] / scale["limit"])
+        np.testing.assert_allclose(tile.maps["evidence"].max(), -np.log10(clearest["smallest_p"]), rtol=1e-9)
+
+
 @pytest.mark.core
 def test_unchanged_images_pass(reference, np_rng):
     found = compare(reference, random_image(np_rng, 4, "test"))

@@ -170,6 +170,15 @@ def test_creases_of_a_signature_are_equal_if_those_at_its_corners_are(cut, np_rn
     assert len(set(found)) == 2
 
 
+@pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
+def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
+    """Beside a crease that is, in a face that does not see it."""
+    cage = tagged(torus(5, 6), corners=[(0, sharpness)], creases=[(13, 14, 1.0)])
+    at_corner, at_crease = (signature_at(cage.cut_mesh.topology, 4 * face, "face") for face in (0, 13))
+    assert at_crease.is_semi_sharp
+    assert at_corner.is_semi_sharp == (sharpness < 10)
+
+
 @by_name(TOPOLOGIES)
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_elements_gather_as_each_alone(topology, kind):
