@@ -230,6 +230,11 @@ def test_a_member_of_another_kind_or_shape_is_named(member, number):
         LimitSurface(cube(), scheme)
 
 
+def test_a_domain_with_other_children_is_named():
+    with pytest.raises(SchemeError, match="domain is .*; expected SQUARE or TRIANGLE"):
+        require_members(Members(CatmullClark(), domain=type(SQUARE)("square", SQUARE.corners, QUARTER)))
+
+
 def test_three_faces_may_meet_at_a_regular_vertex():
     # As in schemes on hexagons.
     require_members(Members(CatmullClark(), regular_valence=3))

@@ -119,6 +119,11 @@ def test_exposures_are_those_that_flip_chooses():
     assert found["count"] == chosen["numExposures"] > 2
 
 
+def test_what_is_below_black_does_not_choose_exposures():
+    pixels = truth() * np.geomspace(0.01, 90, SIZE)[:, None, None] * [-1, 1, 1]
+    assert flip_exposures(pixels) == flip_exposures(np.maximum(pixels, 0))
+
+
 def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):
     found = compare(reference, random_image(np_rng, 4), ["tile"]).tier("tile")
     smallest = min(scale["smallest_p"] for name, scale in found.numbers["scales"].items() if name != "whole")

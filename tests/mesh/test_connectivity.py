@@ -140,6 +140,17 @@ def test_turn_visits_every_face_around_an_interior_vertex_once(any_cage):
         assert sorted(visited) == sorted(topology.face[topology.face_vertices == vertex])
 
 
+def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(any_cage):
+    t = any_cage.topology
+    offsets, half_edges = t.vertex_fans
+    for vertex in range(t.vertex_count):
+        fan = half_edges[offsets[vertex] : offsets[vertex + 1]]
+        leaving = np.flatnonzero(t.face_vertices == vertex)
+        np.testing.assert_array_equal(np.sort(fan), [] if t.is_border_vertex[vertex] else leaving)
+        np.testing.assert_array_equal(t.turn(fan), np.roll(fan, -1))
+        assert not len(fan) or fan[0] == fan.min()
+
+
 def test_turn_is_counter_clockwise():
     topology = cube().topology
     # From outside, at the corner (1, 1, 1), the outgoing edges turn -x, -y, -z.

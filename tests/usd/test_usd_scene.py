@@ -753,7 +753,9 @@ def test_normals_of_polygons(stage):
     faceted = msub.usd_scene(stage(mesh("square", SQUARE)), mi)["square"]
     assert not faceted.has_vertex_normals()
     normals = 'normal3f[] normals = [(1,0,0), (0,1,0), (0,0,1), (0,0.6,0.8)] (interpolation = "faceVarying")\n'
-    for hand in ("rightHanded", "leftHanded"):
+    indexed = normals.replace("normals =", "primvars:normals =").replace("(1,0,0), (0,1,0)", "(0,1,0), (1,0,0)")
+    indexed += "int[] primvars:normals:indices = [1, 0, 2, 3]\n"
+    for hand, normals in (("rightHanded", normals), ("leftHanded", normals), ("rightHanded", indexed)):
         body = f'{SQUARE}{normals}uniform token orientation = "{hand}"'
         shape = msub.usd_scene(stage(mesh("square", body)), mi)["square"]
         found = dict(
