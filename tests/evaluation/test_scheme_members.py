@@ -231,7 +231,7 @@ def test_a_member_of_another_kind_or_shape_is_named(member, number):
 
 
 def test_a_domain_with_other_children_is_named():
-    with pytest.raises(SchemeError, match="domain is .*; expected SQUARE or TRIANGLE"):
+    with pytest.raises(SchemeError, match=r"domain is .*; expected SQUARE or TRIANGLE"):
         require_members(Members(CatmullClark(), domain=type(SQUARE)("square", SQUARE.corners, QUARTER)))
 
 

@@ -755,8 +755,8 @@ def test_normals_of_polygons(stage):
     normals = 'normal3f[] normals = [(1,0,0), (0,1,0), (0,0,1), (0,0.6,0.8)] (interpolation = "faceVarying")\n'
     indexed = normals.replace("normals =", "primvars:normals =").replace("(1,0,0), (0,1,0)", "(0,1,0), (1,0,0)")
     indexed += "int[] primvars:normals:indices = [1, 0, 2, 3]\n"
-    for hand, normals in (("rightHanded", normals), ("leftHanded", normals), ("rightHanded", indexed)):
-        body = f'{SQUARE}{normals}uniform token orientation = "{hand}"'
+    for hand, authored in (("rightHanded", normals), ("leftHanded", normals), ("rightHanded", indexed)):
+        body = f'{SQUARE}{authored}uniform token orientation = "{hand}"'
         shape = msub.usd_scene(stage(mesh("square", body)), mi)["square"]
         found = dict(
             zip(
