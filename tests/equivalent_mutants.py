@@ -137,7 +137,7 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     (
         "a difference within rounding, or a tie of two results that are both right",
         (
-            ("mesh/agreement.py", "DECIMALS = 12", "DECIMALS = 13"),
+            ("mesh/refinement_differences.py", "DECIMALS = 12", "DECIMALS = 13"),
             ("patches/area_samples.py", "ROUNDED = 1 + 1e-9", "ROUNDED = 1 - 1e-9"),
             (
                 "patches/closest_points.py",

@@ -769,6 +769,12 @@ def test_normals_of_polygons(stage):
         assert found[(1, -1)] == [0, 1, 0]
 
 
+def test_planes_are_rectangles(stage):
+    plane = msub.usd_scene(stage('def Plane "plane" { double width = 4\ndouble length = 6 }'), mi)["plane"]
+    corners = np.unique(positions(plane), axis=0)
+    np.testing.assert_allclose(corners, [(-2, -3, 0), (-2, 3, 0), (2, -3, 0), (2, 3, 0)])
+
+
 @pytest.mark.parametrize("kind", ["Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane"])
 def test_shapes_without_a_mesh_have_their_extent_and_face_outwards(stage, kind):
     from pxr import Usd, UsdGeom
