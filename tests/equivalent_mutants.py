@@ -42,6 +42,7 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     (
         "a faster path: what it leaves out is read or computed by the slower one",
         (
+            ("files/ply_lists.py", "for each in self._element.properties:", "for each in []:"),
             ("files/obj_tags.py", "continue", "break"),
             ("files/obj_tags.py", "for name, (head, width) in _PLAIN_TAGS.items():", "for name, (head, width) in []:"),
             (

@@ -6,6 +6,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.mesh import connectivity
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.edge_pairing import paired
+from mitsuba_subdivision.mesh.refinement_differences import differences
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
@@ -116,6 +117,17 @@ def test_pairs_of_vertices_have_distinct_numbers_below_their_count(any_cage, mon
 
     monkeypatch.setattr(connectivity, "paired", checked)
     assert Topology(any_cage.vertex_count, any_cage.face_sizes, any_cage.face_vertices).edge_count
+
+
+def test_refinement_differs_where_one_mesh_is_sharp():
+    smooth = torus(5, 6)
+    sharp = ControlCage(smooth.positions, smooth.face_vertices.reshape(-1, 4).tolist(), creases=[(13, 14, 2.0)])
+    meshes = [cage.cut_mesh.topology for cage in (smooth, sharp)]
+    for expected, found in (meshes, meshes[::-1]):
+        *others, is_sharper = differences(expected, found)
+        assert not np.any(others)
+        np.testing.assert_array_equal(is_sharper, sharp.cut_mesh.topology.semi_sharpness.edges > 0)
+    assert not np.any(differences(*[meshes[0]] * 2))
 
 
 def test_euler_characteristic():
