@@ -110,6 +110,16 @@ def test_seeds_determine_points():
     assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
 
 
+def test_samples_do_not_depend_on_the_unit_of_length():
+    cage = cube()
+    metres, millimetres = (LimitSurface(cage.with_positions(unit * cage.positions)) for unit in (1, 1024))
+    first, second = metres.sample(100, 3), millimetres.sample(100, 3)
+    np.testing.assert_array_equal(first.uv, second.uv)
+    cells, scaled = metres._sampling_cells(), millimetres._sampling_cells()
+    np.testing.assert_array_equal(cells.offsets, scaled.offsets)
+    np.testing.assert_allclose(1024**2 * cells.areas, scaled.areas, rtol=1e-12)
+
+
 def test_points_are_those_of_their_parameters():
     surface = surface_named("rook")
     found = surface.sample(1000)

@@ -754,8 +754,10 @@ def test_normals_of_polygons(stage):
     faceted = msub.usd_scene(stage(mesh("square", SQUARE)), mi)["square"]
     assert not faceted.has_vertex_normals()
     normals = 'normal3f[] normals = [(1,0,0), (0,1,0), (0,0,1), (0,0.6,0.8)] (interpolation = "faceVarying")\n'
-    for hand in ("rightHanded", "leftHanded"):
-        body = f'{SQUARE}{normals}uniform token orientation = "{hand}"'
+    indexed = normals.replace("normals =", "primvars:normals =").replace("(1,0,0), (0,1,0)", "(0,1,0), (1,0,0)")
+    indexed += "int[] primvars:normals:indices = [1, 0, 2, 3]\n"
+    for hand, authored in (("rightHanded", normals), ("leftHanded", normals), ("rightHanded", indexed)):
+        body = f'{SQUARE}{authored}uniform token orientation = "{hand}"'
         shape = msub.usd_scene(stage(mesh("square", body)), mi)["square"]
         found = dict(
             zip(
@@ -766,6 +768,12 @@ def test_normals_of_polygons(stage):
         )
         assert found[(-1, -1)] == [1, 0, 0]
         assert found[(1, -1)] == [0, 1, 0]
+
+
+def test_planes_are_rectangles(stage):
+    plane = msub.usd_scene(stage('def Plane "plane" { double width = 4\ndouble length = 6 }'), mi)["plane"]
+    corners = np.unique(positions(plane), axis=0)
+    np.testing.assert_allclose(corners, [(-2, -3, 0), (-2, 3, 0), (2, -3, 0), (2, 3, 0)])
 
 
 @pytest.mark.parametrize("kind", ["Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane"])
