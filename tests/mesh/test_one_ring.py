@@ -53,9 +53,9 @@ def local_faces(ring):
     return polygons(ring.topology)
 
 
-@pytest.mark.parametrize("valences", [*product((3, 4, 5, 7), repeat=4), (2, 4, 3, 4), (2, 5, 2, 6), (30, 4, 4, 4)])
-def test_quad_has_twice_its_valences_less_16_control_points(valences):
-    assert one_ring(quads_at(*valences)).vertex_count == 2 * sum(valences) - 16
+def test_quad_has_twice_its_valences_less_16_control_points():
+    for valences in (*product((3, 4, 5, 7), repeat=4), (2, 4, 3, 4), (2, 5, 2, 6), (30, 4, 4, 4)):
+        assert one_ring(quads_at(*valences)).vertex_count == 2 * sum(valences) - 16
 
 
 @pytest.mark.parametrize("fan", [(4,) * 3, (4,) * 7, (3, 5, 4, 6), (3, 3, 3)])

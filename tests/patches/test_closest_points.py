@@ -20,13 +20,13 @@ from scipy.spatial import cKDTree
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # Points of each kind: all around, near the surface, on it, and far away.
-COUNT = 40
+COUNT = 15
 # Of distances, in sizes of the surface: both are sums of some tens of rounded products.
 ROUNDED = 1e-13
 # Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
-SAMPLES, REFINED = 20_000, 12
+SAMPLES, REFINED = 6_000, 8
 STEPS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
 
 

@@ -164,6 +164,7 @@ def merge(folder, *words):
     return main(["merge", *(str(folder / f"{word}.exr") for word in words), "-o", str(folder / "merged.exr")])
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("words", "message"),
     [
