@@ -14,6 +14,7 @@ from ..mesh import ragged
 from ..mesh.chunks import gathered
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
+from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.scheme import Scheme
@@ -201,13 +202,17 @@ class PatchTable:
         if refined is not None:
             from scipy import sparse
 
-            # Copies of a control point share a column, where their weights add up. This is done in place.
-            weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-            refinement = sparse.csr_array(
-                (weights.data, control_of_vertex[weights.indices], weights.indptr), shape=shape, copy=True
-            )
-            refinement.sum_duplicates()
-            return refined.table.controls.view(np.uint32), refinement
+            def make() -> sparse.csr_array:
+                # Copies of a control point share a column, where their weights add up. This is done in place.
+                weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
+                matrix = sparse.csr_array(
+                    (weights.data, control_of_vertex[weights.indices], weights.indptr), shape=shape, copy=True
+                )
+                matrix.sum_duplicates()
+                return matrix
+
+            key = refined, Content(control_of_vertex), control_count
+            return refined.table.controls.view(np.uint32), _REFINEMENTS.get(key, make)
         controls = self.controls
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             controls = gathered(control_of_vertex.astype(np.int32), controls)
@@ -348,3 +353,7 @@ class RefinedPatches:
         # By `splits_corners` of the scheme, face h of the refined cage lies at half-edge h of the cage, and
         # begins there.
         return self.table.topology.face_of(patch_class.corners)
+
+
+# Tessellations and exact shading refine the same control values.
+_REFINEMENTS: Shared[sparse.csr_array] = Shared()
