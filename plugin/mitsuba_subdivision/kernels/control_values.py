@@ -96,7 +96,12 @@ class ControlValues:
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
         self.flat: FloatBuffer = types.float() if types.is_jit else None
-        self.set(types.floats(values.ravel()))
+        if not types.is_jit:
+            self.set(values)
+            return
+        # Kept, so that others that are equal share its memory.
+        self._given = types.shared_floats(values)
+        self.set(self._given.array)
 
     def set(self, values: FloatBuffer) -> None:
         """Set new values of the cage, flat. Later lookups are attached to them."""

@@ -237,11 +237,16 @@ class PatchTable:
         """By their `OccupiedPieces.piece_levels`, those of classes in which samples have lain; and these' numbers."""
         return {}
 
+    def patch_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The class, the patch in it, and which of the patch's corners it is, for some half-edges of `elements`."""
+        index, patch, patch_corner = (found[corners].astype(np.int64) for found in self._patch_of_corner)
+        return index, patch, patch_corner
+
     @cached_property
-    def patch_of_corner(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """The class, the patch in it, and which of the patch's corners it is, for each half-edge of `elements`."""
+    def _patch_of_corner(self) -> tuple[IndexArray, IndexArray, IndexArray]:
+        """`patch_at` all half-edges."""
         t = self.elements
-        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=np.int64) for _ in range(3))
+        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=np.int32) for _ in range(3))
         for index, patch_class in enumerate(self.classes):
             corners = patch_class.corners
             whole = self.is_whole[t.face_of(corners[0])]

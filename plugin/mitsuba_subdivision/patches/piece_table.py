@@ -170,7 +170,7 @@ class PieceTable:
         # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
         table = patches if refined is None else refined.table
         own = every if refined is None else table.topology.face_offsets[:-1]
-        class_index, patch, patch_corner = (values[own] for values in table.patch_of_corner)
+        class_index, patch, patch_corner = table.patch_at(own)
         first_patch = ragged.starts(np.array([len(each.corners) for each in table.classes]))
         face = t.face_of(every)
         is_whole = patches.is_whole[face]
