@@ -56,7 +56,9 @@ class StencilTable:
         from scipy import sparse
 
         shape = self.row_count, self.column_count
-        return sparse.coo_array((self.weights, (self.rows, self.columns)), shape=shape).tocsr()
+        dtype = np.int32 if max(*shape, len(self.rows)) <= np.iinfo(np.int32).max else np.int64
+        rows, columns = self.rows.astype(dtype), self.columns.astype(dtype)
+        return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
 
     def dense(self, rows: IntArray) -> FloatArray:
         """Stencils of some refined vertices, ``(len(rows), column_count)``."""
