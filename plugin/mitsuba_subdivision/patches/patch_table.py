@@ -205,11 +205,8 @@ class PatchTable:
             def make() -> sparse.csr_array:
                 # Copies of a control point share a column, where their weights add up. This is done in place.
                 weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-                matrix = sparse.csr_array(
-                    (weights.data, control_of_vertex.astype(weights.indices.dtype)[weights.indices], weights.indptr),
-                    shape=shape,
-                    copy=True,
-                )
+                columns = control_of_vertex.astype(weights.indices.dtype)[weights.indices]
+                matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
                 matrix.sum_duplicates()
                 return matrix
 
