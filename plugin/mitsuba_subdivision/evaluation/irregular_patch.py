@@ -131,7 +131,7 @@ class IrregularPatch:
         if evaluator == "limit":
             return self._rows_at_point(len(uv), dtype, derivatives)
         tables = self.structure.children if evaluator == "power" else self.eigen_children
-        level, rows = child_rows(self.scheme, uv, tables.astype(dtype), derivatives)
+        level, rows = child_rows(self.scheme, uv, tables.astype(dtype, copy=False), derivatives)
         at_point = self.scheme.domain.extent(uv) == 0
         # Far beyond the levels of their precision, the published forms overflow and so may the derivatives' scale.
         with np.errstate(over="ignore", invalid="ignore"):

@@ -131,6 +131,21 @@ class PatchTable:
         return self._classes[1]
 
     @cached_property
+    def rings(self) -> IndexArray:
+        """`controls`, those of each patch together, for samples that jump from patch to patch."""
+        return np.concatenate([each.controls.ravel() for each in self.classes])
+
+    @cached_property
+    def first_controls(self) -> IntArray:
+        """``(c,)`` `PatchClass.first_control` of each class."""
+        return np.array([each.first_control for each in self.classes], dtype=np.int64)
+
+    @cached_property
+    def control_counts(self) -> IntArray:
+        """``(c,)`` K of each class."""
+        return np.array([each.controls.shape[1] for each in self.classes], dtype=np.int64)
+
+    @cached_property
     def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
         order, bounds = self._order
         members = np.split(gathered(self._patch_codes[0], order), bounds)
