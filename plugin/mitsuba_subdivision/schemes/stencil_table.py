@@ -56,8 +56,8 @@ class StencilTable:
         from scipy import sparse
 
         shape = self.row_count, self.column_count
-        dtype = np.int32 if max(*shape, len(self.rows)) <= np.iinfo(np.int32).max else np.int64
-        rows, columns = self.rows.astype(dtype), self.columns.astype(dtype)
+        is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
+        rows, columns = (each.astype(np.int32) if is_short else each for each in (self.rows, self.columns))
         return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
 
     def dense(self, rows: IntArray) -> FloatArray:
