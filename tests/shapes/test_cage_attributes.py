@@ -122,6 +122,19 @@ def assert_alike(shape, expected):
 
 
 @every_variant
+def test_equal_values_share_their_memory_until_those_of_one_shape_change():
+    first, second = (mi.traverse(make(cube())) for _ in range(2))
+    for name in NAMES:
+        one, other = first[f"cage_{name}"], second[f"cage_{name}"]
+        assert not dr.is_jit_v(one) or one.index == other.index
+    before = np.array(second["cage_texcoords"])
+    dr.scatter(first["cage_texcoords"], 7.0, dr.uint32_array_t(type(first["cage_texcoords"]))(0))
+    first.update()
+    assert np.array(first["cage_texcoords"])[0] == 7
+    np.testing.assert_array_equal(np.array(second["cage_texcoords"]), before)
+
+
+@every_variant
 @shadings
 def test_an_update_equals_a_new_shape(cage, shading):
     made, parameters = cage

@@ -379,6 +379,8 @@ def _welded(table: VertexTable, split: AttributeLayout | None = None, first: Int
     """
 
     def triangles() -> NDArray[np.uint32]:
+        if not table.copies.size:
+            return table.triangles
         return table.weld_target.astype(np.uint32)[table.triangles]
 
     def make() -> AttributeLayout:
