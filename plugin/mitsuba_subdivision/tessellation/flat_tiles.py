@@ -81,7 +81,7 @@ def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) ->
 
 
 def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray[np.bool_]:
-    """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along watched sides."""
+    """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along feature edges."""
     count, m = len(tiles), rates.domain.corner_count
     lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((m, 3, count))
     for each in groups:
@@ -144,7 +144,7 @@ def _have_curved_sides(
     corners: FloatArray,
     limit: FloatArray,
 ) -> NDArray[np.bool_]:
-    """``(t,)`` whether a watched side of some tiles with these corners is no straight line within the limit."""
+    """``(t,)`` whether tiles with these corners have a feature edge that is no straight line within the limit."""
     m, asked = rates.domain.corner_count, []
     for side in range(m):
         for each in groups:

@@ -124,7 +124,7 @@ class Spans:
         number = side - m * tile + m * tiles.is_flipped[tile]
         corners = self.frames.domain.corners.T.astype(np.int32)
         steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
-        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
+        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.origin.T, steps, strict=True)]
         return np.stack(found).astype(np.int32)
 
     def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[SidePoints]]]:
@@ -143,8 +143,8 @@ class Spans:
         return self.tiles.corner[self.side[block] // self.frames.domain.corner_count]
 
     @cached_property
-    def _places(self) -> tuple[IndexArray, IndexArray]:
-        """``(s,)`` number of the place of each point, and the first point of each."""
+    def _points(self) -> tuple[IndexArray, IndexArray]:
+        """``(s,)`` number of the point at which each span begins, and the first span of each."""
         frames, t = self.frames, self.frames.topology
         vertex_count, count = int(frames.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
@@ -194,7 +194,7 @@ class Spans:
             lie in the same place, and on edges and vertices of the same numbers.
         """
         frames = self.frames
-        point, of_point = self._places
+        point, of_point = self._points
         span, of_span = self.at, first_of_each(self.at)
         if _is_finer(edge, frames.edge) or _is_finer(vertex, frames.vertex):
             of_points = np.zeros(len(point), dtype=np.int32)

@@ -17,11 +17,11 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme_members import optional_member
 from .criterion import Criterion
+from .feature_edges import feature_edges, sides_on
 from .flat_tiles import PatchGroup, TileGroup, are_flat, have_flat_rings
 from .patch_frames import PatchFrames
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
-from .watched_sides import sides_on, watched_edges
 
 # Number of patches, or their pieces, processed together, which bounds temporary memory.
 PATCHES_AT_ONCE = 1 << 14
@@ -60,10 +60,10 @@ def choose_tiles(
         If their triangles would not fit into memory.
     """
     points = control_points[control_of_vertex]
-    rates, watched = TileRates(patches.scheme, frames, criterion), watched_edges(patches, frames, points, criterion)
+    rates, features = TileRates(patches.scheme, frames, criterion), feature_edges(patches, frames, points, criterion)
     found: list[Tiles] = []
     triangle_count = 0
-    for tiles, groups in _blocks(patches, frames, points, watched, max_rate):
+    for tiles, groups in _blocks(patches, frames, points, features, max_rate):
         for chosen in _chosen(rates, tiles, groups, triangle_count):
             triangle_count += rates.cost(chosen)
             found.append(chosen)
@@ -72,7 +72,7 @@ def choose_tiles(
 
 
 def _blocks(
-    patches: PatchTable, frames: PatchFrames, points: FloatArray, watched: NDArray[np.bool_], max_rate: int
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, features: NDArray[np.bool_], max_rate: int
 ) -> Iterator[tuple[Tiles, list[PatchGroup]]]:
     """All patches, each as one tile, class by class, in blocks that bound temporary memory.
 
@@ -80,8 +80,8 @@ def _blocks(
     ----------
     points : (n_v, 3) float64
         At the vertices of the mesh.
-    watched : (n_h,) bool
-        As `watched_edges`.
+    features : (n_h,) bool
+        As `feature_edges`.
     """
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
@@ -97,15 +97,15 @@ def _blocks(
             groups.append(PatchGroup(patch_class.signature, np.arange(count, count + len(corners[-1])), controls))
             count += len(corners[-1])
             if count >= PATCHES_AT_ONCE:
-                yield _whole(frames, corners, max_rate, watched), groups
+                yield _whole(frames, corners, max_rate, features), groups
                 groups, corners, count = [], [], 0
     if groups:
-        yield _whole(frames, corners, max_rate, watched), groups
+        yield _whole(frames, corners, max_rate, features), groups
 
 
-def _whole(frames: PatchFrames, corners: list[IntArray], max_rate: int, watched: NDArray[np.bool_]) -> Tiles:
+def _whole(frames: PatchFrames, corners: list[IntArray], max_rate: int, features: NDArray[np.bool_]) -> Tiles:
     joined = np.concatenate(corners)
-    return Tiles.whole(joined, max_rate, sides_on(watched, frames, joined))
+    return Tiles.whole(joined, max_rate, sides_on(features, frames, joined))
 
 
 def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_count: int) -> Iterator[Tiles]:
@@ -222,8 +222,8 @@ def _numbered(tiles: Tiles, groups: list[TileGroup]) -> tuple[Tiles, list[TileGr
 
 def _order(tiles: Tiles, frames: PatchFrames) -> IntArray:
     """Tiles in the order of their elements, then of their patches, along a curve of Morton's."""
-    code = _interleaved(tiles.place[:, 0] << (DEEPEST - tiles.depth)) | (
-        _interleaved(tiles.place[:, 1] << (DEEPEST - tiles.depth)) << 1
+    code = _interleaved(tiles.origin[:, 0] << (DEEPEST - tiles.depth)) | (
+        _interleaved(tiles.origin[:, 1] << (DEEPEST - tiles.depth)) << 1
     )
     return np.lexsort([tiles.is_flipped, code, tiles.corner, frames.topology.face_of(tiles.corner)])
 

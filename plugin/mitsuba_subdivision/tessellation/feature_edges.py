@@ -1,4 +1,4 @@
-"""Sides of tiles along which the surface ends, or folds, and that hold to the limit by themselves."""
+"""Feature edges: along which the surface ends, or folds, so that curves hold to the limit by themselves."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .patch_frames import PatchFrames
 FOLDED = -0.1
 
 
-def watched_edges(
+def feature_edges(
     patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
 ) -> NDArray[np.bool_]:
     """``(n_h,)`` the half-edges along which curves hold to the limit by themselves.
