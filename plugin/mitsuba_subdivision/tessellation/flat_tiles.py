@@ -13,6 +13,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
+from ..schemes.scheme_members import optional_member
 from .cones import NormalCone, TangentCone, cross, dot
 from .criterion import Measure
 from .tile_extents import TileParts, fit_within
@@ -39,6 +40,10 @@ class PatchGroup(NamedTuple):
     at: IntArray
     points: FloatArray
 
+    def chosen(self, which: NDArray[np.bool_]) -> PatchGroup:
+        """Some of the patches."""
+        return self if which.all() else self._replace(at=self.at[which], points=self.points[..., which])
+
 
 class TileGroup(NamedTuple):
     """Tiles of several pieces with the same subdivision.
@@ -58,7 +63,7 @@ class TileGroup(NamedTuple):
 
     def chosen(self, which: NDArray[np.bool_]) -> TileGroup:
         """Some of the tiles."""
-        return TileGroup(self.tile, self.at[which], np.ascontiguousarray(self.points[..., which]))
+        return self if which.all() else self._replace(at=self.at[which], points=self.points[..., which])
 
 
 def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) -> NDArray[np.bool_]:
@@ -77,7 +82,11 @@ def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) ->
     axis, extent = axis_across(corners), np.empty(count)
     for each in groups:
         extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
-    return rates.are_within(tiles, lower, upper, axis, extent) & ~tiles.sides.any(axis=1)
+    limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
+    fits = np.linalg.norm(upper - lower, axis=0) <= limit
+    if rates.criterion.measure is Measure.EDGE:
+        return fits
+    return fits | (axis.any(axis=0) & (extent <= limit) & ~tiles.sides.any(axis=1))
 
 
 def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray[np.bool_]:
@@ -93,15 +102,16 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray
         return fit_within(rates.scheme, limit, [TileParts(each.tile, each.points, each.at) for each in groups])
     parts = [TileParts(each.tile, dot(each.points, axis[:, each.at])[:, None], each.at) for each in groups]
     # A tile without a normal, or folded across it, is tested by its size only.
-    fits = np.linalg.norm(upper - lower, axis=0) <= limit
-    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis)
+    fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & bool(optional_member(rates.scheme, "has_convex_rules"))
+    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis) if m > 3 else axis.any(axis=0)
     found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
     if rates.criterion.outline is not None:
         cone = NormalCone(axis, _normal_sines(rates, tiles, groups, axis))
         higher = np.where(~found & (cone.sine < 1), rates.limit(tiles, lower, upper, cone), -1.0)
         found |= fit_within(rates.scheme, higher, parts)
-    if (found[:, None] & (tiles.sides > 0)).any():
-        found &= ~_have_curved_sides(rates, tiles, groups, found, corners, limit)
+    may_curve = found & ~fits & tiles.sides.any(axis=1)
+    if may_curve.any():
+        found &= ~_have_curved_sides(rates, tiles, groups, may_curve, corners, limit)
     return found
 
 

@@ -174,14 +174,9 @@ class Spans:
 
     def _vertices(self, borders: list[SidePoints]) -> tuple[IntArray, IntArray]:
         """Points at vertices, and half-edges that begin there."""
-        t = self.frames.topology
-        found = [
-            (border.on[border.at == position], edge[border.at == position])
-            for border in borders
-            if not border.is_spoke
-            for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
-        ]
-        on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
+        # The end of each side is the beginning of the next one.
+        chosen = [(border, np.flatnonzero(border.at == 0)) for border in borders if not border.is_spoke]
+        on, edge = (np.concatenate(each) for each in zip(*((own.on[i], own.edge[i]) for own, i in chosen), strict=True))
         return on, edge
 
     def numbered(self, edge: IndexArray, vertex: IndexArray) -> SpanVertices:
@@ -297,6 +292,8 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:
     """Whether some names distinguish items with equal other names."""
+    if names is others:
+        return False
     one = np.zeros(int(others.max(initial=0)) + 1, dtype=names.dtype)
     one[others] = names
     return bool((one[others] != names).any())

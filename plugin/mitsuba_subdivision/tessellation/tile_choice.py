@@ -20,6 +20,7 @@ from .criterion import Criterion
 from .feature_edges import feature_edges, sides_on
 from .flat_tiles import PatchGroup, TileGroup, are_flat, have_flat_rings
 from .patch_frames import PatchFrames
+from .spans import joined
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
@@ -63,12 +64,12 @@ def choose_tiles(
     rates, features = TileRates(patches.scheme, frames, criterion), feature_edges(patches, frames, points, criterion)
     found: list[Tiles] = []
     triangle_count = 0
-    for tiles, groups in _blocks(patches, frames, points, features, max_rate):
-        for chosen in _chosen(rates, tiles, groups, triangle_count):
+    for block, groups in _blocks(patches, frames, points, features, max_rate):
+        for chosen in _chosen(rates, block, groups, triangle_count):
             triangle_count += rates.cost(chosen)
             found.append(chosen)
-    joined = Tiles.joined(found)
-    return joined[_order(joined, frames)]
+    tiles = Tiles.joined(found)
+    return tiles[_order(tiles)]
 
 
 def _blocks(
@@ -85,6 +86,7 @@ def _blocks(
     """
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
+    coordinates = np.ascontiguousarray(points.T)
     groups: list[PatchGroup] = []
     corners: list[IntArray] = []
     count = 0
@@ -93,7 +95,9 @@ def _blocks(
         for begin in range(0, len(of_class), PATCHES_AT_ONCE):
             own = slice(begin, begin + PATCHES_AT_ONCE)
             corners.append(of_class[own])
-            controls = np.ascontiguousarray(points[patch_class.controls[own].T].swapaxes(1, 2))
+            controls = np.empty((patch_class.controls.shape[1], 3, len(corners[-1])))
+            for axis, values in enumerate(coordinates):
+                controls[:, axis] = values.take(patch_class.controls[own].T, mode="clip")
             groups.append(PatchGroup(patch_class.signature, np.arange(count, count + len(corners[-1])), controls))
             count += len(corners[-1])
             if count >= PATCHES_AT_ONCE:
@@ -104,8 +108,8 @@ def _blocks(
 
 
 def _whole(frames: PatchFrames, corners: list[IntArray], max_rate: int, features: NDArray[np.bool_]) -> Tiles:
-    joined = np.concatenate(corners)
-    return Tiles.whole(joined, max_rate, sides_on(features, frames, joined))
+    every = np.concatenate(corners)
+    return Tiles.whole(every, max_rate, sides_on(features, frames, every))
 
 
 def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_count: int) -> Iterator[Tiles]:
@@ -128,11 +132,7 @@ def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_
     if optional_member(rates.scheme, "has_convex_rules"):
         is_flat = have_flat_rings(rates, tiles, patches)
         yield tiles[is_flat]
-        patches = [
-            PatchGroup(each.signature, each.at[~is_flat[each.at]], each.points[..., ~is_flat[each.at]])
-            for each in patches
-            if not is_flat[each.at].all()
-        ]
+        patches = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
     flat, pieces, coefficients = _divided(rates, tiles, patches)
     yield flat
     for begin in range(0, len(pieces), PATCHES_AT_ONCE):
@@ -156,8 +156,9 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
     pieces: list[tuple[Tiles, FloatArray]] = [(tiles[:0], np.empty((len(rates.basis.indices), 3, 0)))]
     waiting: list[TileGroup] = []
     for each, element in zip(patches, divided_elements(scheme, [own.signature for own in patches]), strict=True):
-        tile, rows = part_of_tile(element, np.eye(element.control_count))
-        points = times(rows, each.points)
+        every = np.eye(element.control_count)
+        tile, rows = part_of_tile(element, every)
+        points = each.points if rows is every else times(rows, each.points)
         if tile is None:
             pieces.append((tiles[each.at], points))
         else:
@@ -170,23 +171,25 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
             if not group.tile.is_self_similar:
                 is_done[group.at] |= tiles.most[group.at] == 1
         flat.append(tiles[is_done])
+        index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
         children = [tiles.child(number, scheme.domain) for number in range(4)]
         most = np.concatenate([each.most for each in children])
         divided, waiting = waiting, []
         of_pieces, coefficients = [], []
         for group in divided:
-            rest = group.chosen(~is_done[group.at])
-            if not len(rest.at):
+            if is_done[group.at].all():
                 continue
+            rest = group.chosen(~is_done[group.at])
+            parents = index[rest.at]
             for number, (tile, rows) in enumerate(group.tile.children):
-                at, points = number * len(tiles) + rest.at, times(rows, rest.points)
+                at, points = number * len(tiles) + parents, times(rows, rest.points)
                 if tile is None:
                     of_pieces.append(at)
                     coefficients.append(points)
                     continue
                 if tile is group.tile:
                     # Each ring around an extraordinary point may have as many segments as the one around it.
-                    most[at] = tiles.most[rest.at]
+                    most[at] = tiles.most[parents]
                 waiting.append(TileGroup(tile, at, points))
         tiles = replace(Tiles.joined(children), most=most)
         if of_pieces:
@@ -220,12 +223,11 @@ def _numbered(tiles: Tiles, groups: list[TileGroup]) -> tuple[Tiles, list[TileGr
     ]
 
 
-def _order(tiles: Tiles, frames: PatchFrames) -> IntArray:
-    """Tiles in the order of their elements, then of their patches, along a curve of Morton's."""
-    code = _interleaved(tiles.origin[:, 0] << (DEEPEST - tiles.depth)) | (
-        _interleaved(tiles.origin[:, 1] << (DEEPEST - tiles.depth)) << 1
-    )
-    return np.lexsort([tiles.is_flipped, code, tiles.corner, frames.topology.face_of(tiles.corner)])
+def _order(tiles: Tiles) -> IntArray:
+    """Tiles in the order of their patches' corners, and so of the elements, along a curve of Morton's."""
+    depth = int(tiles.depth.max(initial=0))
+    u, v = (_interleaved(axis.astype(np.int64) << (depth - tiles.depth)) for axis in tiles.origin.T)
+    return np.argsort(joined(tiles.corner, (u | v << 1) << 1 | tiles.is_flipped, 2 * depth + 1), kind="stable")
 
 
 def _interleaved(values: IntArray) -> IntArray:
