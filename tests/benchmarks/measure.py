@@ -63,7 +63,7 @@ def stages(obj, binary, rate, repeats, _variant):
     """Each step by itself."""
     import drjit as dr
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.evaluation.stencils_together import stencils_together
+    from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
     from mitsuba_subdivision.files.obj_reader import read_obj
     from mitsuba_subdivision.kernels import WeightKernel
     from mitsuba_subdivision.mesh.connectivity import Topology
@@ -84,7 +84,7 @@ def stages(obj, binary, rate, repeats, _variant):
         classes = surface.patches.classes
         clock.lap("patch table")
         uv = np.stack(np.meshgrid(*[np.arange(rate + 1) / rate] * 2), axis=-1).reshape(-1, 2)
-        stencils_together(surface.scheme, [patch_class.signature for patch_class in classes], uv)
+        stencils_by_signature(surface.scheme, [patch_class.signature for patch_class in classes], uv)
         clock.lap("weights")
         table = surface.sampling(rate)
         clock.lap("sampling table, with weights")

@@ -288,8 +288,8 @@ def test_curvature_grows_as_the_eigenvalues_say(valence):
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
+    from mitsuba_subdivision.figures.figure_scenes import load_stage
     from mitsuba_subdivision.figures.normal_error import offset_cage
-    from mitsuba_subdivision.figures.staging import load_stage
     from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
 
     view = TangentView.of(offset_cage(VALENCE, OFFSET))

@@ -14,7 +14,7 @@ from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, framed, outermost
 from mitsuba_subdivision.studio.scene_file import save_scene
-from mitsuba_subdivision.studio.stage import sampler
+from mitsuba_subdivision.studio.studio_entries import sampler
 from mitsuba_subdivision.studio.view import VIEWS
 from mitsuba_subdivision.studio.wire import CageWire
 

@@ -7,7 +7,7 @@ from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.usd import copies
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_subdivision.usd.copies import LEAST_INSTANCES, with_copies
-from mitsuba_subdivision.usd.notes import Notes
+from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 
 FACES = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
 POINTS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -36,7 +36,7 @@ def rates_of(shape):
 
 def test_copies_of_one_rate_are_one_shape():
     shape, alone = ShapeContents("/cube", cube(), np.eye(4)), ShapeContents("/alone", cube(), np.eye(4))
-    found, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", Notes())
+    found, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", StageWarnings())
     assert (found.groups, found.instances, found.shapes[0]) == ([], [], alone)
     assert [rates[each] for each in found.shapes[1:]] == [1, 3]
     few = found.shapes[2].cage
@@ -47,7 +47,7 @@ def test_copies_of_one_rate_are_one_shape():
 
 def test_copies_of_a_part_show_its_faces_only():
     part = ShapeContents("/cube", cube(), np.eye(4), shown_faces=np.array([1, 4]))
-    found, _ = with_copies(scene(group=[part]), {}, "exact", Notes())
+    found, _ = with_copies(scene(group=[part]), {}, "exact", StageWarnings())
     expected = np.add.outer(6 * np.arange(COUNT), [1, 4]).ravel()
     np.testing.assert_array_equal(found.shapes[0].shown_faces, expected)
 
@@ -55,7 +55,7 @@ def test_copies_of_a_part_show_its_faces_only():
 def test_few_instances_stay():
     shape = ShapeContents("/cube", cube(), np.eye(4))
     contents = scene(group=[shape], count=LEAST_INSTANCES - 1)
-    assert with_copies(contents, {}, "exact", Notes()) == (contents, {})
+    assert with_copies(contents, {}, "exact", StageWarnings()) == (contents, {})
 
 
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
@@ -66,13 +66,13 @@ def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
     shape = ShapeContents("/cube", cube(), np.eye(4))
     for allowed, expected in ((fits, [1, 2]), (fits - 1, [1])):
         monkeypatch.setattr(copies, "MOST_BYTES", allowed)
-        _, rates = with_copies(scene(group=[shape]), rates_of(shape), shading, Notes())
+        _, rates = with_copies(scene(group=[shape]), rates_of(shape), shading, StageWarnings())
         assert [*rates.values()] == expected
 
 
 def test_what_is_too_much_stays_instances_and_is_told_with_numbers(monkeypatch):
     monkeypatch.setattr(copies, "MOST_BYTES", 1)
-    shape, notes = ShapeContents("/cube", cube(), np.eye(4)), Notes()
+    shape, notes = ShapeContents("/cube", cube(), np.eye(4)), StageWarnings()
     contents = scene(group=[shape])
     assert with_copies(contents, rates_of(shape), "exact", notes) == (contents, {})
     with pytest.warns(UserWarning, match=rf"copies with {6 * COUNT:,} faces .* GB, and stay {COUNT} instances"):
@@ -83,8 +83,8 @@ def test_rates_that_are_chosen_do_not_give_way(monkeypatch):
     monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 12 * COUNT * 3)
     shape = ShapeContents("/cube", cube(), np.eye(4))
     rates = {shape: np.full(COUNT, 4)}
-    assert with_copies(scene(group=[shape]), rates, "vertex", Notes(), lowest=4)[1] == {}
-    assert [*with_copies(scene(group=[shape]), rates, "vertex", Notes())[1].values()] == [1]
+    assert with_copies(scene(group=[shape]), rates, "vertex", StageWarnings(), lowest=4)[1] == {}
+    assert [*with_copies(scene(group=[shape]), rates, "vertex", StageWarnings())[1].values()] == [1]
 
 
 def test_copies_that_are_no_instances_are_one_shape_too():
@@ -96,7 +96,7 @@ def test_copies_that_are_no_instances_are_one_shape_too():
     cage = cube(None, attributes=attributes)
     mirrored = np.diag([-1.0, 1, 1, 1])
     shapes = [ShapeContents(f"/c{k}", cage, mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
-    found, _ = with_copies(scene(shapes, count=0), {}, "exact", Notes())
+    found, _ = with_copies(scene(shapes, count=0), {}, "exact", StageWarnings())
     (joined,) = found.shapes
     heat, paint = (joined.cage.attributes[name] for name in ("heat", "paint"))
     np.testing.assert_array_equal(heat.values.ravel(), np.tile(np.arange(8.0), COUNT))

@@ -7,7 +7,7 @@ from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.usd.stage_scenes import StageScenes
-from usd.film_stages import CORNERS, CUBE, mesh, write
+from usd.moving_stages import CORNERS, CUBE, mesh, write
 
 BODY = f"point3f[] points = [{CORNERS}]{CUBE}"
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))

@@ -7,8 +7,8 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from mitsuba_subdivision.cage.equality import same
 from mitsuba_subdivision.cage.errors import CageWarning
-from mitsuba_subdivision.cage.sameness import same
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_subdivision.usd.stage_reader import StageReader

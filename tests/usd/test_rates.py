@@ -15,8 +15,8 @@ from mitsuba_subdivision.studio.picture import ERRORS, HIGHEST_RATE, MOST_TRIANG
 from mitsuba_subdivision.studio.placed_points import points_at
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_subdivision.usd.limit_surfaces import DENSE, Surfaces
-from mitsuba_subdivision.usd.notes import Notes
 from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture
+from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -176,7 +176,7 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
         assert surfaces.of(one) is not surfaces.of(moved)
         assert surfaces.of(replace(one, scheme="doo_sabin")) is not surfaces.of(one)
     for each in (one, other, moved):
-        notes = Notes()
+        notes = StageWarnings()
         surfaces.note_warnings(ShapeContents(each.source.name, each, np.eye(4)), notes)
         with pytest.warns(CageWarning, match=f"^{each.source.name}: 1 of 9 vertices"):
             notes.warn("stage")

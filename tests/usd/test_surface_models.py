@@ -10,7 +10,7 @@ from mitsuba_subdivision.usd import surface_models
 from mitsuba_subdivision.usd.bsdfs import Bsdfs
 from mitsuba_subdivision.usd.contents import ShapeContents
 from mitsuba_subdivision.usd.materialx_library import library, numbers
-from mitsuba_subdivision.usd.notes import Notes
+from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 from mitsuba_subdivision.usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
 from mitsuba_subdivision.usd.textures import Textures
 
@@ -41,7 +41,7 @@ def look(model, **given):
 
 
 def entry(material):
-    notes = Notes()
+    notes = StageWarnings()
     cage = CageContents(np.zeros((3, 3)), np.array([3]), np.arange(3))
     shape = ShapeContents("/shape", cage, np.eye(4))
     return Bsdfs(Textures(notes), notes).surface(material, shape), notes

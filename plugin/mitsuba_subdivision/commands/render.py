@@ -302,7 +302,7 @@ def _load_still(options: dict[str, Any]) -> LoadedScene:
 def _source(options: argparse.Namespace) -> SceneSource[Any]:
     """One mesh, or a whole USD file."""
     from ..studio.picture import shading_for
-    from ..studio.stage import variant_in_use
+    from ..studio.studio_entries import variant_in_use
 
     look, which = _look(options), {"time": options.time, "numbers": options.frames}
     is_usd = options.scene.suffix.lower().startswith(".usd")

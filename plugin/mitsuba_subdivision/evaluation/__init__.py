@@ -11,7 +11,7 @@ From the ground up:
 - `tangent_frame` has tangents for the normal where the derivatives fail, `normals` the normals, `curvature` the
   curvature.
 - `irregular_patch` puts these together for a patch with one extraordinary point, `element` for a whole element, and
-  `stencils_together` for the same samples on many elements.
+  `stencils_by_signature` for the same samples on many elements.
 - `limit_stencil` has limit stencils of vertices, `product_patch` regular patches whose weights are products, and
   `scheme_check` the checks that a user's scheme must pass.
 """

@@ -5,9 +5,9 @@ is a part that needs no further division: a regular patch, or one with a single 
 consists of three regular pieces at every level (`IrregularPatch`).
 
 A semi-sharp crease has thousands of parts along it, but few kinds: parts whose one-rings have the same signature are
-divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Evaluation
-descends to the children that hold samples (`occupied_pieces`, `stencils_together`); bounds divide parts that are not
-yet tight (`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
+divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Evaluation descends to the
+children that hold samples (`occupied_pieces`, `stencils_by_signature`); bounds divide parts that are not yet tight
+(`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
 
 *Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as one
 with 2.7 and 4.2: all of them are sharp before and after, and the amount makes no difference. Only the sharpness of

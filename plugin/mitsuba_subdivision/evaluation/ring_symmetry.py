@@ -167,8 +167,8 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     of_outside = np.linalg.eigvals(matrix[np.ix_(outside, outside)])
     is_separate = np.abs(waves.eigenvalues[:, None] - of_outside).min(axis=1) >= SEPARATE
     is_separate[0] = False
-    for place, _ in of_ring.blocks:
-        is_separate[place] = False
+    for rows, _ in of_ring.blocks:
+        is_separate[rows] = False
     found = _completed(matrix, waves, rest, is_separate)
     require_basis(matrix, found, _probes(len(matrix), PROBES_OF_FACE))
     return found

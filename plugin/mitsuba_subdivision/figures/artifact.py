@@ -14,10 +14,10 @@ from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..images.probe_tier import normal_angle
 from ..surface import LimitSurface
+from .figure_scenes import in_8_bits, load_stage, render
 from .normal_error import draw as draw_normal_error
 from .output import FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
 from .projection import project
-from .staging import in_8_bits, load_stage, render
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,7 +18,7 @@ from ..fit.triangle_samples import triangle_samples
 from ..shapes.views import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode
-from .staging import make_mesh
+from .figure_scenes import make_mesh
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

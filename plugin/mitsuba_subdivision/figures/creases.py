@@ -11,8 +11,8 @@ import numpy as np
 
 from ..cage import ControlCage
 from ..variants import SceneNode
+from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
 from .output import FigureOptions, pyplot, scene_path, write_pixels, write_plot
-from .staging import in_8_bits, load_stage, make_mesh, paint, render, staged
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
 from ..variants import SceneNode
+from .figure_scenes import in_8_bits, load_stage, render, staged
 from .output import FigureOptions, save_png, scene_path, write_pixels
-from .staging import in_8_bits, load_stage, render, staged
 
 # The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
 WIDER = 2.25

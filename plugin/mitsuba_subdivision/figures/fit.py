@@ -17,9 +17,9 @@ from ..cage import ControlCage
 from ..variants import SceneNode
 from .ball_fits import GREY, VIEWS, Course, Measurement, fit_cage, fit_mesh, target, views_of
 from .crease_fit import FIRST, HIGHEST, CreaseFit, fit_creases
+from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
 from .output import FigureError, FigureOptions, hide_frame, pyplot, write_pixels, write_plot
 from .projection import project
-from .staging import in_8_bits, load_stage, make_mesh, paint, render, staged
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

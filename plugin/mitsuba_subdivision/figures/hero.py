@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .figure_scenes import in_8_bits, load_stage, render
 from .output import FigureOptions, save_png, write_pixels
-from .staging import in_8_bits, load_stage, render
 
 # The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
 WIDER = 2.25

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from .figure_scenes import in_8_bits, load_stage, render
 from .output import FigureOptions, pyplot, write_pixels, write_plot
-from .staging import in_8_bits, load_stage, render
 
 
 def draw_row(

@@ -14,9 +14,9 @@ from ..evaluation.patch_pieces import lattice_stencils
 from ..mesh.connectivity import Topology
 from ..schemes import scheme_named
 from ..surface import LimitSurface
+from .figure_scenes import load_stage, make_mesh, on_white, render, staged
 from .output import FigureError, FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
 from .projection import project, visible, visible_runs
-from .staging import load_stage, make_mesh, on_white, render, staged
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,10 +17,10 @@ from ..cage.named_cages import cube
 from ..images.probe_tier import normal_angle
 from ..regression.rendering import render_pixels
 from ..surface import LimitSurface
+from .figure_scenes import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .output import FigureOptions, pyplot, write_pixels, write_plot
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
-from .staging import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .subdivision import refined
 
 if TYPE_CHECKING:

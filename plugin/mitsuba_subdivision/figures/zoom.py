@@ -21,11 +21,11 @@ from ..images.probe_tier import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
+from .figure_scenes import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
 from .normal_error import EQUATIONS, offset_cage
 from .output import FigureError, FigureOptions, pyplot, write_pixels, write_plot
 from .peers import osd_peer, osd_samples
 from .projection import project
-from .staging import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -127,12 +127,12 @@ def _page(title: str, comparison: Comparison, panels: list[Panel]) -> str:
 def _figure(panel: Panel, comparison: Comparison) -> str:
     height, width = panel.pixels.shape[:2]
     data = base64.b64encode(png_bytes(panel.pixels)).decode()
-    places = [(f"x={t['x']} y={t['y']} width={t['width']} height={t['height']}", t) for t in _one_of_each(panel.tiles)]
+    marks = [(f"x={t['x']} y={t['y']} width={t['width']} height={t['height']}", t) for t in _one_of_each(panel.tiles)]
     # The white halos of all rectangles first, so that none hides a line.
-    shapes = "".join(f"<rect class=halo {place} />" for place, _ in places)
+    shapes = "".join(f"<rect class=halo {mark} />" for mark, _ in marks)
     shapes += "".join(
-        f"<rect {place}><title>{t['width']} &times; {t['height']}, {t['channel']}, z = {t['z']:+.1f}</title></rect>"
-        for place, t in places
+        f"<rect {mark}><title>{t['width']} &times; {t['height']}, {t['channel']}, z = {t['z']:+.1f}</title></rect>"
+        for mark, t in marks
     )
     if comparison.worst:
         x, y = comparison.worst.x + 0.5, comparison.worst.y + 0.5

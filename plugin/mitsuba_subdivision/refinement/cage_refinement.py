@@ -21,8 +21,8 @@ from ..cage.errors import CageError, CageWarning
 from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..mesh import ragged
-from ..mesh.agreement import differences
 from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.refinement_differences import differences
 from ..mesh.sharpness import INFINITE, Sharpness
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement

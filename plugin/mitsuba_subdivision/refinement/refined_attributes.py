@@ -12,8 +12,8 @@ from ..cage.attributes import Attribute
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, shortened
 from ..cage.rules import RULES
-from ..mesh.agreement import differences
 from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.refinement_differences import differences
 from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement

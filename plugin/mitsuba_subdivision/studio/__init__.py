@@ -2,6 +2,6 @@
 
 from .denoising import render_denoised
 from .scene import studio_scene
-from .stage import studio
+from .studio_entries import studio
 
 __all__ = ["render_denoised", "studio", "studio_scene"]

@@ -20,7 +20,7 @@ from ..variants import SceneNode
 from .camera import outermost
 from .placed_points import points_at
 from .polygon_mesh import with_meshes
-from .stage import RIG
+from .studio_entries import RIG
 from .view import View, studio_axes, turned
 
 C = TypeVar("C")

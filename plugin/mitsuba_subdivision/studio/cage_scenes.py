@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, CageWarning, ControlCage
 from ..cage.contents import CageContents
+from ..cage.equality import same_topology
 from ..cage.errors import warn
-from ..cage.sameness import same_topology
 from ..files.formats import read_file
 from ..regression.scene import LoadedScene
 from ..variants import SceneNode
@@ -27,7 +27,7 @@ from .frame_files import FrameFiles
 from .look import Look
 from .model import Model
 from .obj_materials import material_bsdf, material_emitter
-from .stage import DEFAULT_SIZE, studio
+from .studio_entries import DEFAULT_SIZE, studio
 from .view import View
 
 CLAY = (0.56, 0.52, 0.47)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .stage import DEFAULT_SPP
+from .studio_entries import DEFAULT_SPP
 from .view import DEFAULT_VIEW, View
 
 

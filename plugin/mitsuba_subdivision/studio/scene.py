@@ -10,7 +10,7 @@ from .animation import StillPicture
 from .cage_scenes import CageScenes
 from .look import Look
 from .picture import shading_for
-from .stage import DEFAULT_SIZE, DEFAULT_SPP, variant_in_use
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, variant_in_use
 from .view import DEFAULT_VIEW, View
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.product_patch import product_patch
-from ..evaluation.stencils_together import stencils_together
+from ..evaluation.sample_stencils import stencils_by_signature
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
@@ -144,7 +144,7 @@ def _stencils(
     groups = [classes[begin : begin + step] for begin in range(0, len(classes), step)]
     weights: list[FloatArray] = []
     for group in counted(groups, "Weights of groups of patch classes"):
-        weights += stencils_together(scheme, [each.signature for each in group], uv)
+        weights += stencils_by_signature(scheme, [each.signature for each in group], uv)
     return [
         ClassStencils.of(each, own, uv, controls, product_patch(scheme, each.signature))
         for each, own in zip(classes, weights, strict=True)

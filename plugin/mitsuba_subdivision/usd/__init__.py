@@ -4,14 +4,14 @@ stage_reader.py, stage_walk.py, stage_*.py, polygons.py   read a stage to plain 
 materialx_layers.py, materialx_library.py   the USD layers and the node library of MaterialX
 contents.py                  the plain data
 surface_models.py            models of surfaces, by the inputs that all share
-nodes.py, noise.py, baking.py   nodes of MaterialX, evaluated to numbers or pictures
+materialx_nodes.py, materialx_noise.py, baking.py   nodes of MaterialX, evaluated to numbers or pictures
 copies.py                    replaces many instances by meshes
 bsdfs.py, textures.py, texture_*.py, emitters.py, sensors.py, shapes.py   build scene entries from the data
-entries.py, loaded_shapes.py  combine the entries, for one scene or for frames
+scene_entries.py, loaded_shapes.py   combine the entries, for one scene or for frames
 limit_surfaces.py, rates.py  limit surfaces and their tessellation rates
-staging.py                   adds the studio's camera and lights if the stage has none
+studio_defaults.py           adds the studio's camera and lights if the stage has none
 stage_scenes.py, scene.py    all of it, at one time or in frames
-notes.py                     warnings, one for each kind
+stage_warnings.py            warnings, one for each kind
 """
 
 from .scene import usd_scene

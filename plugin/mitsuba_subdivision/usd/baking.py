@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contents import NodeContents, TextureContents, leaves
-from .nodes import Values, evaluate
+from .materialx_nodes import Values, evaluate
 
 # Pixels along the unit square of what has no picture, and of what has large ones, many times.
 LEAST_PROCEDURAL, MOST = 1024, 4096

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..variants import SceneNode
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
-from .nodes import constant, is_constant, node
-from .notes import Notes
+from .materialx_nodes import constant, is_constant, node
+from .stage_warnings import StageWarnings
 from .surface_models import NEUTRAL, conductor, with_shape
 from .textures import Textures
 
@@ -35,10 +35,10 @@ class Bsdfs:
     Parameters
     ----------
     textures : Textures
-    notes : Notes
+    notes : StageWarnings
     """
 
-    def __init__(self, textures: Textures, notes: Notes) -> None:
+    def __init__(self, textures: Textures, notes: StageWarnings) -> None:
         self._textures = textures
         self._notes = notes
 
@@ -112,7 +112,7 @@ def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode
 class _Values:
     """Inputs as Mitsuba's textures and numbers, for one shape."""
 
-    def __init__(self, textures: Textures, notes: Notes, shape: ShapeContents) -> None:
+    def __init__(self, textures: Textures, notes: StageWarnings, shape: ShapeContents) -> None:
         self._textures, self.notes, self._shape = textures, notes, shape
 
     def for_shape(self, given: Input) -> Input:

@@ -20,7 +20,7 @@ from ..cage.source import CageSource
 from ..files.usd_reader import reversed_order
 from ..mesh.connectivity import IntArray
 from .contents import SceneContents, ShapeContents
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 # Fewer instances cost less than a second in each picture.
 LEAST_INSTANCES = 64
@@ -41,7 +41,12 @@ class _Copies(NamedTuple):
 
 
 def with_copies(
-    contents: SceneContents, rates: Mapping[ShapeContents, IntArray], shading: str, notes: Notes, *, lowest: int = 1
+    contents: SceneContents,
+    rates: Mapping[ShapeContents, IntArray],
+    shading: str,
+    notes: StageWarnings,
+    *,
+    lowest: int = 1,
 ) -> tuple[SceneContents, dict[ShapeContents, int]]:
     """A scene where copies of a shape are one shape, if there are many; and the rates of such shapes.
 
@@ -54,7 +59,7 @@ def with_copies(
     rates : dict of (n,) int array by shape
         Segments on each edge of limit surfaces that their copies need, in the order of ``contents.placed_shapes``.
     shading : "vertex" or "exact"
-    notes : Notes
+    notes : StageWarnings
     lowest : int
     """
     placed = _of_instances(contents, rates)

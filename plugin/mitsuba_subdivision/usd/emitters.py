@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..variants import SceneNode
 from .bsdfs import rgb
 from .contents import LightContents
-from .notes import Notes
+from .stage_warnings import StageWarnings
 from .textures import Textures
 
 # From a dome whose pole is y, as Mitsuba's, to one whose pole is z: y becomes z, and z becomes -y.
@@ -131,7 +131,7 @@ _MAKERS: dict[str, Callable[[LightContents, str, Textures], SceneNode]] = {
 }
 
 
-def one_environment(lights: list[LightContents], notes: Notes) -> list[LightContents]:
+def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[LightContents]:
     """The lights, with one dome at most, as Mitsuba's scenes have one environment: the first with a picture."""
     domes = [light for light in lights if light.kind == "dome"]
     if len(domes) < 2:

@@ -60,7 +60,7 @@ def linear_values(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 
     if pixels.dtype.kind != "u":
         values = pixels.astype(np.float32)
         if is_srgb:
-            color = [place for place, channel in enumerate(channels[: pixels.shape[2]]) if channel < 3]
+            color = [index for index, channel in enumerate(channels[: pixels.shape[2]]) if channel < 3]
             values[..., color] = decoded(values[..., color])
         return values
     most = np.iinfo(pixels.dtype).max

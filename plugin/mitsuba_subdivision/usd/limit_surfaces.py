@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.contents import CageContents
+from ..cage.equality import same, same_topology
 from ..cage.errors import CageError, CageWarning
-from ..cage.sameness import same, same_topology
 from ..progress import counted
 from ..schemes import SchemeError
 from ..studio.model import frame_table
@@ -23,7 +23,7 @@ from ..surface import LimitSurface
 from ..tessellation import VertexTable
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 # From so many faces on, control points stand for the surface, which lies among them and near them: a sphere with 64
 # faces around is smaller than its cage by a six-hundredth of its radius.
@@ -87,7 +87,7 @@ class Surfaces:
         """
         return self._found(contents).surface
 
-    def note_warnings(self, shape: ShapeContents, notes: Notes) -> None:
+    def note_warnings(self, shape: ShapeContents, notes: StageWarnings) -> None:
         """Record the warnings about the cage of a shape, under the shape's name."""
         known = self._found(shape.cage)
         for message in known.warnings:

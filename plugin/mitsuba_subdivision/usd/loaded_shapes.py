@@ -10,15 +10,15 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from ..cage.equality import same, same_topology
 from ..cage.errors import CageError, CageWarning
-from ..cage.sameness import same, same_topology
 from ..studio.animation import set_parameters
 from ..variants import SceneNode
 from .bsdfs import interior
 from .contents import MaterialContents, ShapeContents
 from .limit_surfaces import Surfaces
-from .notes import Notes
 from .shapes import polygon_mesh, subdivision
+from .stage_warnings import StageWarnings
 
 # Fields of a shape that may differ between frames that share an object: a shape can move, and materials are compared
 # themselves.
@@ -60,7 +60,7 @@ class LoadedShapes:
         material: MaterialContents | None,
         bsdf: Callable[[], SceneNode],
         area: SceneNode | None,
-        notes: Notes,
+        notes: StageWarnings,
     ) -> mi.Object:
         """The object of a shape.
 
@@ -72,7 +72,7 @@ class LoadedShapes:
             Makes the entry of its BSDF.
         area : dict or None
             Entry of its emitter.
-        notes : Notes
+        notes : StageWarnings
 
         Raises
         ------
@@ -102,7 +102,7 @@ class LoadedShapes:
         material: MaterialContents | None,
         bsdf: Callable[[], SceneNode],
         area: SceneNode | None,
-        notes: Notes,
+        notes: StageWarnings,
     ) -> mi.Object:
         emitter = None if area is None else mi.load_dict(area)
         if shape.cage.scheme is None:

@@ -13,7 +13,7 @@ from ..cage.contents import CageContents
 from ..cage.source import CageSource
 from ..files.usd_reader import MeshReader, reversed_order
 from ..mesh.connectivity import IntArray
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -24,7 +24,7 @@ AROUND, ALONG = 64, 24
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 
 
-def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArray[np.float64] | None:
+def read_normals(reader: MeshReader, cage: CageContents, notes: StageWarnings) -> NDArray[np.float64] | None:
     """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``, after skinning; None without any.
 
     Parameters
@@ -32,7 +32,7 @@ def read_normals(reader: MeshReader, cage: CageContents, notes: Notes) -> NDArra
     reader : MeshReader
     cage : CageContents
         Contents of the mesh, in its own space.
-    notes : Notes
+    notes : StageWarnings
     """
     from pxr import UsdGeom
 

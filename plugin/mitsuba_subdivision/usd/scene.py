@@ -9,7 +9,7 @@ from typing import Any
 from ..studio.animation import StillPicture
 from ..studio.look import Look
 from ..studio.polygon_mesh import with_meshes
-from ..studio.stage import DEFAULT_SPP
+from ..studio.studio_entries import DEFAULT_SPP
 from ..studio.view import DEFAULT_VIEW, View
 from ..variants import SceneNode, variant_set
 from .stage_scenes import StageScenes

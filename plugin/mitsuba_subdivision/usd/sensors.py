@@ -7,17 +7,17 @@ import math
 import mitsuba as mi
 import numpy as np
 
-from ..studio.stage import sampler
+from ..studio.studio_entries import sampler
 from ..variants import SceneNode
 from .contents import CameraContents
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 _LEAST_NEAR = 1e-6
 # What a single scene leaves out of a camera.
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
 
 
-def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes) -> SceneNode:
+def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: StageWarnings) -> SceneNode:
     """A sensor whose film covers at least the camera's aperture.
 
     Parameters
@@ -26,7 +26,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Notes
     size : (width, height)
         Of the film, in pixels. Where it is wider or higher than the aperture, more is seen.
     spp : int
-    notes : Notes
+    notes : StageWarnings
     """
     width, height = size
     wide = max(camera.aperture[0], camera.aperture[1] * width / height)

@@ -18,7 +18,7 @@ from ..studio.polygon_mesh import PolygonMesh
 from ..variants import SceneNode
 from .contents import ShapeContents
 from .limit_surfaces import Surfaces
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 
 def subdivision(
@@ -27,7 +27,7 @@ def subdivision(
     bsdf: SceneNode | None,
     emitter: SceneNode | mi.Object | None,
     parameters: dict[str, Any],
-    notes: Notes,
+    notes: StageWarnings,
 ) -> SceneNode:
     """A limit surface.
 
@@ -39,7 +39,7 @@ def subdivision(
     bsdf, emitter : dict, mi.Object or None
     parameters : dict
         Of the shape ``subdivision``.
-    notes : Notes
+    notes : StageWarnings
 
     Raises
     ------

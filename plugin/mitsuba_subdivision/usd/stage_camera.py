@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contents import CameraContents
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -18,7 +18,7 @@ TENTHS = 0.1
 
 
 def read_camera(
-    camera: UsdGeom.Camera, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: Notes
+    camera: UsdGeom.Camera, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> CameraContents:
     """Read a camera.
 
@@ -28,7 +28,7 @@ def read_camera(
     to_world : (4, 4) float64
         For column vectors. Scales are left out, as USD's own frustum of a camera has none.
     time : Usd.TimeCode
-    notes : Notes
+    notes : StageWarnings
     """
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contents import LightContents
-from .notes import Notes
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -44,7 +44,9 @@ _NEUTRAL = {
 }
 
 
-def read_light(prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: Notes) -> LightContents | None:
+def read_light(
+    prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
+) -> LightContents | None:
     """Read a light; None if its kind is not supported.
 
     Parameters
@@ -53,7 +55,7 @@ def read_light(prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode
     to_world : (4, 4) float64
         For column vectors.
     time : Usd.TimeCode
-    notes : Notes
+    notes : StageWarnings
     """
     path, given = prim.GetPath(), str(prim.GetTypeName())
     kind = KINDS.get(given)
@@ -95,7 +97,7 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
     return usual if value is None else value
 
 
-def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> None:
+def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> None:
     for name, neutral in _NEUTRAL.items():
         value = _value(prim, name, time, neutral)
         if value != neutral and not (name == "inputs:shaping:cone:angle" and value >= 90):
@@ -113,7 +115,7 @@ def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> None:
             notes.add("light and shadow links are ignored; lights illuminate all shapes", prim.GetPath())
 
 
-def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: Notes) -> str | None:
+def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | None:
     asset = _value(prim, "inputs:texture:file", time, None)
     if asset is None or not asset.path:
         return None

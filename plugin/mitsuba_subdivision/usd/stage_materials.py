@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.sameness import same
+from ..cage.equality import same
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
-from .notes import Notes
 from .stage_networks import NetworkReader
+from .stage_warnings import StageWarnings
 from .surface_models import MODELS, PREVIEW, left_out
 from .texture_image import UDIM
 
@@ -31,7 +31,7 @@ class MaterialReader:
     Parameters
     ----------
     time : Usd.TimeCode
-    notes : Notes
+    notes : StageWarnings
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class MaterialReader:
         Of those that are equal, the first.
     """
 
-    def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
+    def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time = time
         self._notes = notes
         self._networks = NetworkReader(time, notes)

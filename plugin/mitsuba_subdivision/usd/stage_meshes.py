@@ -17,10 +17,10 @@ from ..files.usd_skinning import Skinning
 from ..files.usd_stage import usd_errors_at
 from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
-from .notes import Notes
 from .polygons import GPRIMS, read_gprim, read_normals
 from .stage_lights import read_emission
 from .stage_materials import MaterialReader
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -42,11 +42,11 @@ class ShapeReader:
     code : Usd.TimeCode
         The same time, for all but the cage.
     materials : MaterialReader
-    notes : Notes
+    notes : StageWarnings
     """
 
     def __init__(
-        self, name: str, time: float | None, code: Usd.TimeCode, materials: MaterialReader, notes: Notes
+        self, name: str, time: float | None, code: Usd.TimeCode, materials: MaterialReader, notes: StageWarnings
     ) -> None:
         self._name = name
         self._time = time
@@ -69,26 +69,26 @@ class ShapeReader:
         CageWarning
             If it cannot be used.
         """
-        place = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
+        location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
         try:
             if not is_invertible(to_world):
-                raise CageError(f"{place}: the transform to world space is not invertible; expected one that is")
-            with usd_errors_at(place), np.errstate(over="ignore", invalid="ignore"):
+                raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
+            with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
                 if str(prim.GetTypeName()) in GPRIMS:
                     cage, normals = read_gprim(prim, self._code)
                     return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
-                return self._parts(prim, to_world, place)
+                return self._parts(prim, to_world, location)
         except (CageError, TypeError, ValueError) as error:
             # Values of another type than the schema's.
-            message = str(error) if isinstance(error, CageError) else f"{place}: {error}"
+            message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
             self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
             return []
 
-    def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], place: str) -> list[ShapeContents]:
+    def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
-        reader = MeshReader(mesh, place, self._time, self._skinning)
+        reader = MeshReader(mesh, location, self._time, self._skinning)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
         materials, owner = self._materials_of_faces(mesh, reader)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ..srgb import decoded
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_library import library, numbers
-from .nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
-from .notes import Notes
+from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
+from .stage_warnings import StageWarnings
 from .texture_image import UDIM
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ class NetworkReader:
     Parameters
     ----------
     time : Usd.TimeCode
-    notes : Notes
+    notes : StageWarnings
     """
 
-    def __init__(self, time: Usd.TimeCode, notes: Notes) -> None:
+    def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time = time
         self._notes = notes
         self._known: dict[tuple[str, str], Input | None] = {}
@@ -99,9 +99,9 @@ class NetworkReader:
         space = "sRGB" if self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()) else "raw"
         return TextureContents(path, "rgba", space, "repeat", [1.0] * 4, [0.0] * 4, np.eye(3), "st", [0.0] * 4)
 
-    def _is_srgb(self, space: str, place: object) -> bool:
+    def _is_srgb(self, space: str, prim: object) -> bool:
         if space not in _IS_SRGB:
-            self._notes.add(f'the colour space "{space}" is ignored; colours are read as linear Rec. 709', place)
+            self._notes.add(f'the colour space "{space}" is ignored; colours are read as linear Rec. 709', prim)
         return _IS_SRGB.get(space, False)
 
     def _output(self, shader: UsdShade.Shader, output: str) -> Input | None:
@@ -121,15 +121,15 @@ class NetworkReader:
                 )
         return self._known[key]
 
-    def _leave(self, what: str, place: object) -> None:
-        self._notes.add(f"MaterialX nodes {what} are ignored; their first input is used instead, or 0", place)
+    def _leave(self, what: str, prim: object) -> None:
+        self._notes.add(f"MaterialX nodes {what} are ignored; their first input is used instead, or 0", prim)
 
     def _made(
         self,
         definition: MaterialX.NodeDef,
         output: str,
         input_of: Callable[[MaterialX.Input], Input | None],
-        place: object,
+        prim: object,
     ) -> Input | None:
         """What a node computes of its inputs: an expression of primitive nodes."""
         import MaterialX
@@ -143,17 +143,17 @@ class NetworkReader:
         implementation = definition.getImplementation()
         is_known = category in OPERATIONS or category in SAMPLED or category in _SPECIAL
         if isinstance(implementation, MaterialX.NodeGraph) and category not in ("convert",) and not is_known:
-            return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, place)
+            return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, prim)
         # Slopes are those along texture coordinates.
         unused = {"texcoord"} if category == "heighttonormal" else set()
         given = {each.getName(): input_of(each) for each in declared if each.getName() not in unused}
         if category in _SPECIAL:
-            return _SPECIAL[category](self, kind, given, place)
+            return _SPECIAL[category](self, kind, given, prim)
         if kind not in CHANNELS or not is_known or any(value is None for value in given.values()):
-            self._leave(f'"{category}"', place)
+            self._leave(f'"{category}"', prim)
             return next((value for name, value in given.items() if name.startswith("in") and value is not None), 0.0)
         if self._size(given) > _MOST_NODES:
-            self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", place)
+            self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", prim)
             return 0.0
         there = {name: value for name, value in given.items() if value is not None}
         made = node(category, kind, **{"in_" if name == "in" else name: value for name, value in there.items()})
@@ -165,7 +165,7 @@ class NetworkReader:
         return sum(self._sizes.get(id(each), 1) for each in given.values() if not is_constant(each))
 
     def _expanded(
-        self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], place: object
+        self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], prim: object
     ) -> Input | None:
         """What a graph of the library computes."""
         made: dict[tuple[str, str], Input | None] = {}
@@ -180,7 +180,7 @@ class NetworkReader:
             if key not in made:
                 inner = graph.getNode(name)
                 definition = inner.getNodeDef("", True)
-                made[key] = self._made(definition, key[1] or "out", lambda each: of_input(inner, each), place)
+                made[key] = self._made(definition, key[1] or "out", lambda each: of_input(inner, each), prim)
             return made[key]
 
         def of_input(inner: MaterialX.Node, declared: MaterialX.Input) -> Input | None:
@@ -189,26 +189,26 @@ class NetworkReader:
 
         return of_port(graph.getOutput(output) or graph.getOutputs()[0])
 
-    def _image(self, kind: str, given: dict[str, Input | None], place: object) -> Input:
-        """A picture; a node if its place is no affine function of texture coordinates."""
+    def _image(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
+        """A picture; a node if its coordinates are no affine function of texture coordinates."""
         file, fallback, where = given["file"], given.get("default"), given["texcoord"]
         width = CHANNELS[kind]
         usual = np.zeros(4)
         if isinstance(fallback, (int, float, list)):
             usual[: np.size(fallback)] = fallback
         if not isinstance(file, TextureContents) or not file.file:
-            self._notes.add("textures without a file are replaced by their default", place)
+            self._notes.add("textures without a file are replaced by their default", prim)
             return float(usual[0]) if width == 1 else usual[:width].tolist()
         modes = [given.get(f"{axis}addressmode") for axis in "uv"]
         if modes[0] != modes[1]:
-            self._notes.add("vaddressmode of textures is ignored; uaddressmode is used for both", place)
+            self._notes.add("vaddressmode of textures is ignored; uaddressmode is used for both", prim)
         if "constant" in modes:
-            self._notes.add('textures with the address mode "constant" are clamped', place)
+            self._notes.add('textures with the address mode "constant" are clamped', prim)
         texture = replace(
             file, channel="rgba"[:width], wrap=_WRAPS.get(str(modes[0]), "repeat"), fallback=usual.tolist()
         )
         if where is None or is_constant(where):
-            # Of one place.
+            # Constant coordinates: one texel.
             matrix = np.zeros((3, 3))
             matrix[:2, 2], matrix[2, 2] = 0.0 if where is None else constant(where), 1
             return replace(texture, to_uv=matrix)
@@ -222,7 +222,7 @@ class NetworkReader:
                 return replace(texture, to_uv=matrix_or_none, texcoords=names.pop())
         return NodeContents("image", kind, {"file": texture, "texcoord": where})
 
-    def _attribute(self, kind: str, given: dict[str, Input | None], _place: object) -> Input:
+    def _attribute(self, kind: str, given: dict[str, Input | None], _prim: object) -> Input:
         """An attribute of the mesh; texture coordinates if it has two components."""
         name, fallback = given["geomprop"], given.get("default")
         if kind == "vector2":
@@ -231,10 +231,10 @@ class NetworkReader:
         usual = fallback if isinstance(fallback, (int, float, list)) else 0.0
         return PrimvarContents(str(name), constant(usual, width).tolist())
 
-    def _color(self, kind: str, _given: dict[str, Input | None], _place: object) -> Input:
+    def _color(self, kind: str, _given: dict[str, Input | None], _prim: object) -> Input:
         return PrimvarContents("displayColor", [0.0] * CHANNELS[kind])
 
-    def _normal(self, _kind: str, given: dict[str, Input | None], _place: object) -> Input | None:
+    def _normal(self, _kind: str, given: dict[str, Input | None], _prim: object) -> Input | None:
         """A normal map in tangent space, from -1 to 1."""
         picture, scale = given["in"], given["scale"]
         if picture is None or scale is None or is_constant(picture):

@@ -19,19 +19,19 @@ from ..studio.animation import load_quietly
 from ..studio.frame_files import FrameFiles
 from ..studio.look import Look
 from ..studio.picture import MOST_SEGMENTS, outline_for, shading_for
-from ..studio.stage import variant_in_use
+from ..studio.studio_entries import variant_in_use
 from ..studio.view import View
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies
-from .entries import Entries
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
-from .notes import Notes
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
+from .scene_entries import SceneEntries
 from .sensors import NO_BLUR, sensor
 from .stage_reader import StageReader
-from .staging import angles_for, size_for, staged
+from .stage_warnings import StageWarnings
+from .studio_defaults import angles_for, size_for, with_studio_defaults
 from .texture_detail import texels_for_picture
 
 
@@ -146,26 +146,26 @@ class StageScenes:
         CageError
             If no mesh can be used.
         """
-        notes, rest, parameters = Notes(), None, self._parameters
+        notes, rest, parameters = StageWarnings(), None, self._parameters
         triangles: dict[ShapeContents, dict[str, Any]] = {}
         needed: dict[str, float] = {}
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
-            rest = staged(contents, points, self._is_lit, self._look, notes)
+            rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes)
         if rest is None or not is_one_picture:
             contents, parameters = self._with_copies(contents, notes)
         else:
             contents, triangles, needed = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
         size = self._look.texture_size
-        made = Entries(contents, notes, parameters, self._surfaces, triangles, needed, size)
+        made = SceneEntries(contents, notes, parameters, self._surfaces, triangles, needed, size)
         notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
         return {**made.scene, **rest}
 
     def _for_picture(
-        self, contents: SceneContents, sensor: SceneNode, notes: Notes, follows_sensor: bool
+        self, contents: SceneContents, sensor: SceneNode, notes: StageWarnings, follows_sensor: bool
     ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]], dict[str, float]]:
         """Contents with copies, and the triangles and the texels that a picture needs."""
         seen = outline_for(sensor), sensor["near_clip"]
@@ -181,7 +181,7 @@ class StageScenes:
         triangles = triangles_for_picture(contents, segments, seen[0], self._parameters, follows_sensor=follows_sensor)
         return contents, triangles | {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}, needed
 
-    def _with_copies(self, contents: SceneContents, notes: Notes) -> tuple[SceneContents, dict[str, Any]]:
+    def _with_copies(self, contents: SceneContents, notes: StageWarnings) -> tuple[SceneContents, dict[str, Any]]:
         """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
         if mi.Float is float:
             return contents, self._parameters
@@ -206,12 +206,12 @@ class StageScenes:
         """
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
-        shapes = LoadedShapes(self._with_copies(first, Notes())[1])
+        shapes = LoadedShapes(self._with_copies(first, StageWarnings())[1])
         for number, delay in product(numbers, self._delays(first)):
-            notes = Notes()
+            notes = StageWarnings()
             contents, _ = self._with_copies(self._read(number, delay) if delay else self.at(number), notes)
             shapes.begin_frame()
-            made = Entries(
+            made = SceneEntries(
                 contents,
                 notes,
                 self._parameters,
@@ -219,7 +219,7 @@ class StageScenes:
                 texture_size=self._look.texture_size,
                 loaded=shapes,
             )
-            rest = staged(first, points, self._is_lit, self._look, notes)
+            rest = with_studio_defaults(first, points, self._is_lit, self._look, notes)
             if contents.camera is not None:
                 rest["sensor"] = sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
             notes.warn(self.name, self._warned)

@@ -21,12 +21,12 @@ from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messag
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
-from .notes import Notes
 from .polygons import GPRIMS
 from .stage_camera import read_camera
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
+from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -109,7 +109,7 @@ def open_checked(path: str | Path) -> Usd.Stage:
 
 def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str | None) -> SceneContents:
     """Read a stage that is open; see `read_stage`."""
-    notes = Notes()
+    notes = StageWarnings()
     with usd_errors_at(name), usd_messages_of(name), timed("Reading") as at:
         contents = _StageWalk(stage, name, time, notes, at).contents(camera)
     notes.warn(name)
@@ -118,7 +118,7 @@ def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str
 
 class _StageWalk:
     def __init__(
-        self, stage: Usd.Stage, name: str, time: float | None, notes: Notes, at: Callable[[str], None]
+        self, stage: Usd.Stage, name: str, time: float | None, notes: StageWarnings, at: Callable[[str], None]
     ) -> None:
         from pxr import Usd, UsdGeom
 
@@ -183,8 +183,8 @@ class _StageWalk:
                 try:
                     self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
                 except (CageError, TypeError, ValueError) as error:
-                    place = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
-                    message = str(error) if isinstance(error, CageError) else f"{place}{error}"
+                    location = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
+                    message = str(error) if isinstance(error, CageError) else f"{location}{error}"
                     self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
             elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
                 kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
@@ -299,11 +299,11 @@ class _StageWalk:
         firsts = [samples[0] for samples in (each.GetTimeSamples() for each in moving) if samples]
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
-    def _is_invertible(self, matrix: NDArray[np.float64], place: object) -> bool:
+    def _is_invertible(self, matrix: NDArray[np.float64], prim: object) -> bool:
         """Whether a transform is invertible; records a problem if it is not."""
         if is_invertible(matrix):
             return True
-        self._notes.add(_SINGULAR, place)
+        self._notes.add(_SINGULAR, prim)
         return False
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:

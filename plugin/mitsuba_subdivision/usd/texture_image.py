@@ -97,8 +97,8 @@ def _tiles(path: str) -> dict[tuple[int, int], str]:
 
 def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
     """One image of all tiles; smaller ones are enlarged to the size of the largest."""
-    places = np.array(list(tiles))
-    first, (columns, rows) = places.min(axis=0), np.ptp(places, axis=0) + 1
+    uv = np.array(list(tiles))
+    first, (columns, rows) = uv.min(axis=0), np.ptp(uv, axis=0) + 1
     height, width, channels = np.max([each.shape for each in tiles.values()], axis=0)
     dtype = max((each.dtype for each in tiles.values()), key=lambda each: (each.kind == "f", each.itemsize))
     pixels = np.zeros((rows, height, columns, width, channels), dtype=dtype)

@@ -16,8 +16,8 @@ from ..variants import SceneNode
 from .baking import Baked, baked
 from .contents import NodeContents, TextureContents, leaves
 from .image_reduction import linear_values
-from .nodes import affine
-from .notes import Notes
+from .materialx_nodes import affine
+from .stage_warnings import StageWarnings
 from .texture_image import TextureImage, is_srgb_image, read_texture_image, with_alpha
 
 # From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
@@ -29,14 +29,16 @@ class Textures:
 
     Parameters
     ----------
-    notes : Notes
+    notes : StageWarnings
     needed : dict of float by file, optional
         Pixels along the sides of textures of materials that a picture shows; see `texels_for_picture`.
     most : int, optional
         Pixels along their sides at most.
     """
 
-    def __init__(self, notes: Notes, needed: Mapping[str, float] | None = None, most: int | None = None) -> None:
+    def __init__(
+        self, notes: StageWarnings, needed: Mapping[str, float] | None = None, most: int | None = None
+    ) -> None:
         self._notes, self._needed, self._most = notes, needed or {}, most
         self._pictures: dict[str, TextureImage | None] = {}
         # In eight bits, by file, channel and whether they are decoded.

@@ -18,7 +18,7 @@ from ...variants import Variant
 
 _ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)
 # Results that the answers return.
-_PLACE, _VALUE = (8, 9), (10, 11, 12)
+_ANSWERED_UV, _VALUE = (8, 9), (10, 11, 12)
 _ATTRIBUTES = {"face_one": 1, "face_three": 3}
 
 
@@ -46,7 +46,7 @@ class Trial:
         if self.fails:
             raise TrialError
         self.asked = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
-        si.uv = self._variant.Point2f(*_PLACE)
+        si.uv = self._variant.Point2f(*_ANSWERED_UV)
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value:
         """Note the arguments, and answer."""
@@ -70,13 +70,13 @@ def trial_problem(variant: Variant, attach: Callable[[mi.Mesh, Trial], None]) ->
     ray = variant.Ray3f(variant.Point3f(*_ORIGIN), variant.Vector3f(*_DIRECTION))
     preliminary = dr.zeros(variant.PreliminaryIntersection3f)
     preliminary.t, preliminary.prim_uv = variant.Float(_DISTANCE), variant.Point2f(*_UV)
-    flags, active, place = int(mi.RayFlags.UV), variant.Mask(True), variant.Point2f(*_PLACE)
+    flags, active, answered = int(mi.RayFlags.UV), variant.Mask(True), variant.Point2f(*_ANSWERED_UV)
 
     def interaction() -> mi.SurfaceInteraction3f:
         return shape.compute_surface_interaction(ray, preliminary, flags, active)
 
     expected = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
-    if _identity(interaction().uv) != _identity(place) or trial.asked != expected:
+    if _identity(interaction().uv) != _identity(answered) or trial.asked != expected:
         return "compute_surface_interaction does not pass on its arguments, or its result"
     questions: list[Callable[[], Any]] = [interaction]
     if dr.is_jit_v(variant.Float):

@@ -19,13 +19,13 @@ from .contents import SceneContents, ShapeContents
 from .emitters import emitter, one_environment
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
-from .notes import Notes
 from .shapes import polygon_mesh, subdivision
-from .staging import RESERVED
+from .stage_warnings import StageWarnings
+from .studio_defaults import RESERVED
 from .textures import Textures
 
 
-class Entries:
+class SceneEntries:
     """Scene entries of a stage, without those of a studio.
 
     Limit surfaces are entries of the shape ``subdivision``, polygon meshes those of `PolygonMesh`.
@@ -33,7 +33,7 @@ class Entries:
     Parameters
     ----------
     contents : SceneContents
-    notes : Notes
+    notes : StageWarnings
     parameters : dict
         Of every shape ``subdivision``; see `with_rate`.
     surfaces : Surfaces
@@ -55,7 +55,7 @@ class Entries:
     def __init__(
         self,
         contents: SceneContents,
-        notes: Notes,
+        notes: StageWarnings,
         parameters: dict[str, Any],
         surfaces: Surfaces,
         triangles: Mapping[ShapeContents, dict[str, Any]] | None = None,

@@ -98,7 +98,7 @@ BARE = MOVING + STILL + TINTED + INSTANCES
 WHOLE = BARE + FLOOR + LAMP + SKY + CAMERA
 
 
-def write(folder, text, name="film.usda"):
+def write(folder, text, name="moving.usda"):
     """Write a stage, with the pictures that it may name beside it."""
     tiles = np.full((8, 8, 3), 200, np.uint8)
     tiles[:2, :3] = [220, 60, 40]

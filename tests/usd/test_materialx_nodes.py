@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision.usd import baking
 from mitsuba_subdivision.usd.baking import baked
 from mitsuba_subdivision.usd.contents import NodeContents, TextureContents, leaves
-from mitsuba_subdivision.usd.nodes import evaluate, node, operation
+from mitsuba_subdivision.usd.materialx_nodes import evaluate, node, operation
 
 UV = NodeContents("texcoord", "vector2", {"name": "st"})
 

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..studio.look import Look
-from ..studio.stage import DEFAULT_SIZE, LIGHTS, studio
+from ..studio.studio_entries import DEFAULT_SIZE, LIGHTS, studio
 from ..studio.view import View
 from ..variants import SceneNode
 from .bsdfs import integrator, rgb
 from .contents import CameraContents, SceneContents
-from .notes import Notes
 from .sensors import sensor
+from .stage_warnings import StageWarnings
 
 # Of pictures by a stage's camera.
 WIDTH = 640
@@ -42,7 +42,9 @@ def angles_for(contents: SceneContents, look: Look) -> View:
     return look.view if contents.camera is None else _angles(contents.camera, contents.up)
 
 
-def staged(contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: Notes) -> SceneNode:
+def with_studio_defaults(
+    contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: StageWarnings
+) -> SceneNode:
     """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene.
 
     Parameters
@@ -53,7 +55,7 @@ def staged(contents: SceneContents, points: NDArray[np.float64], is_lit: bool, l
     is_lit : bool
         Whether the stage has lights.
     look : Look
-    notes : Notes
+    notes : StageWarnings
     """
     camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])

@@ -31,7 +31,7 @@ from .refined_rings import RingMesh
 KEPT_WEIGHTS = 1 << 17
 
 
-def stencils_together(scheme: Scheme, signatures: Sequence[Signature], uv: FloatArray) -> list[FloatArray]:
+def stencils_by_signature(scheme: Scheme, signatures: Sequence[Signature], uv: FloatArray) -> list[FloatArray]:
     """`element_stencils` of the same samples on elements of several signatures, seen from their first corners.
 
     Parameters
@@ -66,7 +66,7 @@ def _kept_stencils(scheme: Scheme, signatures: tuple[Signature, ...], uv: bytes)
 def stencils_of_samples(
     scheme: Scheme, signatures: Sequence[Signature], counts: Sequence[int], uv: FloatArray
 ) -> list[FloatArray]:
-    """As `stencils_together`, of other samples on each element.
+    """As `stencils_by_signature`, of other samples on each element.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def stencils_of_samples(
 
 
 def _same_samples(scheme: Scheme, elements: list[DividedElement], uv: FloatArray) -> list[FloatArray]:
-    """`stencils_together`; elements that occur several times are evaluated once."""
+    """`stencils_by_signature`; elements that occur several times are evaluated once."""
     different = list(dict.fromkeys(elements))
     element, local = np.repeat(np.arange(len(different)), len(uv)), np.tile(uv, (len(different), 1))
     found = dict(zip(different, _stencils(scheme, different, element, local), strict=True))

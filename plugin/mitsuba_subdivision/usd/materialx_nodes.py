@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.sameness import same
-from . import noise
+from ..cage.equality import same
+from . import materialx_noise as noise
 from .contents import Input, NodeContents, PrimvarContents, TextureContents
 
 Values = NDArray[np.floating]

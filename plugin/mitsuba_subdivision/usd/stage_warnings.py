@@ -12,7 +12,7 @@ _SHOWN, _LENGTH = 3, 200
 _DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
 
-class Notes:
+class StageWarnings:
     """Kinds of problems, and the affected prims."""
 
     def __init__(self) -> None:

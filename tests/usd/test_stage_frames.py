@@ -18,7 +18,7 @@ from mitsuba_subdivision.usd import loaded_shapes
 from mitsuba_subdivision.usd.limit_surfaces import Surfaces
 from mitsuba_subdivision.usd.stage_reader import StageReader
 from mitsuba_subdivision.usd.stage_scenes import StageScenes
-from usd.film_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
+from usd.moving_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
 
 pytest.importorskip("pxr")
 
@@ -92,8 +92,8 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
     )
     path = write(tmp_path, WHOLE)
     times = (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
-    film = frame_range(path, range(1, 6, 2))
-    found = [pixels(loaded) for loaded in film.frames(times, "box")]
+    moving = frame_range(path, range(1, 6, 2))
+    found = [pixels(loaded) for loaded in moving.frames(times, "box")]
     assert made == {"/moving": 1, "/still": 1, "/tinted": 1, "/ball": 1}
     for time, picture in zip(times, found, strict=True):
         np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
@@ -114,8 +114,8 @@ def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
         + STILL.replace("displayColor = [(.1,.2,.7)]", "displayColor.timeSamples = {1: [(1,0,0)], 5: [(0,1,0)]}")
         + MOVING
     )
-    film = frame_range(write(tmp_path, text), range(1, 6, 2))
-    scenes = list(film.frames([1, 3, 5], "box"))
+    moving = frame_range(write(tmp_path, text), range(1, 6, 2))
+    scenes = list(moving.frames([1, 3, 5], "box"))
     shapes = [len(each.scene.shapes()) for each in scenes]
     assert shapes[1] == shapes[0] + 1
     assert len({str(mi.traverse(each.scene)["sensor.to_world"]) for each in scenes}) == 1
@@ -130,7 +130,7 @@ def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
 def test_a_saved_stage_renders_to_the_same_picture(tmp_path, request, variant):
     request.getfixturevalue(f"variant_{variant}")
     path = write(tmp_path, WHOLE)
-    written = save_scene(StillPicture(StageScenes(path, LOOK, RATE, time=2)).scene, tmp_path / "saved" / "film.xml")
+    written = save_scene(StillPicture(StageScenes(path, LOOK, RATE, time=2)).scene, tmp_path / "saved" / "moving.xml")
     suffixes = Counter(each.suffix for each in written)
     assert suffixes == {".obj": 3, ".ply": 2, ".png": 1, ".exr": 2, ".xml": 1}
     np.testing.assert_allclose(pixels(load_scene(written[-1], None, "box")), alone(path, 2), atol=1e-5)
@@ -142,10 +142,10 @@ def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys)
     write(tmp_path, BARE)
     small = ["--size", "16x12", "--spp", "1", "--rate", "2", "-m", "scalar_rgb"]
     assert (
-        main(["render", "film.usda", "-o", "turn.png", "--turntable", "2", "--save-scene", "s/film.xml", *small]) == 0
+        main(["render", "moving.usda", "-o", "turn.png", "--turntable", "2", "--save-scene", "s/one.xml", *small]) == 0
     )
-    assert main(["render", "film.usda", "-o", "f.png", "--frames", "1:5:4", *small]) == 0
-    assert main(["render", "s/film.xml", "-o", "again.png", "-m", "scalar_rgb"]) == 0
+    assert main(["render", "moving.usda", "-o", "f.png", "--frames", "1:5:4", *small]) == 0
+    assert main(["render", "s/one.xml", "-o", "again.png", "-m", "scalar_rgb"]) == 0
     first, second, third, again = (
         np.array(mi.Bitmap(name)).astype(int) for name in ("turn_0001.png", "turn_0002.png", "f_0005.png", "again.png")
     )
@@ -167,8 +167,8 @@ def test_warnings_of_all_frames_are_told_once(tmp_path):
     path = write(tmp_path, mesh("fin", fin) + 'def BasisCurves "hair" {}\n' + LAMP)
     with warnings.catch_warnings(record=True) as record:
         warnings.simplefilter("always", CageWarning)
-        film = frame_range(path, range(1, 3))
-        assert len([*film.frames([1, 2], "box")]) == 2
+        moving = frame_range(path, range(1, 3))
+        assert len([*moving.frames([1, 2], "box")]) == 2
     messages = sorted((str(each.message) for each in record), key=len)
     assert len(messages) == 2
     assert "BasisCurves are ignored (/hair)" in messages[0]

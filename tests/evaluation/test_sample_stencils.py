@@ -7,11 +7,11 @@ import pytest
 from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.evaluation import stencils_together as module
+from mitsuba_subdivision.evaluation import sample_stencils as module
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.stencils_together import stencils_together
+from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
 from mitsuba_subdivision.schemes import SchemeError
 from reference.refined_cages import tagged
 
@@ -39,7 +39,7 @@ def grid(scheme, rate):
 def test_stencils_of_all_signatures_are_those_of_each(name, rate):
     scheme, signatures = classes(surface_named(name))
     uv = grid(scheme, rate)
-    for signature, found in zip(signatures, stencils_together(scheme, signatures, uv), strict=True):
+    for signature, found in zip(signatures, stencils_by_signature(scheme, signatures, uv), strict=True):
         expected = element_stencils(scheme, signature, uv)
         np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDED * np.abs(expected).max())
         np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
@@ -48,8 +48,8 @@ def test_stencils_of_all_signatures_are_those_of_each(name, rate):
 def test_signatures_may_come_more_than_once():
     scheme, signatures = classes(surface_named("mixed torus"))
     uv = grid(scheme, 3)
-    once = stencils_together(scheme, signatures, uv)
-    twice = stencils_together(scheme, signatures * 2, uv)
+    once = stencils_by_signature(scheme, signatures, uv)
+    twice = stencils_by_signature(scheme, signatures * 2, uv)
     assert len(twice) == 2 * len(once)
     for found, expected in zip(twice, once * 2, strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -74,7 +74,7 @@ def test_samples_in_equal_parts_go_on_as_one():
 def test_small_stencils_are_kept_and_large_ones_are_not():
     scheme, signatures = classes(surface_named("mixed torus"))
     for rate, is_kept in ((2, True), (80, False)):
-        first, second = (stencils_together(scheme, signatures, grid(scheme, rate)) for _ in range(2))
+        first, second = (stencils_by_signature(scheme, signatures, grid(scheme, rate)) for _ in range(2))
         assert [one is other for one, other in zip(first, second, strict=True)] == [is_kept] * len(signatures)
         for one, other in zip(first, second, strict=True):
             np.testing.assert_array_equal(one, other)
@@ -91,7 +91,7 @@ def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
     element_of.cache_clear()
     try:
         with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
-            stencils_together(scheme, signatures, np.array([[0.0, 1e-30]]))
+            stencils_by_signature(scheme, signatures, np.array([[0.0, 1e-30]]))
     finally:
         element_of.cache_clear()
 
@@ -102,4 +102,4 @@ def test_elements_may_have_samples_of_their_own():
     uv = [grid(scheme, rate) for rate in range(1, len(signatures) + 1)]
     found = module.stencils_of_samples(scheme, signatures, [len(own) for own in uv], np.concatenate(uv))
     for own, signature, stencils in zip(uv, signatures, found, strict=True):
-        np.testing.assert_allclose(stencils, stencils_together(scheme, [signature], own)[0], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(stencils, stencils_by_signature(scheme, [signature], own)[0], rtol=0, atol=1e-14)
