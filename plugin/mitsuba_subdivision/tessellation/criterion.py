@@ -229,22 +229,6 @@ class Criterion:
         furthest = SQUARE_ERROR * np.sqrt(dot(second, second).max(axis=0))
         return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
 
-    def is_flat(
-        self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray
-    ) -> NDArray[np.bool_]:
-        """``(t,)`` whether triangles between the corners suffice for surfaces inside boxes and between two planes.
-
-        Parameters
-        ----------
-        lower, upper : (3, t) float64
-        heights : (t,) float64
-            Distance of the planes.
-        limit : (t,) float64
-        """
-        if self.measure is Measure.EDGE:
-            return np.linalg.norm(upper - lower, axis=0) <= limit
-        return heights <= limit
-
 
 def _isotropic(values: FloatArray) -> FloatArray:
     return np.stack([values, np.zeros_like(values), np.zeros_like(values)])

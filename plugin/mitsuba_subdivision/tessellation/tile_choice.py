@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.bernstein import times
 from ..evaluation.divided_element import divided_elements
-from ..evaluation.divided_tile import DividedTile, part_of_tile
+from ..evaluation.divided_tile import part_of_tile
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
@@ -18,9 +18,10 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme_members import optional_member
 from .criterion import Criterion
 from .feature_edges import feature_edges, sides_on
-from .flat_tiles import PatchGroup, TileGroup, are_flat, have_flat_rings
+from .flat_tiles import PatchGroup, are_flat, have_flat_rings
 from .patch_frames import PatchFrames
 from .spans import joined
+from .tile_extents import TileParts, alike
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
@@ -154,7 +155,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
     scheme = rates.scheme
     flat: list[Tiles] = [tiles[:0]]
     pieces: list[tuple[Tiles, FloatArray]] = [(tiles[:0], np.empty((len(rates.basis.indices), 3, 0)))]
-    waiting: list[TileGroup] = []
+    waiting: list[TileParts] = []
     for each, element in zip(patches, divided_elements(scheme, [own.signature for own in patches]), strict=True):
         every = np.eye(element.control_count)
         tile, rows = part_of_tile(element, every)
@@ -162,14 +163,14 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
         if tile is None:
             pieces.append((tiles[each.at], points))
         else:
-            waiting.append(TileGroup(tile, each.at, points))
+            waiting.append(TileParts(tile, points, each.at))
     while waiting:
-        tiles, waiting = _numbered(tiles, _alike(waiting))
+        tiles, waiting = _numbered(tiles, alike(waiting))
         # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
         is_done = are_flat(rates, tiles, waiting) | (tiles.depth >= DEEPEST - 1)
         for group in waiting:
             if not group.tile.is_self_similar:
-                is_done[group.at] |= tiles.most[group.at] == 1
+                is_done[group.owner] |= tiles.most[group.owner] == 1
         flat.append(tiles[is_done])
         index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
         children = [tiles.child(number, scheme.domain) for number in range(4)]
@@ -177,12 +178,12 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
         divided, waiting = waiting, []
         of_pieces, coefficients = [], []
         for group in divided:
-            if is_done[group.at].all():
+            if is_done[group.owner].all():
                 continue
-            rest = group.chosen(~is_done[group.at])
-            parents = index[rest.at]
+            rest = group.chosen(~is_done[group.owner])
+            parents = index[rest.owner]
             for number, (tile, rows) in enumerate(group.tile.children):
-                at, points = number * len(tiles) + parents, times(rows, rest.points)
+                at, points = number * len(tiles) + parents, times(rows, rest.values)
                 if tile is None:
                     of_pieces.append(at)
                     coefficients.append(points)
@@ -190,7 +191,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
                 if tile is group.tile:
                     # Each ring around an extraordinary point may have as many segments as the one around it.
                     most[at] = tiles.most[parents]
-                waiting.append(TileGroup(tile, at, points))
+                waiting.append(TileParts(tile, points, at))
         tiles = replace(Tiles.joined(children), most=most)
         if of_pieces:
             pieces.append((tiles[np.concatenate(of_pieces)], np.concatenate(coefficients, axis=2)))
@@ -198,28 +199,12 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
     return Tiles.joined(flat), in_pieces, np.concatenate([each for _, each in pieces], axis=2)
 
 
-def _alike(groups: list[TileGroup]) -> list[TileGroup]:
-    """The same tiles, with groups of the same subdivision merged."""
-    found: dict[DividedTile, list[TileGroup]] = {}
-    for group in groups:
-        found.setdefault(group.tile, []).append(group)
-    return [
-        own[0]
-        if len(own) == 1
-        else TileGroup(
-            tile, np.concatenate([each.at for each in own]), np.concatenate([each.points for each in own], axis=2)
-        )
-        for tile, own in found.items()
-    ]
-
-
-def _numbered(tiles: Tiles, groups: list[TileGroup]) -> tuple[Tiles, list[TileGroup]]:
+def _numbered(tiles: Tiles, groups: list[TileParts]) -> tuple[Tiles, list[TileParts]]:
     """The tiles of some groups only, one group after the other."""
-    ends = np.cumsum([len(group.at) for group in groups]).tolist()
-    chosen = tiles[np.concatenate([group.at for group in groups])]
+    ends = np.cumsum([len(group.owner) for group in groups]).tolist()
+    chosen = tiles[np.concatenate([group.owner for group in groups])]
     return chosen, [
-        TileGroup(group.tile, np.arange(end - len(group.at), end), group.points)
-        for group, end in zip(groups, ends, strict=True)
+        group._replace(owner=np.arange(end - len(group.owner), end)) for group, end in zip(groups, ends, strict=True)
     ]
 
 

@@ -52,6 +52,26 @@ class TileParts(NamedTuple):
     owner: IntArray
     side: int | None = None
 
+    def chosen(self, which: NDArray[np.bool_]) -> TileParts:
+        """Some of the parts."""
+        return self if which.all() else self._replace(values=self.values[..., which], owner=self.owner[which])
+
+
+def alike(parts: list[TileParts]) -> list[TileParts]:
+    """The same parts, those with the same subdivision merged."""
+    found: dict[tuple[DividedTile, int | None], list[TileParts]] = {}
+    for part in parts:
+        found.setdefault((part.tile, part.side), []).append(part)
+    return [
+        own[0]
+        if len(own) == 1
+        else own[0]._replace(
+            values=np.concatenate([each.values for each in own], axis=2),
+            owner=np.concatenate([each.owner for each in own]),
+        )
+        for own in found.values()
+    ]
+
 
 def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDArray[np.bool_]:
     """Whether the extents of the surface over tiles are within their limits.
@@ -84,7 +104,7 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
         is_last = division == MOST_DIVISIONS[is_convex] - 1
         levels = LEVELS_TOGETHER[division] if division < len(LEVELS_TOGETHER) else LATER_TOGETHER
         below: list[tuple[TileParts, _Child, FloatArray]] = []
-        for part in _alike(waiting):
+        for part in alike(waiting):
             divided = _divided(scheme, part.tile, part.side, levels if part.side is None else CURVES_TOGETHER)
             found = times(divided.rows, part.values)
             points.add(part.owner, found[: divided.point_count])
@@ -129,22 +149,6 @@ def _relative(part: TileParts) -> tuple[NDArray[np.float32], FloatArray]:
     largest = np.abs(values).max(axis=(0, 1))
     largest[largest == 0] = 1
     return (values / largest).astype(np.float32), largest
-
-
-def _alike(parts: list[TileParts]) -> list[TileParts]:
-    """The same parts, those with the same subdivision merged."""
-    found: dict[tuple[DividedTile, int | None], list[TileParts]] = {}
-    for part in parts:
-        found.setdefault((part.tile, part.side), []).append(part)
-    return [
-        own[0]
-        if len(own) == 1
-        else own[0]._replace(
-            values=np.concatenate([each.values for each in own], axis=2),
-            owner=np.concatenate([each.owner for each in own]),
-        )
-        for own in found.values()
-    ]
 
 
 class _Child(NamedTuple):
