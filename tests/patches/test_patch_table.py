@@ -5,10 +5,11 @@ import pytest
 from mitsuba_subdivision.cage import ControlCage
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mesh.one_ring import one_ring
-from mitsuba_subdivision.mesh.signature import signature_at
+from mitsuba_subdivision.mesh.signature import NEAR_FACES, signature_at
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
+from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
 
@@ -51,6 +52,25 @@ def test_patches_of_a_class_have_its_signature_and_others_have_not(scheme, name)
         assert {signature_of(table, corner) for corner in patch_class.corners} == {patch_class.signature}
     classes = [least_turn(patch_class.signature, table.scheme.domain.corner_count) for patch_class in table.classes]
     assert len(set(classes)) == len(classes)
+
+
+def test_patches_of_a_class_see_the_same_near_faces_of_large_fans():
+    # Two fans that differ in their numbers of faces, each of mixed sizes.
+    faces, centre = [], 0
+    for count in (NEAR_FACES + 6, 2 * NEAR_FACES):
+        for i in range(centre + 1, centre + 2 * count, 2):
+            faces.append([centre, i, i + 2] if i % 3 else [centre, i, i + 1, i + 2])
+        centre += 2 * count + 2
+    table = PatchTable(mesh_of(centre, faces), scheme_named("catmull_clark"))
+    for patch_class in table.classes:
+        assert {signature_of(table, corner).near() for corner in patch_class.corners} == {patch_class.signature}
+        start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
+        for controls, ends in zip(patch_class.controls, zip(start, end, strict=True), strict=True):
+            assert {*ends} <= {*controls}
+    signatures = [least_turn(patch_class.signature, 4) for patch_class in table.classes]
+    assert len(set(signatures)) == len(signatures)
+    # Far from the ends of both fans there are three kinds of faces, and so three of each of their corners.
+    assert table.class_count < table.patch_count / 2
 
 
 @EVERY_SURFACE

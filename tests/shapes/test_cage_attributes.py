@@ -14,7 +14,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import refine_first
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")

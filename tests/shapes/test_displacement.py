@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")

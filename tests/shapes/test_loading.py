@@ -15,7 +15,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.shapes import nesting
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")

@@ -32,7 +32,7 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
     du, dv = first
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         a, b, c = _dot(du, du), _dot(du, dv), _dot(dv, dv)
-        normal = unit_normals(du, dv)
+        normal = unit_normals(first.swapaxes(1, 2)).T
         e, f, g = (_dot(row, normal) for row in second)
         area = a * c - b * b
         return np.stack([(e * g - f * f) / area, (e * c - 2 * f * b + g * a) / (2 * area)])
@@ -90,8 +90,8 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
 
 def _orthonormal_frames(coordinates: FloatArray) -> FloatArray:
     """Orthonormal frames ``(e, 3, 3)``: in columns, two tangents at the extraordinary point and the normal."""
-    first, second = coordinates[:, 1], coordinates[:, 2]
-    normal = unit_normals(first, second)
+    first = coordinates[:, 1]
+    normal = unit_normals(coordinates[:, 1:3].transpose(1, 2, 0)).T
     with np.errstate(invalid="ignore", divide="ignore"):
         along = first / np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([along, np.cross(normal, along), normal], axis=2)

@@ -17,15 +17,15 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .equations import Evaluator, SampleRows
 from .irregular_patch import IrregularPatch
-from .normals import TANGENT_ROUNDING, are_collapsed
+from .normals import TANGENT_ROUNDING, unit_normals
 from .occupied_pieces import OccupiedPieces, PieceGroup, occupied_pieces
 
 # Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
 KEPT_WEIGHTS = 1 << 13
 # Samples are evaluated in runs of this many, and weights of this many of these are gathered at once: they stay in a
-# processor's cache.
-RUN = 1024
-GATHERED = 512
+# processor's cache. Powers of two would put the columns of an array into the same few lines of it.
+RUN = 1000
+GATHERED = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +36,16 @@ class ElementSamples:
     ----------
     values : (1 + 2 or 1 + 5, s, x)
         The value; its derivatives by u and v; those by uu, uv and vv if requested.
-    frame : (2, s, x)
-        Two tangents whose cross product is along the normal. Zero where the surface has no normal, but not in the
-        published forms "power" and "stam".
+    normal : (s, 3)
+        Unit normals. Zero where the surface has none, but not in the published forms "power" and "stam". Not a number
+        where values are no points in space.
     level : (s,) int64
     curvature : (2, s)
         Gaussian and mean. Not a number unless requested, and where values are no points in space.
     """
 
     values: FloatArray
-    frame: FloatArray
+    normal: FloatArray
     level: NDArray[np.int64]
     curvature: FloatArray
 
@@ -54,7 +54,7 @@ class ElementSamples:
         """Samples without values yet."""
         return cls(
             np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype),
-            np.empty((2, count, width), dtype=dtype),
+            np.full((count, 3), np.nan, dtype=dtype),
             np.empty(count, dtype=np.int64),
             np.full((2, count), np.nan, dtype=dtype),
         )
@@ -68,7 +68,7 @@ class ElementSamples:
 def evaluate_elements(
     pieces: OccupiedPieces,
     element: IntArray,
-    controls: Callable[[IntArray, int], FloatArray],
+    controls: Callable[[IntArray, IntArray], FloatArray],
     uv: FloatArray,
     corner: IntArray,
     extent: FloatArray,
@@ -84,8 +84,9 @@ def evaluate_elements(
     element : (s,) int64
         Number of each sample's element in ``pieces``.
     controls : callable
-        Control points ``(K, m, x)`` float64 of the elements of some samples ``(m,)`` and a K, in an array that may be
-        changed; maybe more than an element has, of which others are repeated. They are rounded to the samples' type.
+        Control points ``(K, m, x)`` float64 of the elements of some samples ``(m,)``, by their indices ``(K,)``, in an
+        array that may be changed; for indices that an element has not, its last one. They are rounded to the samples'
+        type.
     uv : (s, 2) float64
         With (0, 0) at the sample's corner.
     corner : (s,) int64
@@ -98,59 +99,64 @@ def evaluate_elements(
         The result, in the rows ``at`` ``(s,)``. Arithmetic is of its type.
     """
     count, (size, _, width), dtype = len(uv), samples.values.shape, samples.values.dtype
-    derivatives = samples.derivatives
+    derivatives, has_origin = samples.derivatives, evaluator not in ("power", "stam")
     located = LocatedSamples.of(pieces, element, uv, corner)
-    # Of the point, the derivatives and the frame, one after the other. Samples are along the last axis from here on, as
-    # operations along rows of three would be slow.
+    into = at.take(located.order)
+    # Of the point and the derivatives. Samples are along the last axis from here on, as operations along rows of three
+    # would be slow.
     values, origin = np.empty((size, width, count), dtype=dtype), np.zeros((width, count), dtype=dtype)
-    scale, level = np.empty((2, count), dtype=dtype), np.empty(count, dtype=np.int64)
-    curvature, weights = np.full((2, count), np.nan, dtype=dtype), np.empty((2, count), dtype=dtype)
+    scale, level, bounds = np.empty((2, count), dtype), np.empty(count, np.int64), np.empty((2, count), dtype)
     frames: list[tuple[slice, FloatArray]] = []
     buffer = np.empty(GATHERED * max((group.coordinates[0].size for group in pieces.groups), default=0))
-    use_stam = evaluator in ("power", "stam")
     for patch, run in located.runs():
         rows = located.rows(patch, run, evaluator, dtype, derivatives)
         scale[:, run], level[run] = rows.derivative_scale, rows.level
-        weights[:, run] = np.abs(rows.tangents) @ np.ones(rows.rows.shape[2], dtype=dtype)
+        bounds[:, run] = np.abs(rows.tangents) @ np.ones(rows.rows.shape[2], dtype=dtype)
+        every = rows.rows if rows.frame is None else np.concatenate([rows.rows, rows.frame])
         for group, own, within in located.groups(run):
-            points = controls(located.order[own], group.control_count).astype(dtype, copy=False)
-            if not use_stam:
-                origin[:, own] = points[0].T
+            points = controls(located.order[own], group.columns).astype(dtype, copy=False)
+            if has_origin:
+                origin[:, own] = points[0].T[:width]
                 points -= points[0].copy()
-            coordinates = group.coordinates_of(located.index[own], points, evaluator, buffer)
-            found = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
-            values[..., own] = found
+            points = points.swapaxes(0, 1)
+            weights = group.weights(every[:, within], located.index[own], evaluator, buffer)
+            found = (weights @ points).transpose(1, 2, 0)[:, :width]
+            values[..., own] = found[:size]
             if rows.frame is not None:
-                frame = (rows.frame[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
-                frames.append((own, _by_uv(frame, located.jacobian[..., own].astype(dtype))))
+                frames.append((own, _by_uv(found[size:], located.jacobian[..., own].astype(dtype))))
             if derivatives == 2 and width == 3:
-                curvature[:, own] = _curvature(patch, located.uv[:, own].T, found, coordinates, evaluator)
+                coordinates = None
+                if patch is not None and evaluator == "stabilized":
+                    coordinates = group.coordinates[located.index[own]] @ points[..., :3]
+                curvature = _curvature(patch, located.uv[:, own].T, found[:size], coordinates)
+                samples.curvature[:, into[own]] = curvature
     values[0] += origin
-    jacobian = located.jacobian.astype(dtype)
-    tangents: FloatArray = _by_uv(values[1:3], jacobian)
+    jacobian = located.jacobian.astype(dtype, copy=False)
+    tangents = _by_uv(values[1:3], jacobian)
     # At levels far beyond any that float32 can hold, the scale overflows.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         np.multiply(tangents, scale[0], out=values[1:3])
         if derivatives == 2:
             values[3:] = _second_by_uv(values[3:], jacobian) * scale[1]
-    for own, own_frame in frames:
-        tangents[..., own] = own_frame
-    # Only points in space have normals; texture coordinates, for example, have none.
-    if width == 3 and not use_stam:
-        # First by bounds that are too large, but take little time.
-        gains = pieces.parts["gain"].take(located.part).astype(dtype)
-        bounds = _absolute_by_uv(weights * gains, jacobian)
-        suspect = np.flatnonzero(are_collapsed(tangents[0].T, tangents[1].T, bounds, extent.astype(dtype)))
-        if len(suspect):
-            suspect = suspect[located.chosen(suspect).are_collapsed(tangents[..., suspect], controls, evaluator)]
-            tangents[..., suspect] = 0
-            curvature[:, suspect] = np.nan
-    into = at.take(located.order)
-    for rows_of_sample, sorted_rows in zip((*samples.values, *samples.frame), (*values, *tangents), strict=True):
+    for rows_of_sample, sorted_rows in zip(samples.values, values, strict=True):
         rows_of_sample[into] = sorted_rows.T
     samples.level[into] = level
-    if derivatives == 2:
-        samples.curvature[:, into] = curvature
+    # Only points in space have normals; texture coordinates, for example, have none.
+    if width != 3:
+        return
+    for own, own_frame in frames:
+        tangents[..., own] = own_frame
+    if has_origin:
+        # First by bounds that are too large, but take little time.
+        bounds *= pieces.parts["gain"].take(located.part)
+        normal = unit_normals(tangents, _by_uv(bounds, np.abs(jacobian)), extent.astype(dtype)[:, None])
+        suspect = np.flatnonzero(~normal.any(axis=0))
+        if len(suspect):
+            normal[:, suspect] = located.chosen(suspect).normals(tangents[..., suspect], controls, evaluator)
+            samples.curvature[:, into[~normal.any(axis=0)]] = np.nan
+    else:
+        normal = unit_normals(tangents)
+    samples.normal[into] = normal.T
 
 
 def element_stencils(
@@ -222,9 +228,10 @@ def _stencils(
     """Weights of points and derivatives ``(1 + 2 or 1 + 5, s, K)``, of frames, and where the samples lie."""
     located = LocatedSamples.of(occupied_pieces(scheme, signature), np.zeros(len(uv), dtype=np.int64), uv, corner)
     values = np.empty((3 if derivatives == 1 else 6, one_ring(signature).vertex_count, len(uv)))
-    frame, dtype, scale = np.empty((2, *values.shape[1:])), np.dtype(np.float64), np.empty((2, len(uv)))
+    frame = np.empty((2, *values.shape[1:]))
+    scale = np.empty((2, len(uv)))
     for patch, run in located.runs():
-        rows = located.rows(patch, run, "stabilized", dtype, derivatives)
+        rows = located.rows(patch, run, "stabilized", frame.dtype, derivatives)
         scale[:, run] = rows.derivative_scale
         for group, at, within in located.groups(run):
             coordinates = group.coordinates[located.index[at]]
@@ -319,23 +326,23 @@ class LocatedSamples:
     def rows(
         self, patch: IrregularPatch | None, run: slice, evaluator: Evaluator, dtype: np.dtype, derivatives: int
     ) -> SampleRows:
-        """Coefficients of a run of samples over `PieceGroup.coordinates_of`."""
+        """Coefficients of a run of samples over `PieceGroup.coordinates`."""
         uv = np.ascontiguousarray(self.uv[:, run].T)
         if patch is not None:
             return patch.rows(uv, evaluator, dtype, derivatives)
         rows = self.pieces.scheme.regular_basis(uv.astype(dtype), derivatives)
         return SampleRows(rows, np.ones((2, len(uv)), dtype=dtype), self.pieces.parts["level"].take(self.part[run]))
 
-    def are_collapsed(
-        self, frame: FloatArray, controls: Callable[[IntArray, int], FloatArray], evaluator: Evaluator
-    ) -> NDArray[np.bool_]:
-        """Whether frames ``(2, 3, s)`` span no plane, but for rounding; ``controls`` as for `evaluate_elements`."""
-        extent: FloatArray = np.empty((len(self.part), 3), dtype=frame.dtype)
+    def normals(
+        self, frame: FloatArray, controls: Callable[[IntArray, IntArray], FloatArray], evaluator: Evaluator
+    ) -> FloatArray:
+        """Unit normals ``(3, s)`` along frames ``(2, 3, s)``; ``controls`` as for `evaluate_elements`."""
+        extent = np.empty_like(frame[0])
         for _, run in self.runs():
             for group, at, _ in self.groups(run):
-                points = controls(self.order[at], group.control_count).astype(frame.dtype, copy=False)
-                extent[at] = np.abs(points - points[0]).max(axis=0)
-        return are_collapsed(frame[0].T, frame[1].T, self.frame_weights(evaluator, frame.dtype), extent)
+                points = controls(self.order[at], group.columns).astype(frame.dtype, copy=False)
+                extent[:, at] = np.abs(points - points[0]).max(axis=0).T[:3]
+        return unit_normals(frame, self.frame_weights(evaluator, frame.dtype), extent)
 
     def frame_weights(self, evaluator: Evaluator, dtype: np.dtype) -> FloatArray:
         """For each tangent of the frame, the sum of the absolute weights of the control points in it ``(2, s)``.
@@ -347,7 +354,7 @@ class LocatedSamples:
             frame = self.rows(patch, run, evaluator, dtype, 1).tangents
             for group, at, within in self.groups(run):
                 found[:, at] = group.absolute_weights(frame[:, within], self.index[at])
-        return _absolute_by_uv(found, self.jacobian.astype(dtype))
+        return _by_uv(found, np.abs(self.jacobian.astype(dtype)))
 
 
 def _runs(keys: IntArray, length: int) -> Iterator[slice]:
@@ -359,7 +366,7 @@ def _runs(keys: IntArray, length: int) -> Iterator[slice]:
 
 
 def _curvature(
-    patch: IrregularPatch | None, uv: FloatArray, values: FloatArray, coordinates: FloatArray, evaluator: Evaluator
+    patch: IrregularPatch | None, uv: FloatArray, values: FloatArray, coordinates: FloatArray | None
 ) -> FloatArray:
     """``(2, s)`` Gaussian and mean curvature, of samples in pieces of a patch.
 
@@ -370,25 +377,20 @@ def _curvature(
         Parameters in the pieces.
     values : (6, 3, s)
         With derivatives by these.
-    coordinates : (s, K_piece, 3)
+    coordinates : (s, K_piece, 3), optional
+        Eigen-coordinates, for curvature from these.
     """
     from .curvature import curvature, irregular_curvature
 
-    if patch is not None and evaluator == "stabilized":
+    if patch is not None and coordinates is not None:
         return irregular_curvature(patch, uv, coordinates, np.arange(len(uv)))
     derivatives = values[1:].swapaxes(1, 2)
     return curvature(derivatives[:2], derivatives[2:])
 
 
 def _by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Derivatives ``(2, x, s)`` by a piece's parameters, turned into those by the samples' own (u, v)."""
-    (by_s, by_t), ((a, b), (c, d)) = tangents, jacobian
-    return np.stack([a * by_s + c * by_t, b * by_s + d * by_t])
-
-
-def _absolute_by_uv(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """The same of absolute weights ``(2, s)``."""
-    return _by_uv(weights[:, None], np.abs(jacobian))[:, 0]
+    """Derivatives ``(2, .., s)`` by a piece's parameters, turned into those by the samples' own (u, v)."""
+    return np.einsum("ijs,i...s->j...s", jacobian, tangents)
 
 
 def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:

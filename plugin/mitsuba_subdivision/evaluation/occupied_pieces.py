@@ -85,12 +85,13 @@ class PieceGroup:
     Attributes
     ----------
     patch : IrregularPatch or None
-    control_count : int
-        K.
+    columns : (K,) int64
+        Control points of an element that `weights` are of.
     """
 
     def __init__(self, patch: IrregularPatch | None, shape: tuple[int, int], order: tuple[int, ...] | None = None):
-        self.patch, self._order, self.control_count = patch, order, shape[1]
+        self.patch, self._order = patch, order
+        self.columns = np.arange(shape[1]) if order is None else np.array(order)
         names = ("stencils",) if patch is None else ("stencils", "coordinates")
         self._weights = GrowingColumns(**dict.fromkeys(names, (shape, np.float64)))
 
@@ -114,28 +115,28 @@ class PieceGroup:
         index = self._weights.append(stencils=stencils, **own)
         return index, float(self.absolute_sums(np.array([index])).max())
 
-    def coordinates_of(
-        self, which: IntArray, controls: FloatArray, evaluator: Evaluator, buffer: FloatArray
-    ) -> FloatArray:
-        """The factors of `IrregularPatch.rows`, or of rows of the regular basis: ``(s, K_piece, x)``.
+    def weights(self, rows: FloatArray, which: IntArray, evaluator: Evaluator, buffer: FloatArray) -> FloatArray:
+        """Weights ``(s, d, K)`` of control points of the elements, those of `columns`.
 
         Parameters
         ----------
+        rows : (d, s, K_piece)
+            Of `IrregularPatch.rows`, or of the regular basis.
         which : (s,) int64
             Piece of each sample.
-        controls : (K, s, x)
-            Control points. Sums are double precision, and rounded once.
         evaluator : "power" | "stam" | "stabilized" | "limit"
         buffer : (n,) float64
-            To gather weights in: fresh memory takes several times as long.
+            To gather stencils in: fresh memory takes several times as long.
         """
+        rows = rows.swapaxes(0, 1)
         if self._order is not None:
-            return controls.take(self._order, axis=0).swapaxes(0, 1)
-        rows = self.stencils if evaluator == "power" else self.coordinates
-        weights = buffer[: len(which) * rows[0].size].reshape(len(which), *rows.shape[1:])
+            return rows
+        source = self.stencils if evaluator == "power" else self.coordinates
+        stencils = buffer[: len(which) * source[0].size].reshape(len(which), *source.shape[1:])
         # Without checks of the indices, which would allocate memory.
-        rows.take(which, axis=0, out=weights, mode="clip")
-        return (weights @ controls.swapaxes(0, 1)).astype(controls.dtype, copy=False)
+        source.take(which, axis=0, out=stencils, mode="clip")
+        # Sums are double precision, and rounded once.
+        return (rows @ stencils).astype(rows.dtype, copy=False)
 
     def absolute_sums(self, which: IntArray) -> FloatArray:
         """Of some pieces ``(s, K_piece)``: bounds of the absolute weights of control points in each coordinate.
@@ -212,11 +213,11 @@ class OccupiedPieces:
     ranks : (g,) int16
         Where each group comes if those of the same patch follow each other.
     parts : GrowingColumns
-        All parts, elements among them. Of each ``kind``, a `PartKind`; ``turn``, by which the corner of the domain
-        where it has an extraordinary point becomes (0, 0) before it is divided; ``children``, or `NO_CHILD`; ``maps``
-        to its own parameters from the element's, as counted from each corner: matrix and offset. Of pieces ``group``
-        and ``index`` in the group; of regular ones ``level`` around an extraordinary point, else 0; ``gain``, the
-        largest of `PieceGroup.absolute_sums`.
+        All parts, elements among them. Of each ``kind``, a `PartKind`; ``children``, or `NO_CHILD`, in the order of
+        its parameters; ``turn`` of a level around an extraordinary point, which makes these of the patch's, see
+        `DividedElement.turn`; ``maps`` to its own parameters from the element's, as counted from each corner: matrix
+        and offset. Of pieces ``group`` and ``index`` in the group; of regular ones ``level`` around an extraordinary
+        point, else 0; ``gain``, the largest of `PieceGroup.absolute_sums`.
     """
 
     def __init__(self, scheme: Scheme, piece_levels: int = 0, column_step: int = 1) -> None:
@@ -263,7 +264,7 @@ class OccupiedPieces:
     def piece(self, part: int) -> Piece:
         """A part that is a piece."""
         group = self.groups[self.parts["group"][part]]
-        return Piece(self._domain(part), group.stencils[self.parts["index"][part]], group.patch)
+        return Piece(self._domain(part), group.stencils[self.parts["index"][part]], group.patch, group.control_count)
 
     def locate(self, part: IntArray, uv: FloatArray, corner: IntArray) -> IntArray:
         """Find the piece ``(s,)`` that each sample lies in.
@@ -302,19 +303,15 @@ class OccupiedPieces:
     def mapped(self, part: IntArray, uv: FloatArray, corner: IntArray) -> tuple[FloatArray, FloatArray]:
         """Parameters ``(2, s)`` in parts, and their derivatives ``(2, 2, s)`` by those of the elements ``(2, s)``."""
         maps = self.parts["maps"]
-        a, b, c, d, x, y = found = maps.reshape(-1, 6).take(part * maps.shape[1] + corner, axis=0).T.copy()
-        u, v = uv
+        found = maps.reshape(-1, 6).take(part * maps.shape[1] + corner, axis=0).T.copy()
+        jacobian = found[:4].reshape(2, 2, -1)
         # Products and sums one by one, as in `AffineMap`.
-        return np.stack([a * u + b * v + x, c * u + d * v + y]), found[:4].reshape(2, 2, -1)
+        return np.einsum("ijs,js->is", jacobian, uv) + found[4:], jacobian
 
     def _first_child(self, part: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """The first child that each sample lies in, as it may lie on the border of several, and parameters there."""
-        turn, is_only = self.parts["turn"].take(part), self.parts["kind"].take(part) == PartKind.ONLY_CHILD
-        if turn.any():
-            for number, rotation in enumerate(self._rotations):
-                own = np.flatnonzero(turn == number)
-                uv[:, own] = rotation(uv[:, own].T).T
         child, inner = self.scheme.domain.first_child(uv)
+        is_only = self.parts["kind"].take(part) == PartKind.ONLY_CHILD
         return (np.where(is_only, 0, child), np.where(is_only, uv, inner)) if is_only.any() else (child, inner)
 
     def _divide(self, parent: IntArray, child: IntArray) -> None:
@@ -329,7 +326,9 @@ class OccupiedPieces:
             if part is None:
                 continue
             if isinstance(part.source, Piece):
-                found = self._add_level_child(part, number, self._domain(index))
+                turn, corners = int(self.parts["turn"][index]), self.scheme.domain.corner_count
+                turned = (number + turn) % corners if number < corners else number
+                found = self._add_level_child(part, turned, self._domain(index), turn)
                 self.parts["children"][index, number] = found
                 continue
             element, stencils = part.source.child(number)
@@ -361,7 +360,7 @@ class OccupiedPieces:
                 found.append(self._add_part(part, domain, element.kind))
                 continue
             stencils = element.piece.stencils if part.weights is None else element.piece.stencils @ part.weights
-            piece = Piece(element.piece.domain @ domain, stencils, element.piece.patch)
+            piece = Piece(element.piece.domain @ domain, stencils, element.piece.patch, stencils.shape[1])
             if piece.patch is None or not self._piece_levels:
                 found.append(self._add_piece(piece))
             else:
@@ -369,19 +368,20 @@ class OccupiedPieces:
                 found.append(self._add_part(tip, domain, PartKind.DIVIDED, turn=element.turn))
         return found
 
-    def _add_level_child(self, part: _Part, number: int, domain: AffineMap) -> int:
-        """Add a child of a level around an extraordinary point; ``domain`` as the level's row has it."""
+    def _add_level_child(self, part: _Part, number: int, domain: AffineMap, turn: int) -> int:
+        """Add a child of a level around an extraordinary point; ``domain`` and ``turn`` as the level's row has them."""
         piece, level = part.source, part.depth
         if not isinstance(piece, Piece) or part.weights is None:
             raise TypeError(f"a part of {type(piece).__name__}; expected a level around an extraordinary point")
         patch = piece.irregular_patch
         inner = self.scheme.domain.children[number] @ (domain if level else piece.domain)
         if number > 0:
-            return self._add_piece(Piece(inner, patch.eigen_children[number - 1] @ part.weights, None), level)
+            weights = patch.eigen_children[number - 1] @ part.weights
+            return self._add_piece(Piece(inner, weights, None, weights.shape[1]), level)
         if level + 1 == self._piece_levels:
             return self._add_piece(piece)
         smaller = patch.basis.block_matrix() @ part.weights
-        return self._add_part(_Part(piece, smaller, level + 1), inner, PartKind.DIVIDED)
+        return self._add_part(_Part(piece, smaller, level + 1), inner, PartKind.DIVIDED, turn=turn)
 
     def _add_piece(self, piece: Piece, level: int = 0) -> int:
         columns = piece.stencils.shape[1]

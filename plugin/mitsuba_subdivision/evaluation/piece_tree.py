@@ -10,8 +10,7 @@ points, and a sample needs nothing else. Nearly all samples lie there: three lev
 
 Deeper levels are equations (10) and (12) as a table. A *block* has a row for each control point of the one-ring, and a
 column for each monomial of the scheme's `PolynomialBasis`. Sums of rows times control points, relative to the first of
-these, are coefficients. The first eigenvector is left out of them, and all others are divided by the power of the
-second eigenvalue, ``λ_2ⁿ``: the polynomial has to be multiplied by that, but for its constant, the point itself.
+these, are coefficients. The first eigenvector, which is constant, is left out but for the point itself.
 """
 
 from __future__ import annotations
@@ -94,9 +93,8 @@ class PieceTree:
         many blocks for levels once more, of the point without the second eigenvector, divided by the power of the third
         eigenvalue.
     blocks : (b, K, m) float64
-        As the relative first control point is zero, no block needs the first row for weights. Its first entry is the
-        power of the second eigenvalue, ``λ_2ⁿ``; the others are, in uneven tips, the polynomial of the second
-        eigenvector, of which `uneven_frame` is made.
+        As the relative first control point is zero, no block needs the first row for weights. In uneven tips it is the
+        polynomial of the second eigenvector, of which `uneven_frame` is made.
     """
 
     kinds: IntArray
@@ -167,17 +165,14 @@ def _tip_pieces(scheme: Scheme, tip: Piece, piece_levels: int) -> tuple[FloatArr
     rows: FloatArray = polynomials.matrix @ patch.eigen_children
     level_count = float32_levels(patch)
     by_level = _by_level(rows, patch, basis.subdominant, np.arange(level_count))
-    power = basis.subdominant ** np.repeat(np.arange(level_count), len(rows))
-    by_level[:, 0] *= power[:, None]
+    by_level *= basis.subdominant ** np.repeat(np.arange(level_count), len(rows))[:, None, None]
     by_level[:, 0, 0] = 1
     piece_count = piece_levels * len(rows)
-    pieces = by_level[:piece_count].copy()
-    pieces[:, 1:] *= power[:piece_count, None, None]
     rest: FloatArray = np.zeros((2, len(polynomials.powers), len(coordinates)))
     u, v = (int(np.flatnonzero((polynomials.powers == each).all(axis=1))[0]) for each in ((1, 0), (0, 1)))
-    rest[0, [u, v]], rest[1, [u, v]] = patch.edge_tangents, patch.limit_frame
+    rest[0, [u, v]], rest[1, [u, v]] = basis.subdominant**level_count * patch.edge_tangents, patch.limit_frame
     # Polynomials are about the middle of the domain, and the point itself is at its corner.
-    rest[0, 0] = basis.subdominant**level_count * polynomials.centre @ patch.edge_tangents
+    rest[0, 0] = polynomials.centre @ rest[0, [u, v]]
     rest[0, 0, 0] = 1
     levels = np.arange(piece_levels, level_count)
     blocks, second_eigenvector = [by_level[piece_count:], rest], 0 * rows[:, :, 0]
@@ -189,9 +184,7 @@ def _tip_pieces(scheme: Scheme, tip: Piece, piece_levels: int) -> tuple[FloatArr
     # In place of weights of the first control point.
     level_blocks = found[: len(levels) * len(rows)]
     level_blocks[:, 0] = np.tile(second_eigenvector, (len(levels), 1))
-    level_blocks[:, 0, 0] = power[piece_count:]
-    found[len(level_blocks), 0, 0] = basis.subdominant**level_count
-    return pieces @ coordinates, found, frame, level_count
+    return by_level[:piece_count] @ coordinates, found, frame, level_count
 
 
 def _by_level(rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 
 import drjit as dr
 
-from .types import FloatBuffer, Matrix4, Vector3
-from .vectors import cross, dot, unit
+from .types import Float, FloatBuffer, Matrix4, Vector3
+from .vectors import cross, dot, like, unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,60 +18,50 @@ class AffineMap:
 
     Attributes
     ----------
-    columns : tuple of three 3-vectors
-        Images of the axes under the linear map.
-    translation : 3-vector
+    rows : tuple of three rows of three numbers
+        The linear map.
+    translation : three numbers
+    inverse : tuple of three rows of three numbers
+        Of the linear map.
     """
 
-    columns: tuple[Vector3, Vector3, Vector3]
-    translation: Vector3
+    rows: tuple[Sequence[Float], ...]
+    translation: Sequence[Float]
+    inverse: tuple[Sequence[Float], ...]
 
     @classmethod
-    def of(cls, matrix: Matrix4, vector3: type) -> AffineMap:
+    def of(cls, matrix: Matrix4, inverse: Matrix4 | None = None) -> AffineMap:
         """The map of a 4x4 matrix, whose last row is not used.
 
         Parameters
         ----------
-        matrix : 4x4 matrix
-            Of Dr.Jit or NumPy.
-        vector3 : type
-            Dr.Jit array of three numbers.
+        matrix, inverse : 4x4 matrices
+            Of Dr.Jit or NumPy. An inverse that is not given is computed, with derivatives.
         """
-        x, y, z, translation = (vector3(*(matrix[row, column] for row in range(3))) for column in range(4))
-        return cls((x, y, z), translation)
+        rows = _rows(matrix)
+        return cls(rows, [matrix[i, 3] for i in range(3)], _inverse(rows) if inverse is None else _rows(inverse))
 
     def point(self, point: Vector3) -> Vector3:
         """Map a point."""
         # The translation comes last, so that points far from the world's origin are rounded once.
-        return self.direction(point) + self.translation
+        return like([x + y for x, y in zip(self.direction(point), self.translation, strict=True)], point)
 
     def direction(self, vector: Vector3) -> Vector3:
         """Map a vector without the translation."""
-        return _combined(self.columns, vector)
+        return like([dot(row, vector) for row in self.rows], vector)
 
     def normal(self, normal: Vector3) -> Vector3:
         """Map the direction of a normal by the inverse transpose; reflections keep it on the outside."""
-        return type(normal)(*(dot(column, normal) for column in self._inverse))
+        return like([dot(column, normal) for column in zip(*self.inverse, strict=True)], normal)
 
     def inverse_point(self, point: Vector3) -> Vector3:
         """The point that is mapped to a given one."""
         # Subtract the translation first: both points may be far from the world's origin.
-        return self.inverse_direction(point - self.translation)
+        return self.inverse_direction(like([x - y for x, y in zip(point, self.translation, strict=True)], point))
 
     def inverse_direction(self, vector: Vector3) -> Vector3:
         """The vector that is mapped to a given one without the translation."""
-        return _combined(self._inverse, vector)
-
-    @cached_property
-    def _inverse(self) -> tuple[Vector3, Vector3, Vector3]:
-        """Columns of the inverse of the linear map."""
-        # Divided by the largest entry, so that the determinant neither overflows nor underflows.
-        scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for column in self.columns for entry in column])
-        x, y, z = (column * scale for column in self.columns)
-        rows = cross(y, z), cross(z, x), cross(x, y)
-        factor = scale / dot(x, rows[0])
-        a, b, c = (type(x)(*(row[k] * factor for row in rows)) for k in range(3))
-        return a, b, c
+        return like([dot(row, vector) for row in self.inverse], vector)
 
 
 def placed(
@@ -88,13 +79,23 @@ def placed(
     n: Vector3 = dr.unravel(vector3, normals)
     if dr.grad_enabled(matrix):
         matrix = dr.custom(_Spread, matrix, dr.width(p))
-    to_world = AffineMap.of(matrix, vector3)
+    to_world = AffineMap.of(matrix)
     return dr.ravel(to_world.point(p)), dr.ravel(unit(to_world.normal(n)))
 
 
-def _combined(columns: tuple[Vector3, Vector3, Vector3], vector: Vector3) -> Vector3:
-    x, y, z = columns
-    return dr.fma(x, vector[0], dr.fma(y, vector[1], z * vector[2]))
+def _rows(matrix: Matrix4) -> tuple[Sequence[Float], ...]:
+    """The linear part of a 4x4 matrix."""
+    return tuple([matrix[i, k] for k in range(3)] for i in range(3))
+
+
+def _inverse(rows: tuple[Sequence[Float], ...]) -> tuple[Sequence[Float], ...]:
+    """The inverse of a linear map."""
+    # Divided by the largest entry, so that the determinant neither overflows nor underflows.
+    scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for row in rows for entry in row])
+    x, y, z = ([entry * scale for entry in row] for row in rows)
+    columns = cross(y, z), cross(z, x), cross(x, y)
+    factor = scale / dot(x, columns[0])
+    return tuple([column[i] * factor for column in columns] for i in range(3))
 
 
 class _Spread(dr.CustomOp):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..mesh import ragged
 from ..mesh.shared import Shared
-from ..patches.piece_table import PACKET, piece_packets
+from ..patches.piece_table import NOTHING, PACKET, piece_packets
 from .array_types import NO_CONFLICTS, ArrayTypes
 from .sparse_matrix import SparseMatrix
 from .types import FloatBuffer, Index, IndexBuffer, Vector3, Vector4
@@ -62,9 +62,12 @@ class CoefficientMap:
         ):
             controls = points[table.controls[first : first + count * control_count].reshape(control_count, count)]
             own = found[packet : packet + count * size].reshape(count, size, PACKET)
-            own[:, :ring, :3] = controls.swapaxes(0, 1)[:, :ring]
             # Sums are relative to the first control point, to lose fewer digits.
-            relative = (controls - controls[0]).reshape(control_count, -1)
+            relative = controls - controls[0]
+            if ring:
+                own[:, :ring, :3] = relative.swapaxes(0, 1)
+                own[:, 0, :3] = controls[0]
+            relative = relative.reshape(control_count, -1)
             for first_piece, stencils, pieces in maps:
                 piece_count, monomial_count, _ = pieces.shape
                 parts = relative if stencils is None else stencils @ relative
@@ -88,8 +91,9 @@ class CoefficientMap:
             steps.parts.write(own, padded)
         found: FloatBuffer = dr.zeros(types.float, PACKET * self._table.packet_count)
         if steps.rings is not None:
-            control, packet = steps.rings
-            dr.scatter(found, types.fetch(types.vector4, padded, control), packet, mode=NO_CONFLICTS)
+            control, first, packet = steps.rings
+            origin = types.fetch(types.vector4, padded, first, first != NOTHING)
+            dr.scatter(found, types.fetch(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
         if steps.pieces is not None:
             steps.pieces.write(padded, found)
         return found
@@ -99,14 +103,16 @@ class CoefficientMap:
         types, steps = self._types, self._steps
         sums: FloatBuffer = dr.zeros(types.float, PACKET * steps.point_count)
         if steps.rings is not None:
-            control, packet = steps.rings
-            dr.scatter_add(sums, types.fetch(types.vector4, gradient, packet), control)
+            control, first, packet = steps.rings
+            own: Vector4 = types.fetch(types.vector4, gradient, packet)
+            dr.scatter_add(sums, own, control)
+            dr.scatter_add(sums, -own, first, first != NOTHING)
         if steps.pieces is not None:
             steps.pieces.add_transposed(gradient, sums)
         if steps.parts is not None:
             dr.eval(sums)
             steps.parts.add_transposed(type(sums)(sums), sums)
-        own: Vector4 = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
+        own = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
         found = dr.ravel(types.vector3(own.x, own.y, own.z))
         return found if steps.refine_transposed is None else steps.refine_transposed(found)
 
@@ -131,8 +137,9 @@ class _Steps:
         Of these control points, and of all together with those of parts.
     parts : _Rows or None
         Control points of parts.
-    rings : tuple of two index arrays, or None
-        Control points that are packets of the coefficients: their indices, and the packets.
+    rings : tuple of three index arrays, or None
+        Control points that are packets of the coefficients: their indices, those of what they are relative to or
+        `NOTHING`, and the packets.
     pieces : _Rows or None
         Coefficients of pieces.
     """
@@ -167,16 +174,13 @@ class _Steps:
         self.parts, self.pieces = (each.rows(types, every) if each.added else None for each in (parts, pieces))
         self.rings = None
         if table.classes[:, 5].any():
-            pairs = [
-                (
-                    controls[first : first + n * k].reshape(k, n).T.ravel(),
-                    (packet + size * np.arange(n)[:, None] + np.arange(k)).ravel(),
-                )
-                for first, n, k, packet, size, ring in table.classes.tolist()
-                if ring
-            ]
-            control, packets = (np.concatenate(each) for each in zip(*pairs, strict=True))
-            self.rings = types.indices(control), types.indices(packets)
+            rings = []
+            for first, n, k, packet, size, ring in table.classes.tolist():
+                if ring:
+                    own = controls[first : first + n * k].reshape(k, n).T
+                    origin = np.where(np.arange(k) == 0, NOTHING, own[:, :1])
+                    rings.append(np.stack([own, origin, packet + size * np.arange(n)[:, None] + np.arange(k)]))
+            self.rings = tuple(types.indices(*(each[i].ravel() for each in rings)) for i in range(3))
 
 
 class _Blocks:

@@ -76,16 +76,15 @@ def in_child(
 
 def turned(domain: ParameterDomain, u: Float, v: Float, turn: Index) -> tuple[Float, Float]:
     """Parameters seen from the first corner, from those seen from corner ``turn``."""
-    found_u, found_v = u, v
+    by_one, by_two = turn == 1, turn == 2
     if domain.corner_count == 4:
-        found_u = dr.select(turn == 1, 1 - v, dr.select(turn == 2, 1 - u, dr.select(turn == 3, v, u)))
-        found_v = dr.select(turn == 1, u, dr.select(turn == 2, 1 - v, dr.select(turn == 3, 1 - u, v)))
-        return found_u, found_v
+        by_three, rest_u, rest_v = turn == 3, 1 - u, 1 - v
+        return (
+            dr.select(by_one, rest_v, dr.select(by_two, rest_u, dr.select(by_three, v, u))),
+            dr.select(by_one, u, dr.select(by_two, rest_v, dr.select(by_three, rest_u, v))),
+        )
     rest = 1 - (u + v)
-    return (
-        dr.select(turn == 1, rest, dr.select(turn == 2, v, u)),
-        dr.select(turn == 1, u, dr.select(turn == 2, rest, v)),
-    )
+    return (dr.select(by_one, rest, dr.select(by_two, v, u)), dr.select(by_one, u, dr.select(by_two, rest, v)))
 
 
 def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tuple[Float, Float, Float, Float]:
@@ -96,11 +95,12 @@ def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tupl
     a, b, c, d : float arrays
         Of u by u and v; of v by u and v.
     """
+    is_turned = [turn == k for k in range(1, domain.corner_count)]
     entries = []
     for first, *others in _turn_entries(domain):
         value = types.float(first)
-        for k, other in enumerate(others, start=1):
-            value = dr.select(turn == k, types.float(other), value)
+        for is_by, other in zip(is_turned, others, strict=True):
+            value = dr.select(is_by, types.float(other), value)
         entries.append(value)
     a, b, c, d = entries
     return a, b, c, d

@@ -14,6 +14,7 @@ from .element_walk import ElementWalk, Location
 from .newton import LONGEST_STEP, STEP_TOLERANCE, over, rounding, step_along
 from .piece_kernel import PatchValues
 from .types import Float, Index, Mask, Vector3
+from .vectors import dot
 
 if TYPE_CHECKING:
     from .displacement import DisplacedPiece
@@ -151,6 +152,7 @@ class LineIntersection:
             turns = (aim == ON_NORMAL) & (count == 0)
             taken = self._steps(piece, p, d, is_held | (aim == MISSED), turns, side, facing)
             here = taken.values
+            away = p - here.value
             goal = Location(half_edge, u + taken.u, v + taken.v)
             is_finite = dr.isfinite(taken.u) & dr.isfinite(taken.v)
             to = self._walk.carried(goal, active & is_finite, row)
@@ -159,10 +161,10 @@ class LineIntersection:
             moved = dr.maximum(dr.abs(to.u - u), dr.abs(to.v - v))
             has_settled = is_finite & (dr.minimum(taken.length, moved) * piece.magnification < last_step)
             # Also if the other side is unreachable, beyond a crease.
-            is_wrong_side = has_settled & (aim == ON_LINE) & (dr.dot(here.normal, taken.d) * facing < 0)
+            is_wrong_side = has_settled & (aim == ON_LINE) & (dot(here.normal, taken.d) * facing < 0)
             converges = has_settled & (is_wrong_side == False) & (taken.is_along_surface == False)  # noqa: E712 - arrays
             converges &= (to.half_edge == half_edge) & piece.is_inside(to.u - u, to.v - v, last_step)
-            converges &= dr.norm(p - here.value) <= max_distance
+            converges &= dr.sqrt(dot(away, away)) <= max_distance
             # At a border, successive steps overshoot to nearly the same point.
             beyond = dr.maximum(dr.abs(to.u - goal.u), dr.abs(to.v - goal.v)) * piece.magnification
             holds = converges & (beyond > BEYOND_BORDER)
@@ -170,7 +172,7 @@ class LineIntersection:
             # The next state.
             ends = is_held | (aim == MISSED) | (converges & (holds == False))  # noqa: E712 - an array
             fails = (count + 1 >= ROUNDS) & ((ends | holds) == False)  # noqa: E712 - an array
-            towards = dr.select(dr.dot(p - here.value, taken.d) < 0, types.float(-1), types.float(1))
+            towards = dr.select(dot(away, taken.d) < 0, types.float(-1), types.float(1))
             side = dr.select(taken.is_along_surface, side, dr.select(is_wrong_side, towards, 0))
             side = dr.select(fails, 0, side)
             # A point held on a border is not on its line.
@@ -195,8 +197,9 @@ class LineIntersection:
 
         Next to extraordinary points, rounding errors exceed `STEP_TOLERANCE`.
         """
-        rounded = self._rounding * (dr.norm(p) + dr.norm(here.value)) * piece.magnification
-        return dr.clip(over(rounded, dr.maximum(dr.norm(here.du), dr.norm(here.dv))), STEP_TOLERANCE, 1)
+        size = dr.sqrt(dot(p, p)) + dr.sqrt(dot(here.value, here.value))
+        longest = dr.sqrt(dr.maximum(dot(here.du, here.du), dot(here.dv, here.dv)))
+        return dr.clip(over(self._rounding * size * piece.magnification, longest), STEP_TOLERANCE, 1)
 
     def _steps(
         self, piece: AnyPiece, p: Vector3, d: Vector3, is_still: Mask, turns: Mask, side: Float, facing: Float
@@ -222,7 +225,7 @@ class LineIntersection:
             here = piece.values(u, v)
             is_first = left > STEPS_IN_ROUND
             d = dr.select(is_first & turns, here.normal, d)
-            is_along_surface |= is_first & (side != 0) & (dr.dot(here.normal, d) * facing < 0)
+            is_along_surface |= is_first & (side != 0) & (dot(here.normal, d) * facing < 0)
             is_last = (left == 1) | is_still
             du, dv = step_along(
                 dr.select(is_along_surface, side * d, p - here.value),

@@ -6,7 +6,7 @@ import drjit as dr
 
 from .array_types import ArrayTypes
 from .types import Float, Vector3
-from .vectors import cross
+from .vectors import cross, dot
 
 # Longest step, in parameters of an element: outside its element, a polynomial may be far from the surface.
 LONGEST_STEP = 0.5
@@ -24,9 +24,10 @@ def rounding(types: ArrayTypes) -> float:
 
 def step_along(r: Vector3, d: Vector3, du: Vector3, dv: Vector3) -> tuple[Float, Float]:
     """Components of a vector ``r`` along two tangents, after removing its component along ``d``."""
+    d, du, dv = [*d], [*du], [*dv]
     across_v, across_u = cross(dv, d), cross(d, du)
-    inverse = over(1, dr.dot(du, across_v))
-    return dr.dot(r, across_v) * inverse, dr.dot(r, across_u) * inverse
+    inverse = over(1, dot(du, across_v))
+    return dot(r, across_v) * inverse, dot(r, across_u) * inverse
 
 
 def over(value: Float, divisor: Float) -> Float:

@@ -6,7 +6,7 @@ extraordinary points, beyond the levels that are pieces, equations (10) and (12)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +37,7 @@ from .domain_map import distances, in_child, turn_matrix, turned
 from .element_walk import ElementWalk
 from .polynomial import Monomials
 from .types import Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
-from .vectors import cross
+from .vectors import added, combined, cross, like
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -90,11 +90,19 @@ class PatchValues:
             dv=self.dv + (uv * du + vv * dv),
         )
 
+    def at_values(self, known: PatchValues) -> PatchValues:
+        """Known values with these derivatives by the control points."""
+        value, du, dv, normal = (
+            dr.replace_grad(dr.detach(getattr(known, name)), getattr(self, name))  # type: ignore[func-returns-value]  # The stub is wrong.
+            for name in ("value", "du", "dv", "normal")
+        )
+        return PatchValues(value, du, dv, normal, self.second)
+
     def seen_from_first(self, walk: ElementWalk, corner: Index) -> PatchValues:
         """First derivatives by parameters seen from the first corner, instead of from a later one."""
         a, b, c, d = turn_matrix(walk.domain, walk.types, corner)
-        du, dv = d * self.du - c * self.dv, a * self.dv - b * self.du
-        return PatchValues(self.value, du, dv, self.normal)
+        du, dv = combined(self.du, d, self.dv, -c), combined(self.dv, a, self.du, -b)
+        return PatchValues(self.value, like(du, self.value), like(dv, self.value), self.normal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,26 +196,34 @@ class Piece:
         """
         s, t = self._parameters(du, dv)
         kernel = self.kernel
+        # Of each coordinate.
         found = [kernel.monomials.values(numbers, s, t, derivatives) for numbers in self.coefficients]
-        value, *by = (kernel.types.vector(self.size)(*each) for each in zip(*found, strict=True))
+        value, *by = ([*each] for each in zip(*found, strict=True))
         frame = None
         if self.tip is not None:
             value, by, frame = self._with_tip(self.tip, value, by, s, t, derivatives)
         a, b, c, d = self.jacobian
         by_s, by_t, *second = by
-        found_u, found_v = by_s * a + by_t * c, by_s * b + by_t * d
-        tangent_u, tangent_v = found_u, found_v
+        found_u, found_v = combined(by_s, a, by_t, c), combined(by_s, b, by_t, d)
+        tangents = [found_u, found_v]
         if frame is not None:
             is_needed, of_s, of_t = frame
-            tangent_u = dr.select(is_needed, of_s * a + of_t * c, found_u)
-            tangent_v = dr.select(is_needed, of_s * b + of_t * d, found_v)
-        normal = cross(tangent_u, tangent_v) if self.size == 3 else value * 0
+            of_frame = combined(of_s, a, of_t, c), combined(of_s, b, of_t, d)
+            tangents = [
+                [dr.select(is_needed, x, y) for x, y in zip(*each, strict=True)]
+                for each in zip(of_frame, tangents, strict=True)
+            ]
+        normal = cross(*tangents) if self.size == 3 else [0] * self.size
         if second:
             ss, st, tt = second
             second = [
-                ss * (i * k) + st * (i * m + k * j) + tt * (j * m)
+                [x * (i * k) + y * (i * m + k * j) + z * (j * m) for x, y, z in zip(ss, st, tt, strict=True)]
                 for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
             ]
+        vector = kernel.types.vector(self.size)
+        value, found_u, found_v, normal, *second = (
+            vector(*each) for each in (value, found_u, found_v, normal, *second)
+        )
         return PatchValues(value, found_u, found_v, normal, tuple(second))
 
     def _parameters(self, du: Float, dv: Float) -> tuple[Float, Float]:
@@ -215,54 +231,49 @@ class Piece:
         return self.s + (a * du + b * dv), self.t + (c * du + d * dv)
 
     def _with_tip(
-        self, tip: Tip, value: Value, by: list, s: Float, t: Float, derivatives: int
-    ) -> tuple[Value, list, tuple[Mask, Value, Value] | None]:
+        self, tip: Tip, value: list, by: list[list], s: Float, t: Float, derivatives: int
+    ) -> tuple[list, list[list], tuple[Mask, list, list] | None]:
         """Add the point and the derivatives at deeper levels to those of pieces.
 
         Also gives where a frame is needed, and its tangents by s and t.
         """
-        kernel, types = self.kernel, self.kernel.types
+        kernel, types, size = self.kernel, self.kernel.types, self.size
         evaluate, frame = kernel.monomials.values, tip.frame
 
-        def control(packet: Index, active: Mask = True) -> Value:
-            return kernel.control(self.buffer, packet, self.size, active)
-
-        def add(k: Index, power: Float, slow_s: Float, slow_t: Float, *sums: Value) -> tuple:
-            row, of_frame = kernel.weights(tip.row + k), []
-            of_value, *of = evaluate(row, s, t, derivatives)
+        def add(k: Index, *sums: Float) -> tuple:
+            weights = evaluate(kernel.weights(tip.row + k), s, t, derivatives)
             if frame is not None:
-                _, *of_frame = evaluate(kernel.weights(frame.row + k, frame.is_needed), s, t)
-            # The first row is no weights, as the first control point is what the others are relative to.
-            is_first = k == 0
-            power = dr.select(is_first, row[0], power)
-            slow_s, slow_t = dr.select(is_first, of[0], slow_s), dr.select(is_first, of[1], slow_t)
-            relative = control(tip.ring + k) - control(tip.ring)
-            # All but the constant are multiplied by the power of the second eigenvalue.
-            weights = [dr.fma(of_value - row[0], power, row[0]), *(each * power for each in of), *of_frame]
-            added = (dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
-            return k + 1, power, slow_s, slow_t, *added
+                weights += evaluate(kernel.weights(frame.row + k, frame.is_needed), s, t)[1:]
+            terms = itertools.product(weights, kernel.control(self.buffer, tip.ring + k, size))
+            return k + 1, *(dr.fma(x, weight, total) for (weight, x), total in zip(terms, sums, strict=True))
 
-        one, zero, sum_count = types.float(1), dr.detach(value) * 0, 1 + len(by) + (0 if frame is None else 2)
-        state = (types.index(0), one, one * 0, one * 0, *(type(zero)(zero) for _ in range(sum_count)))
+        sum_count = size * (1 + len(by) + (0 if frame is None else 2))
         # It sums only, so that derivatives pass through it backwards without a record of its iterations.
         keywords: dict[str, Any] = {"max_iterations": -1} if types.is_jit and dr.grad_enabled(self.buffer) else {}
-        found = dr.while_loop(
-            state, lambda k, *_: k < tip.control_count, add, mode=types.loops, label="tip", **keywords
+        _, *sums = dr.while_loop(
+            # The other control points are relative to the first.
+            (types.index(1), *(types.float(0) for _ in range(sum_count))),
+            lambda k, *_: k < tip.control_count,
+            add,
+            mode=types.loops,
+            label="tip",
+            **keywords,
         )
-        _, _, slow_s, slow_t, of_value, *of = found
-        of, others = of[: len(by)], of[len(by) :]
+        of_value, *of = (sums[i : i + size] for i in range(0, sum_count, size))
         is_deep = tip.control_count > 0
-        of_value = control(tip.ring, is_deep) + of_value
+        point = added(kernel.control(self.buffer, tip.ring, size, is_deep), of_value)
+        value, *by = (added(each, own) for each, own in zip((value, *by), (point, *of), strict=False))
         if kernel.first_term is not None:
-            first = kernel.first_term(s, t, of_value, is_deep)
-            of_value, of[0], of[1] = (each + own for each, own in zip((of_value, of[0], of[1]), first, strict=True))
-        by = [each + own for each, own in zip(by, of, strict=True)]
+            one, of_s, of_t = kernel.first_term(s, t, is_deep)
+            value, by[0], by[1] = added(value, point, one), added(by[0], point, of_s), added(by[1], point, of_t)
         if frame is None:
-            return value + of_value, by, None
-        (by_s, by_t, *_), (other_s, other_t) = by, others
-        frame_s = dr.select(frame.is_uneven, by_s * slow_s + by_t * slow_t, other_s)
-        frame_t = dr.select(frame.is_uneven, other_t * slow_s - other_s * slow_t, other_t)
-        return value + of_value, by, (frame.is_needed, frame_s, frame_t)
+            return value, by, None
+        by_s, by_t, other_s, other_t = *by[:2], *of[-2:]
+        _, slow_s, slow_t = evaluate(kernel.weights(tip.row, frame.is_uneven), s, t)
+        uneven_s, uneven_t = combined(by_s, slow_s, by_t, slow_t), combined(other_t, slow_s, other_s, -slow_t)
+        frame_s = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_s, other_s, strict=True)]
+        frame_t = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_t, other_t, strict=True)]
+        return value, by, (frame.is_needed, frame_s, frame_t)
 
 
 class PieceKernel:
@@ -381,13 +392,9 @@ class PieceKernel:
             size,
         )
 
-    def control(self, buffer: FloatBuffer, packet: Index, size: int, active: Mask = True) -> Value:
+    def control(self, buffer: FloatBuffer, packet: Index, size: int, active: Mask = True) -> list[Float]:
         """The control value in a packet of the coefficients."""
-        return self._vector(self.types.fetch(self.types.vector4, buffer, packet, active), size)
-
-    def _vector(self, numbers: Sequence[Float], size: int) -> Value:
-        """The first of some numbers as one value."""
-        return self.types.vector(size)(*(numbers[i] for i in range(size)))
+        return [*self.types.fetch(self.types.vector4, buffer, packet, active)][:size]
 
     def weights(self, row: Index, active: Mask = True) -> list:
         """A row of the blocks, one number for each monomial."""
@@ -529,14 +536,14 @@ class FirstTerm:
     functions: list[list[float]]
     monomials: Monomials
 
-    def __call__(self, s: Float, t: Float, value: Value, active: Mask) -> tuple[Value, Value, Value]:
-        """What is added to a point and to its two derivatives by the parameters of a child."""
+    def __call__(self, s: Float, t: Float, active: Mask) -> tuple[Float, Float, Float]:
+        """Factors of a point in what is added to it and to its two derivatives by the parameters of a child."""
         total = (s * 0,) * 3
         for coefficients in self.functions:
             function = self.monomials.values([s * 0 + each for each in coefficients], s, t)
             total = tuple(a + b for a, b in zip(total, function, strict=True))  # type: ignore[assignment]
         one, by_s, by_t = (dr.select(active, each, 0) for each in (total[0] - 1, total[1], total[2]))
-        return value * one, value * by_s, value * by_t
+        return one, by_s, by_t
 
 
 _KERNELS: Shared[PieceKernel] = Shared()

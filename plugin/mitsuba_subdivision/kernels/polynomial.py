@@ -41,27 +41,25 @@ class Monomials:
         tuple
             The value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
         """
-        zero = coefficients[0] * 0
-        along_s = []
-        for column in self._columns:
-            along_s.append(_horner([zero if k is None else coefficients[k] for k in column], s, derivatives))
-        value, by_t, *by_tt = _horner([each[0] for each in along_s], t, derivatives)
-        by_s, *by_st = _horner([each[1] for each in along_s if each[1] is not None], t, derivatives - 1)
+        along_s = [
+            _horner([0 if k is None else coefficients[k] for k in column], s, derivatives) for column in self._columns
+        ]
+        value, by_t, by_tt = _horner([each[0] for each in along_s], t, derivatives)
+        by_s, by_st, _ = _horner([each[1] for each in along_s if each[1] is not None], t, derivatives - 1)
         found = [value, by_s, by_t]
         if derivatives == 2:
-            (by_ss,) = _horner([each[2] for each in along_s if each[2] is not None] or [None], t, 0)
-            found += [by_ss, by_st[0], by_tt[0]]
-        return tuple(zero if each is None else each for each in found)
+            by_ss, _, _ = _horner([each[2] for each in along_s if each[2] is not None] or [None], t, 0)
+            found += [by_ss, by_st, by_tt]
+        return tuple(value * 0 if each is None else each for each in found)
 
 
-def _horner(coefficients: list[Value], x: Float, derivatives: int) -> list[Value]:
-    """A polynomial of one variable and so many of its derivatives, at most two; None for those that are zero."""
-    found = [coefficients[-1], *[None] * derivatives]
-    for coefficient in reversed(coefficients[:-1]):
-        for order in range(derivatives, 0, -1):
-            if found[order - 1] is not None:
-                found[order] = found[order - 1] if found[order] is None else dr.fma(found[order], x, found[order - 1])
-        found[0] = dr.fma(found[0], x, coefficient)
-    if derivatives == 2 and found[2] is not None:
-        found[2] = 2 * found[2]
-    return found
+def _horner(coefficients: list[Value], x: Float, derivatives: int) -> tuple[Value, Value, Value]:
+    """A polynomial of one variable and so many of its first two derivatives; None for those that are zero."""
+    value, first, half_second = coefficients[-1], None, None
+    for coefficient in coefficients[-2::-1]:
+        if derivatives == 2 and first is not None:
+            half_second = first if half_second is None else dr.fma(half_second, x, first)
+        if derivatives:
+            first = value if first is None else dr.fma(first, x, value)
+        value = dr.fma(value, x, coefficient)
+    return value, first, None if half_second is None else 2 * half_second

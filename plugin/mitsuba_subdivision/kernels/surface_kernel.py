@@ -278,11 +278,15 @@ class SurfaceKernel:
         is_shifted = follows is not None or dr.grad_enabled(location.u, location.v)
         if values is None or is_moving or derivatives == 2 or is_shifted:
             piece = self._piece(coefficients, location.half_edge, u, v, active)
-            values = piece.values(derivatives=2 if is_shifted else derivatives)
+            evaluated = piece.values(derivatives=2 if is_shifted else derivatives)
+            # Kernels then need not evaluate the surface once more.
+            values = evaluated.at_values(values) if values is not None and is_moving else evaluated
         n = unit(values.normal)
         if derivatives == 1 and not is_shifted:
             return SurfacePoints(location, values.value, n, values.du, values.dv)
-        dn_du, dn_dv = _normal_derivatives(values, n)
+        # Without second derivatives, their own derivatives are not needed.
+        with dr.suspend_grad(when=derivatives == 1):
+            dn_du, dn_dv = _normal_derivatives(values, n)
         if not is_shifted:
             return SurfacePoints(location, values.value, n, values.du, values.dv, dn_du, dn_dv)
         steps = (location.u, location.v) if follows is None else follows.step(values)

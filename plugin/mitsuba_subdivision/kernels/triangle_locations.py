@@ -9,7 +9,7 @@ import numpy as np
 
 from ..tessellation import UniformGrid
 from .element_walk import ElementWalk, Location
-from .types import Float, Index, Mask
+from .types import Float, FloatBuffer, Index, Mask
 
 if TYPE_CHECKING:
     from ..mesh.connectivity import IntArray
@@ -67,8 +67,7 @@ class AdaptiveLocations:
         """See `TriangleLocations`."""
         types = self._types
         half_edge = types.fetch(types.index, self._half_edge, triangle, active)
-        a, b, c = (types.fetch(types.vector2, self._parameters, 3 * triangle + i, active) for i in range(3))
-        u, v = a + b1 * (b - a) + b2 * (c - a)
+        u, v = _inside(types, self._parameters, triangle, b1, b2, active)
         return self._walk.carried(Location(half_edge, u, v), active)
 
 
@@ -108,10 +107,17 @@ class UniformLocations:
             per_corner = max(self._corner_count, 1)
             corner = dr.select(is_whole, 0, local // per_corner)
             pattern = dr.select(is_whole, local, self._whole_count + local % per_corner)
-        a, b, c = (types.fetch(types.vector2, self._parameters, 3 * pattern + i, active) for i in range(3))
-        u, v = a + b1 * (b - a) + b2 * (c - a)
+        u, v = _inside(types, self._parameters, pattern, b1, b2, active)
         location = self._walk.at(element, u, v, corner, active)
         return self._walk.carried(location, active) if self._leave_corners else location
+
+
+def _inside(
+    types: ArrayTypes, parameters: FloatBuffer, triangle: Index, b1: Float, b2: Float, active: Mask
+) -> list[Float]:
+    """Parameters of a point of a triangle, from those of its corners."""
+    corners = (types.fetch(types.vector2, parameters, 3 * triangle + i, active) for i in range(3))
+    return [dr.fma(b1, b - a, dr.fma(b2, c - a, a)) for a, b, c in zip(*corners, strict=True)]
 
 
 class SomeTriangles:

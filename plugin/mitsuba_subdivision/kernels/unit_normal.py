@@ -42,7 +42,7 @@ class UnitNormal:
         Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`.
     bound : RoundingBound, optional
         Of the tangents. Where rounding alone could have made the plane that the tangents span,
-        the normal is zero, too, as in `evaluation.normals.are_collapsed`.
+        the normal is zero, too, as in `evaluation.normals.unit_normals`.
 
     Attributes
     ----------

@@ -15,7 +15,8 @@ from .types import Float, Vector3
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
     """Scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    (a_x, a_y, a_z), (b_x, b_y, b_z) = a, b
+    return dr.fma(a_x, b_x, dr.fma(a_y, b_y, a_z * b_z))
 
 
 def cross(a: Vector3, b: Vector3) -> Vector3:
@@ -43,6 +44,11 @@ def unit(vector: Vector3) -> Vector3:
 def added(a: Vector3, b: Vector3, factor: Float = 1) -> Vector3:
     """A vector, and another times a factor."""
     return like([dr.fma(y, factor, x) for x, y in zip(a, b, strict=True)], a)
+
+
+def combined(a: Sequence[Float], by_a: Float, b: Sequence[Float], by_b: Float) -> list[Float]:
+    """The sum of a vector times a factor and another times another, of any number of components."""
+    return [dr.fma(x, by_a, y * by_b) for x, y in zip(a, b, strict=True)]
 
 
 def like(components: list, vector: Vector3) -> Vector3:

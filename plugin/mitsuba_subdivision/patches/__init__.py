@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from .closest_points import ClosestPoints, ClosestPointSearch
     from .element_bounds import ElementBounds
     from .energies import energy_matrix, gradients, hessians
-    from .patch_samples import evaluate_patches
+    from .patch_samples import PatchSampler
     from .patch_table import PatchClass, PatchTable
     from .piece_table import PieceTable
     from .polynomial_pieces import SurfacePieces
@@ -29,6 +29,7 @@ __all__ = [
     "ElementBounds",
     "LinearChannel",
     "PatchClass",
+    "PatchSampler",
     "PatchTable",
     "PieceTable",
     "SamplingCells",
@@ -39,7 +40,6 @@ __all__ = [
     "SurfacePieces",
     "contracts_alike",
     "energy_matrix",
-    "evaluate_patches",
     "gradients",
     "hessians",
     "sample_matrices",
@@ -57,6 +57,7 @@ __getattr__ = deferred(
         "ElementBounds": "element_bounds",
         "LinearChannel": "channel",
         "PatchClass": "patch_table",
+        "PatchSampler": "patch_samples",
         "PatchTable": "patch_table",
         "PieceTable": "piece_table",
         "SamplingCells": "sampling_cells",
@@ -67,7 +68,6 @@ __getattr__ = deferred(
         "SurfacePieces": "polynomial_pieces",
         "contracts_alike": "channel",
         "energy_matrix": "energies",
-        "evaluate_patches": "patch_samples",
         "gradients": "energies",
         "hessians": "energies",
         "sample_matrices": "stencil_matrices",

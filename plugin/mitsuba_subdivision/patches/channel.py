@@ -17,7 +17,7 @@ from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from ..schemes.scheme_members import has_phantom_points
-from .patch_samples import evaluate_patches
+from .patch_samples import PatchSampler
 from .patch_table import PatchTable
 from .stencil_matrices import value_matrix
 
@@ -122,12 +122,16 @@ class SubdividedChannel(_OfLayout):
     values: FloatArray
 
     def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at samples, given as for `evaluate_patches`."""
+        """``(s, k)`` values at samples, given as for `PatchSampler.evaluate`."""
         return self.with_derivatives(half_edge, uv)[0]
 
     def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values, and derivatives by u and by v; at extraordinary points, tangents as of points."""
-        return evaluate_patches(self.patches, self.values, self.value_index, half_edge, uv).values
+        return self._sampler.evaluate(half_edge, uv).values
+
+    @cached_property
+    def _sampler(self) -> PatchSampler:
+        return PatchSampler(self.patches, self.values, self.value_index)
 
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
@@ -158,7 +162,7 @@ class LinearChannel(_OfLayout):
     values: FloatArray
 
     def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at samples, given as for `evaluate_patches`."""
+        """``(s, k)`` values at samples, given as for `PatchSampler.evaluate`."""
         return self.with_derivatives(half_edge, uv)[0]
 
     def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:

@@ -130,6 +130,21 @@ class PatchTable:
         return self._classes[1]
 
     @cached_property
+    def rings(self) -> IndexArray:
+        """`controls`, those of each patch together, for samples that jump from patch to patch."""
+        return np.concatenate([each.controls.ravel() for each in self.classes])
+
+    @cached_property
+    def first_controls(self) -> IntArray:
+        """``(c,)`` `PatchClass.first_control` of each class."""
+        return np.array([each.first_control for each in self.classes], dtype=np.int64)
+
+    @cached_property
+    def control_counts(self) -> IntArray:
+        """``(c,)`` K of each class."""
+        return np.array([each.controls.shape[1] for each in self.classes], dtype=np.int64)
+
+    @cached_property
     def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
         order, bounds = self._order
         members = np.split(gathered(self._patch_codes[0], order), bounds)
@@ -137,6 +152,8 @@ class PatchTable:
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
             for corners in counted(members, "Classes of patches")
         ]
+        if self._has_local_borders:
+            signatures = [signature.near() for signature in signatures]
         # Semi-sharpness changes no one-ring.
         rings = [one_ring(signature.smoothed) for signature in signatures]
         counts = [ring.vertex_count for ring in rings]
@@ -266,9 +283,13 @@ class PatchTable:
             codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + unused)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
 
+    @property
+    def _has_local_borders(self) -> bool:
+        return bool(optional_member(self.scheme, "has_local_borders"))
+
     def _fan_codes(self) -> IntArray:
         """``(n_h,)`` code of the fan around the mesh's vertex at each corner of `elements`, see `one_ring_codes`."""
-        codes = fan_codes(self.topology)
+        codes = fan_codes(self.topology, near=self._has_local_borders)
         return codes if self.elements is self.topology else codes[self.half_edge_of_corner]
 
     def _keys(self, fans: IntArray, corners: IntArray, corner_count: int) -> list[IntArray]:

@@ -42,11 +42,11 @@ COEFFICIENT_BYTES = 1 << 29
 class PieceTable:
     """The pieces of all patches, and the neighbours of elements.
 
-    An element is named by one of its half-edges, and parameters are seen from there, as in `evaluate_patches`.
+    An element is named by one of its half-edges, and parameters are seen from there, as in `PatchSampler.evaluate`.
 
     *Coefficients* depend on the control points: for each patch, in packets of four numbers, the control points of its
-    one-ring if the patch has tips, each padded to a packet; then the polynomials of its pieces, three
-    numbers for each monomial, padded to whole packets.
+    one-ring if the patch has tips, each padded to a packet and all but the first relative to that; then the polynomials
+    of its pieces, three numbers for each monomial, padded to whole packets.
 
     Attributes
     ----------

@@ -89,7 +89,7 @@ def sample_matrices(
     uv: FloatArray,
     derivatives: int = 1,
 ) -> StencilMatrices:
-    """Limit stencils of samples, given as for `evaluate_patches`.
+    """Limit stencils of samples, given as for `PatchSampler.evaluate`.
 
     Parameters
     ----------

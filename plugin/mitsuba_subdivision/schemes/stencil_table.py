@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .domain import FloatArray
 
@@ -57,6 +58,13 @@ class StencilTable:
 
         shape = self.row_count, self.column_count
         return sparse.coo_array((self.weights, (self.rows, self.columns)), shape=shape).tocsr()
+
+    def chosen(self, rows: IntArray) -> StencilTable:
+        """Stencils of some refined vertices, as a table of as many rows."""
+        counts = np.bincount(self.rows, minlength=self.row_count)
+        entries = np.argsort(self.rows, kind="stable")[ragged.ranges(ragged.offsets(counts)[rows], counts[rows])]
+        own = np.repeat(np.arange(len(rows)), counts[rows])
+        return StencilTable(len(rows), self.column_count, own, self.columns[entries], self.weights[entries])
 
     def dense(self, rows: IntArray) -> FloatArray:
         """Stencils of some refined vertices, ``(len(rows), column_count)``."""

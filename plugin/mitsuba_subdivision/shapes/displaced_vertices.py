@@ -21,9 +21,9 @@ from ..kernels.displacement import displaced
 from ..kernels.element_walk import Location
 from ..kernels.piece_kernel import PatchValues
 from ..kernels.types import Float, FloatBuffer, Vector3
-from ..kernels.vectors import cross, unit
+from ..kernels.vectors import unit
 from ..mesh.connectivity import IntArray
-from ..patches import contracts_alike, evaluate_patches
+from ..patches import PatchSampler, contracts_alike
 from ..schemes.domain import FloatArray
 
 if TYPE_CHECKING:
@@ -85,9 +85,8 @@ class VertexLocations:
         found = np.ones(len(self.corner), dtype=bool)
         corners = np.flatnonzero((self.uv == 0).all(axis=1))
         cage = surface.cage
-        samples = evaluate_patches(
-            surface.patches, cage.positions, cage.cut_mesh.vertex, self.corner[corners], self.uv[corners]
-        )
+        sampler = PatchSampler(surface.patches, cage.positions, cage.cut_mesh.vertex)
+        samples = sampler.evaluate(self.corner[corners], self.uv[corners])
         points = corners[samples.level == AT_EXTRAORDINARY_POINT]
         found[points] = contracts_alike(channel, surface.patches, self.corner[points])
         return found
@@ -246,18 +245,12 @@ class DisplacedTableVertices:
 
     def _limit(self, points: FloatBuffer) -> PatchValues:
         """The undisplaced limit surface at the vertices."""
-        samples = evaluate_patches(
-            self._surface.patches,
-            np.array(points, dtype=np.float64).reshape(-1, 3),
-            self._surface.cage.cut_mesh.vertex,
-            self._locations.corner,
-            self._locations.uv,
-            derivatives=2,
-        )
+        points, vertex = np.array(points, dtype=np.float64).reshape(-1, 3), self._surface.cage.cut_mesh.vertex
+        sampler = PatchSampler(self._surface.patches, points, vertex)
+        samples = sampler.evaluate(self._locations.corner, self._locations.uv, derivatives=2)
         # Second derivatives do not exist at extraordinary points.
         value, du, dv, *second = (_columns(each) for each in np.nan_to_num(samples.values))
-        normal = cross(*(_columns(each) for each in samples.frame))
-        return PatchValues(value, du, dv, normal, tuple(second))
+        return PatchValues(value, du, dv, _columns(samples.normal), tuple(second))
 
     def _mean(self, vectors: FloatArray) -> FloatArray:
         """For each vertex, the mean of the vectors of all copies of it."""

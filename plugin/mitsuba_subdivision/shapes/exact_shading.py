@@ -22,7 +22,7 @@ from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
-from ..kernels.vectors import dot
+from ..kernels.vectors import added, dot
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
@@ -30,6 +30,7 @@ from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
 from ..variants import Variant
 from .attribute_parameters import WIDTHS, mesh_name
+from .placement import Placement
 
 if TYPE_CHECKING:
     from ..tessellation import VertexTable
@@ -141,7 +142,7 @@ class ExactShading:
         self.side = _side_of(shape)
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
-    def set_transform(self, to_world: Matrix4, coefficients: FloatBuffer, *, mirrors: bool) -> None:
+    def set_transform(self, to_world: Matrix4, coefficients: FloatBuffer, placement: Placement) -> None:
         """Set the transformation and coefficients; derivatives by both reach surface interactions.
 
         Parameters
@@ -150,13 +151,14 @@ class ExactShading:
             From points relative to the centre to the world.
         coefficients : flat array
             The kernel's coefficients, maybe with derivatives.
-        mirrors : bool
-            Whether the map is a reflection, which turns triangles over.
+        placement : Placement
+            Of the same transformation.
         """
-        self._are_turned = mirrors
+        self._are_turned = placement.mirrors
         self.kernel.take(coefficients)
         # Assign into the same array, because others may hold a reference to it.
         self.to_world[:] = self.kernel.types.matrix4(to_world)
+        self._map = AffineMap.of(dr.detach(self.to_world), self.kernel.types.matrix4(placement.inverse))
 
     def channel(self, name: str) -> ChannelKernel:
         """An attribute of the cage on the surface, or its texture coordinates; the same object each time."""
@@ -187,26 +189,26 @@ class ExactShading:
         flags: int,
         active: Mask,
     ) -> None:
-        """Complete a surface interaction; see `InteractionHook`."""
+        """Complete a surface interaction as Mitsuba asks for it."""
         kernel, vector3 = self.kernel, self.kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:
             b1, b2 = b2, b1
         # Without derivatives, less is traced.
         moves = not flags & _DETACHES and self._is_moving()
-        to_world = self._map(moves=moves)
-        hit = dr.detach(to_world.inverse_point(vector3(dr.detach(si.p))))
+        hit = self._map.inverse_point(vector3(dr.detach(si.p)))
         along = vector3(dr.detach(ray.d))
-        d = dr.detach(to_world.inverse_direction(along))
+        d = self._map.inverse_direction(along)
         location = self._triangles(preliminary.prim_index, b1, b2, active)
         # Search no further than the triangle's size, nor than the ray's length: its origin is in front of the surface.
         # Both are lengths in the world, where they are compared along the ray.
         sides = vector3(dr.detach(si.dp_du)), vector3(dr.detach(si.dp_dv))
         size = dr.maximum(*(dot(side, side) for side in sides))
         farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(along, along))), dr.detach(si.t)) * dr.sqrt(dot(d, d))
-        facing = dot(vector3(dr.detach(si.n)), along) * self._sign
-        hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing)
+        facing = dot(vector3(dr.detach(si.n)), along)
+        hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing * self._sign)
         self._count(hits.kind, active)
+        to_world = AffineMap.of(self.to_world) if moves and dr.grad_enabled(self.to_world) else self._map
         lines = None
         if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
             o, along = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
@@ -223,7 +225,7 @@ class ExactShading:
         found = found.placed(to_world)
         if flags & _PARAMETERS:
             self._set_parameters(si, found, active)
-        self._fill_in(si, ray, found, is_before)
+        self._fill_in(si, found, is_before, vector3(ray.o), vector3(ray.d), facing)
 
     def _count(self, kind: Index, active: Mask) -> None:
         """At the log level Debug, count hits by kind, and log the counts of the last kernel."""
@@ -251,14 +253,14 @@ class ExactShading:
         return counts
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
-        """Value of an attribute; see `InteractionHook`."""
+        """Value of an attribute as Mitsuba asks for it."""
         if name not in self._attributes:
             return None
         vector3 = self.kernel.types.vector3
         # The interaction keeps the triangle, but not the location. A line through its point along the ray finds the
         # location again; along the mirrored ray where a BSDF has swapped front and back.
         start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
-        to_world, wi = self._map(moves=False), dr.detach(si.wi)
+        to_world, wi = self._map, dr.detach(si.wi)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
         location = self.kernel.line_hits(
             hit, to_world.inverse_direction(self._direction(si, wi)), start, active
@@ -276,10 +278,6 @@ class ExactShading:
         arrays = [] if displacement is None else displacement.variables()
         return bool(dr.grad_enabled(self.kernel.coefficients, self.to_world, *arrays))
 
-    def _map(self, *, moves: bool) -> AffineMap:
-        """Map from object space to the world, with derivatives by its matrix or without."""
-        return AffineMap.of(self.to_world if moves else dr.detach(self.to_world), self.kernel.types.vector3)
-
     def _direction(self, si: mi.SurfaceInteraction3f, wi: Vector3) -> Vector3:
         """Direction of the ray at an interaction; the normal of an interaction without a ray."""
         vector3 = self.kernel.types.vector3
@@ -292,21 +290,33 @@ class ExactShading:
             return location.u, location.v
         return self._texcoords(location, active)[0]
 
-    def _fill_in(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, found: SurfacePoints, is_before: Mask) -> None:
-        variant = self._variant
-        exists = dr.squared_norm(found.n) > 0
-        n, side = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n), self.side()
-        n = _facing(n, ray.d, dr.dot(si.n, ray.d))  # type: ignore[misc]  # The stub is wrong.
+    def _fill_in(
+        self, si: mi.SurfaceInteraction3f, found: SurfacePoints, is_before: Mask, o: Vector3, d: Vector3, facing: Float
+    ) -> None:
+        """Set the normals, and the point that rays leave from.
+
+        Parameters
+        ----------
+        is_before : mask
+            Where the surface is in front of the triangle.
+        o, d : 3-vectors
+            The ray.
+        facing : float array
+            Below zero where the ray meets the triangle from outside.
+        """
+        variant, side = self._variant, self.side()
         if side is Side.EMITTER:
             return
+        exists = dot(found.n, found.n) > 0
+        n = dr.select(exists, variant.Normal3f(found.n * self._sign), si.n)
+        n = _facing(n, dr.detach(d), facing)
         si.sh_frame.n = n
         if side is Side.TRANSMISSIVE:
             return
         # If the surface lies behind the triangle, the ray leaves from the triangle, in front of all triangles.
-        p = variant.Point3f(found.p)
-        t = dr.dot(p - ray.o, ray.d) / dr.squared_norm(ray.d)
+        t = dot(found.p - o, d) / dot(d, d)
         is_before &= t > 0
-        si.p, si.t = dr.select(is_before, p, si.p), dr.select(is_before, t, si.t)
+        si.p, si.t = dr.select(is_before, variant.Point3f(found.p), si.p), dr.select(is_before, t, si.t)
         si.n = n
 
     def _set_parameters(self, si: mi.SurfaceInteraction3f, found: SurfacePoints, active: Mask) -> None:
@@ -328,16 +338,17 @@ class ExactShading:
             si.dn_du, si.dn_dv = (variant.Vector3f(each) for each in tangents[1])
 
 
-def _facing(n: Vector3, d: Vector3, side: Float) -> Vector3:
+def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
     """Normals that face a ray from the same side as the triangle.
 
     Where a triangle sticks out beyond a silhouette, the surface nearby may face away, and would be black. There the
     normal is turned to that of the silhouette: nearly perpendicular to the ray.
     """
-    d = dr.detach(d) * dr.rsqrt(dr.squared_norm(dr.detach(d)))
-    least = dr.select(side < 0, -GRAZING, GRAZING)
-    turned = dr.normalize(dr.detach(n) + d * (least - dr.dot(dr.detach(n), d)))
-    return dr.select(dr.dot(n, d) * side < 0, turned, n)
+    own, inverse = dr.detach(n), dr.rsqrt(dot(d, d))
+    cosine = dot(own, d) * inverse
+    least = dr.select(facing < 0, -GRAZING, GRAZING)
+    turned = added(own, d, (least - cosine) * inverse)
+    return dr.select(cosine * facing < 0, turned * dr.rsqrt(dot(turned, turned)), n)
 
 
 def _side_of(shape: mi.Mesh) -> Callable[[], Side]:

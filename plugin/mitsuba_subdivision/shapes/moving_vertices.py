@@ -148,7 +148,7 @@ class MovingVertices:
             if attached:
                 moved |= dr.custom(Watched, attached, on_backward)
         if shading is not None:
-            shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), mirrors=placement.mirrors)
+            shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
         return moved
 
 

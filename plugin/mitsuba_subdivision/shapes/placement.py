@@ -94,6 +94,8 @@ class Placement:
     ----------
     matrix : 4x4 matrix
         Of Dr.Jit, with derivatives if the parameter has any; of NumPy in scalar variants.
+    inverse : 4x4 matrix
+        Of the parameter alone, without derivatives.
     is_identity : bool
         Whether it is the identity and has no derivatives.
     mirrors : bool
@@ -101,6 +103,7 @@ class Placement:
     """
 
     matrix: Matrix4
+    inverse: Matrix4
     is_identity: bool
     mirrors: bool
 
@@ -118,10 +121,15 @@ class Placement:
         centre : (3,) float64 or None
         """
         is_jit = dr.is_jit_v(to_world.matrix)
-        matrix = to_world.matrix if is_jit else value
+        matrix, inverse = to_world.matrix if is_jit else value, np.linalg.inv(value)
         if centre is not None:
             shift = np.eye(4)
             shift[:3, 3] = centre
             matrix = matrix @ (type(matrix)(shift) if is_jit else shift)
         is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)
-        return cls(matrix, is_identity, bool(np.linalg.det(value[:3, :3]) < 0))
+        return cls(
+            matrix,
+            type(matrix)(inverse.tolist()) if is_jit else inverse,
+            is_identity,
+            bool(np.linalg.det(value[:3, :3]) < 0),
+        )

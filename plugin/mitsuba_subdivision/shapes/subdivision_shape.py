@@ -148,7 +148,7 @@ def make_subdivision(variant: Variant) -> type:
             )
             if self._exact is not None:
                 from .device_state import DeviceState
-                from .hook.interaction_hook import interaction_hook
+                from .mitsuba_3_9_hook.interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
@@ -270,7 +270,7 @@ def make_subdivision(variant: Variant) -> type:
             self._placement = Placement.of(self.to_world, matrix, self._points.centre)
             if is_jit:
                 # Literals would be compiled into kernels.
-                dr.make_opaque(self.to_world, self._placement.matrix)
+                dr.make_opaque(self.to_world, self._placement.matrix, self._placement.inverse)
 
         def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
             """Evaluate the moving buffers, and update exact shading."""

@@ -15,7 +15,6 @@ from ..cage import ControlCage
 from ..cage.attributes import Attribute
 from ..cage.errors import CageError
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..evaluation.normals import unit_normals
 from ..mesh.shared import Shared
 from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
         ClosestPoints,
         ClosestPointSearch,
         ElementBounds,
+        PatchSampler,
         PatchTable,
         PieceTable,
         SamplingCells,
@@ -161,12 +161,14 @@ class LimitSurface:
         self, half_edge: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
     ) -> SurfaceSamples:
         """Evaluate parameters, each counted from a half-edge of `PatchTable.elements`."""
-        found = patches.evaluate_patches(
-            self.patches, self.cage.positions, self.cage.cut_mesh.vertex, half_edge, uv, evaluator, dtype, derivatives
-        )
+        found = self._sampler.evaluate(half_edge, uv, evaluator, dtype, derivatives)
         p, dp_du, dp_dv, *second = found.values
         more = [*second, *found.curvature] if derivatives == 2 else []
-        return SurfaceSamples(p, dp_du, dp_dv, unit_normals(*found.frame), found.level, *more)
+        return SurfaceSamples(p, dp_du, dp_dv, found.normal, found.level, *more)
+
+    @cached_property
+    def _sampler(self) -> PatchSampler:
+        return patches.PatchSampler(self.patches, self.cage.positions, self.cage.cut_mesh.vertex)
 
     def matrix(self, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0, derivatives: int = 1) -> StencilMatrices:
         """Weights of control points in samples, as sparse matrices: `evaluate` as linear maps.

@@ -87,7 +87,7 @@ class DisplacementBound:
     Attributes
     ----------
     heights : callable
-        Finds heights ``(s,)`` of samples, given as for `evaluate_patches`.
+        Finds heights ``(s,)`` of samples, given as for `PatchSampler.evaluate`.
     extent : float
         Largest distance that any point moves.
     """

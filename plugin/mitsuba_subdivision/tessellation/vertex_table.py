@@ -120,7 +120,7 @@ class VertexTable:
                 extent = np.maximum(extent, LEAST_EXTENT[64] * np.abs(origin))
             frame_weights = block.of_vertices(block.frame_weights.astype(dtype))
             positions[block.vertices] = (values[0] + block.of_patches(origin)).T
-            normals[block.vertices] = unit_normals(values[1].T, values[2].T, frame_weights, block.of_patches(extent).T)
+            normals[block.vertices] = unit_normals(values[1:3], frame_weights, block.of_patches(extent)).T
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
