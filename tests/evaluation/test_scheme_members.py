@@ -20,8 +20,15 @@ REQUIRED = (
     *("edge_turn", "unsupported", "refine", "children", "regular_basis"),
 )
 OPTIONAL = {
-    CatmullClark: ("phantom_points", "splits_corners", "has_convex_rules", "crease_method", "triangle_rule"),
-    Loop: ("phantom_points", "has_convex_rules", "crease_method"),
+    CatmullClark: (
+        "phantom_points",
+        "splits_corners",
+        "has_convex_rules",
+        "has_local_borders",
+        "crease_method",
+        "triangle_rule",
+    ),
+    Loop: ("phantom_points", "has_convex_rules", "has_local_borders", "crease_method"),
     DooSabin: ("phantom_points", "regular_border_faces", "has_convex_rules"),
 }
 CLOSED = {CatmullClark: cube(), Loop: extraordinary_triangles(5), DooSabin: cube()}
@@ -193,6 +200,7 @@ WRONG = {
     "regular_border_faces": [None, 0, "2", 1.5],
     "splits_corners": [None, 1, "yes"],
     "has_convex_rules": [None, 1, "yes"],
+    "has_local_borders": [None, 1, "yes"],
     "crease_method": [1, "normal", ["uniform"]],
     "triangle_rule": [0.47, "smoothed"],
     "unsupported": [None, 3],
@@ -205,9 +213,18 @@ WRONG = {
 def test_every_optional_member_has_a_default_and_is_damaged_here():
     declared = OptionalMembers.__annotations__
     assert set(declared) <= set(WRONG)
-    assert {name: optional_member(object(), name) for name in declared} == {
-        name: vars(OptionalMembers)[name] for name in declared
-    }
+    defaults = {name: optional_member(object(), name) for name in declared}
+    assert defaults == {name: vars(OptionalMembers)[name] for name in declared}
+    # Nothing is claimed of a scheme that does not say so.
+    assert not any(defaults.values())
+
+
+@EVERY_SCHEME
+def test_our_schemes_have_convex_rules_and_say_so(original):
+    scheme = original()
+    weights = scheme.refine(CLOSED[original].topology).stencils.matrix.toarray()
+    assert weights.min() >= 0
+    assert scheme.has_convex_rules
 
 
 @pytest.mark.parametrize(
@@ -219,6 +236,11 @@ def test_a_member_of_another_kind_or_shape_is_named(member, number):
         register_scheme(scheme)
     with pytest.raises(SchemeError):
         LimitSurface(cube(), scheme)
+
+
+def test_a_domain_with_other_children_is_named():
+    with pytest.raises(SchemeError, match=r"domain is .*; expected SQUARE or TRIANGLE"):
+        require_members(Members(CatmullClark(), domain=type(SQUARE)("square", SQUARE.corners, QUARTER)))
 
 
 def test_three_faces_may_meet_at_a_regular_vertex():
@@ -432,3 +454,27 @@ def test_tables_of_stencils_may_come_from_matrices():
     scheme = Members(CatmullClark(), refine=refined(stencils=lambda r: StencilTable.from_matrix(r.stencils.matrix)))
     register_scheme(scheme)
     use(cube())
+
+
+def test_local_borders_have_weights_of_neighbours_on_the_border_only():
+    original = CatmullClark()
+
+    def refined(topology, row, other, share):
+        """Rules that give a share of the first vertex to another, if that is on a border with more than three faces."""
+        refinement = original.refine(topology)
+        matrix = refinement.stencils.matrix.toarray()
+        if topology.is_border_vertex[0] and topology.vertex_face_count[0] > 3:
+            matrix[row, [0, other]] += -share, share
+        return Refinement(refinement.topology, StencilTable.from_matrix(scipy.sparse.csr_array(matrix)))
+
+    def by_inner_vertex(topology):
+        return refined(topology, 0, topology.face_vertices[2], 0.01)
+
+    def by_valence(topology):
+        first_edge = topology.vertex_count + topology.edge[0]
+        return refined(topology, first_edge, topology.face_vertices[1], 0.01 * topology.vertex_face_count[0])
+
+    with pytest.raises(SchemeError, match=r"refine returns a weight of .* of an inner vertex .*has_local_borders"):
+        register_scheme(Members(original, refine=by_inner_vertex))
+    with pytest.raises(SchemeError, match=r"refine returns other weights at a border of 8 faces .*has_local_borders"):
+        register_scheme(Members(original, refine=by_valence))

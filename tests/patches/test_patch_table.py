@@ -5,10 +5,11 @@ import pytest
 from mitsuba_subdivision.cage import ControlCage
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mesh.one_ring import one_ring
-from mitsuba_subdivision.mesh.signature import signature_at
+from mitsuba_subdivision.mesh.signature import NEAR_FACES, signature_at
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
+from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
 
@@ -53,6 +54,25 @@ def test_patches_of_a_class_have_its_signature_and_others_have_not(scheme, name)
     assert len(set(classes)) == len(classes)
 
 
+def test_patches_of_a_class_see_the_same_near_faces_of_large_fans():
+    # Two fans that differ in their numbers of faces, each of mixed sizes.
+    faces, centre = [], 0
+    for count in (NEAR_FACES + 6, 2 * NEAR_FACES):
+        for i in range(centre + 1, centre + 2 * count, 2):
+            faces.append([centre, i, i + 2] if i % 3 else [centre, i, i + 1, i + 2])
+        centre += 2 * count + 2
+    table = PatchTable(mesh_of(centre, faces), scheme_named("catmull_clark"))
+    for patch_class in table.classes:
+        assert {signature_of(table, corner).near() for corner in patch_class.corners} == {patch_class.signature}
+        start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
+        for controls, ends in zip(patch_class.controls, zip(start, end, strict=True), strict=True):
+            assert {*ends} <= {*controls}
+    signatures = [least_turn(patch_class.signature, 4) for patch_class in table.classes]
+    assert len(set(signatures)) == len(signatures)
+    # Far from the ends of both fans there are three kinds of faces, and so three of each of their corners.
+    assert table.class_count < table.patch_count / 2
+
+
 @EVERY_SURFACE
 def test_controls_are_the_one_rings(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
@@ -67,10 +87,10 @@ def test_controls_are_the_one_rings(scheme, name):
 
 
 @EVERY_SURFACE
-def test_patch_of_corner_leads_back_to_it(scheme, name):
+def test_the_patch_at_a_corner_leads_back_to_it(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
     elements = table.elements
-    classes, patches, turns = table.patch_of_corner
+    classes, patches, turns = table.patch_at(np.arange(elements.half_edge_count))
     for corner in range(elements.half_edge_count):
         found = table.classes[classes[corner]].corners[patches[corner]]
         for _ in range(turns[corner]):

@@ -3,17 +3,22 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.mesh.signature import NEAR_FACES
+from mitsuba_subdivision.schemes import CatmullClark, Loop
 
 pytestmark = pytest.mark.core
 
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 # Of which weights would take tens of gigabytes.
 TOO_HIGH = 20_000
-# Beside creases every face of a fan has weights of its own.
-TOO_HIGH_BESIDE_CREASES = 600
 HIGH = 300
 # Roundings of a circle's points, and of sums over them.
 ROUNDED = 1e-12
+# Roundings of eigenbases of fans, in points of size one and in unit normals: eigenvalues of fans are close.
+ROUNDED_POINT = 1e-13
+ROUNDED_NORMAL = 1e-9
+# Levels at which the published form, which multiplies by the rules' matrix for each, still has that precision.
+FEW_LEVELS = 8
 
 
 def circle(count):
@@ -33,11 +38,12 @@ def test_a_vertex_of_too_high_a_valence_is_named(scheme):
         LimitSurface(pyramid(TOO_HIGH), scheme).tessellate(1)
 
 
-def test_a_fan_beside_a_crease_is_refused_sooner():
-    count = TOO_HIGH_BESIDE_CREASES
-    creases = [[count, 0, 10], [count, count - 1, 10]]
-    with pytest.raises(MemoryError, match=rf"vertex {count} has {count - 1} faces beside a crease or boundary"):
-        LimitSurface(pyramid(count, creases=creases), "catmull_clark").tessellate(1)
+@pytest.mark.parametrize(
+    ("count", "sharpness", "where"), [(600, 10, "at the end of a crease"), (3000, 2.5, "and something semi-sharp")]
+)
+def test_a_fan_whose_faces_have_weights_of_their_own_is_refused_sooner(count, sharpness, where):
+    with pytest.raises(MemoryError, match=rf"vertex {count} has {count} faces {where}; .* GB .*several vertices"):
+        LimitSurface(pyramid(count, creases=[[count, 0, sharpness]]), "catmull_clark").tessellate(1)
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
@@ -59,3 +65,47 @@ def test_a_regular_pyramid_has_its_symmetry_at_a_high_valence(scheme):
     np.testing.assert_allclose(samples.n[:-1] @ turn.T, samples.n[1:], rtol=0, atol=ROUNDED)
     top = surface.evaluate(element, [[1, 1]] if scheme == "doo_sabin" else [[0, 0]], corner)
     np.testing.assert_allclose(top.n, np.tile([0, 0, 1], (HIGH, 1)), rtol=0, atol=ROUNDED)
+
+
+def open_fan(count, triangles_only, rng):
+    """Faces around a vertex on the border, along half an uneven ellipse; each third one may be a quadrilateral."""
+    rim = circle(2 * count)[: count + 1] * [1, 1.5, 1] + 0.02 * rng.standard_normal((count + 1, 3))
+    quads = [] if triangles_only else range(0, count, 3)
+    beyond = {i: [count + 2 + number] for number, i in enumerate(quads)}
+    faces = [[count + 1, i, *beyond.get(i, []), i + 1] for i in range(count)]
+    return np.concatenate([rim, [[0, 0, 0.4]], 1.3 * rim[list(quads)]]), faces
+
+
+class WholeCatmullClark(CatmullClark):
+    has_local_borders = False
+
+
+class WholeLoop(Loop):
+    has_local_borders = False
+
+
+@pytest.mark.parametrize(
+    ("scheme", "whole", "corner"),
+    [(CatmullClark(), WholeCatmullClark(), 0), (Loop(), WholeLoop(), 0), (Loop(), WholeLoop(), 10)],
+    ids=["catmull_clark", "loop", "loop corner"],
+)
+def test_far_faces_of_a_fan_do_not_matter(scheme, whole, corner, np_rng):
+    """The surface by the near faces is that by all faces of a fan, and that by the rules, level by level."""
+    count = NEAR_FACES + 5
+    points, faces = open_fan(count, scheme.name == "loop", np_rng)
+    cage = ControlCage(points, faces, corners=[[count + 1, corner]] if corner else [])
+    # Quadrilaterals and triangles, at both borders and between.
+    element = np.array([0, NEAR_FACES // 2, count - 3])
+    for level in (1, FEW_LEVELS, 45):
+        uv = np.tile([0.6, 0.31], (len(element), 1)) * 2.0**-level
+        found, expected = (LimitSurface(cage, each).evaluate(element, uv) for each in (scheme, whole))
+        np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=ROUNDED_POINT)
+        np.testing.assert_allclose(found.n, expected.n, rtol=0, atol=ROUNDED_NORMAL)
+        if level <= FEW_LEVELS:
+            by_rules = LimitSurface(cage, whole).evaluate(element, uv, evaluator="power")
+            np.testing.assert_allclose(found.p, by_rules.p, rtol=0, atol=ROUNDED_POINT)
+            np.testing.assert_allclose(found.n, by_rules.n, rtol=0, atol=ROUNDED_NORMAL)
+    # The limit at the vertex depends on no other faces than those on the border.
+    found, expected = (LimitSurface(cage, each).evaluate(element, [[0, 0]]) for each in (scheme, whole))
+    np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=ROUNDED_POINT)
+    assert (found.n[:, 2] > 0).all()

@@ -39,6 +39,9 @@ from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_togethe
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 # After this many refinements an element consists of pieces.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
+# Stencils of children with more weights are not kept, but made anew: around vertices of high valence each face has its
+# own.
+KEPT_WEIGHTS = 1 << 14
 
 
 class PartKind(IntEnum):
@@ -66,7 +69,8 @@ class DividedElement:
         self.control_count = one_ring(signature.smoothed).vertex_count
         self._steady = _steady_refinements(scheme, signature)
         self._refined: tuple[RefinedRings, int] | None = None
-        self._children: dict[int, tuple[DividedElement, FloatArray]] = {}
+        self._children: dict[int, DividedElement] = {}
+        self._stencils: dict[int, FloatArray] = {}
 
     @cached_property
     def piece(self) -> Piece | None:
@@ -107,16 +111,40 @@ class DividedElement:
 
     def child(self, number: int) -> tuple[DividedElement, FloatArray]:
         """One of the children, and its control points over those of the element: ``(K_child, K)`` float64."""
+        element = self.child_element(number)
+        if number in self._stencils:
+            return element, self._stencils[number]
+        rings, ring = self.base._rings
+        stencils = rings.stencils(ring, number)
+        if stencils.size <= KEPT_WEIGHTS:
+            self._stencils[number] = stencils
+        return element, stencils
+
+    def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
+        """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element."""
+        if self.control_count * rows.shape[2] <= KEPT_WEIGHTS:
+            return rows @ self.child(number)[1]
+        # Nearly all weights of so many are zero.
+        rings, _ = self.base._rings
+        found = rings.table(number).matrix.T @ rows.reshape(-1, rows.shape[2]).T
+        return found.T.reshape(*rows.shape[:2], -1)
+
+    def child_element(self, number: int) -> DividedElement:
+        """One of the children."""
         if number not in self._children:
             rings, ring = self.base._rings
-            signature, stencils = rings.child(ring, number)
-            self._children[number] = element_of(self.scheme, signature.sharpened(self._steady)), stencils
+            self._children[number] = element_of(self.scheme, rings.signature(ring, number).sharpened(self._steady))
         return self._children[number]
 
     @property
     def children(self) -> list[tuple[DividedElement, FloatArray]]:
-        """All children; none of a piece."""
+        """All children, as `child` gives them; none of a piece."""
         return [] if self.piece is not None else [self.child(number) for number in range(len(self.domains))]
+
+    @property
+    def child_elements(self) -> list[DividedElement]:
+        """All children; none of a piece."""
+        return [] if self.piece is not None else [self.child_element(number) for number in range(len(self.domains))]
 
     @cached_property
     def base(self) -> DividedElement:
@@ -133,7 +161,7 @@ class DividedElement:
     @cached_property
     def regular_count(self) -> int:
         """Number of regular pieces."""
-        return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
+        return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child in self.child_elements)
 
     @cached_property
     def tips(self) -> tuple[Piece, ...]:
@@ -152,7 +180,7 @@ class DividedElement:
         if self.piece is not None:
             return np.eye(2)[None][: self.regular_count], np.zeros((self.regular_count, 2))
         matrices, offsets = [], []
-        for domain, (child, _) in zip(self.domains, self.children, strict=True):
+        for domain, child in zip(self.domains, self.child_elements, strict=True):
             outward, (inner_matrices, inner_offsets) = domain.inverse(), child.regular_domains
             matrices.append(outward.matrix @ inner_matrices)
             offsets.append(inner_offsets @ outward.matrix.T + outward.offset)
@@ -171,11 +199,11 @@ class DividedElement:
     @cached_property
     def _below(self) -> IntArray:
         """`nodes` without the element itself."""
-        children = self.children
+        children = self.child_elements
         rows, below = [np.empty((0, 3), dtype=np.int64)], []
         # By kinds: where the next children, regular pieces and tips come.
         first = np.array([len(children), len(children), 0, 0])
-        for child, _ in children:
+        for child in children:
             rows.append(np.array([[child.kind, child.turn, first[child.kind]]]))
             below.append(child._below + first[child._below[:, :1]] * np.array([0, 0, 1]))
             first += [len(child._below)] * 2 + [child.regular_count, len(child.tips)]
@@ -239,7 +267,7 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
     undivided, mesh = list(dict.fromkeys(elements)), None
     for _ in range(MOST_DEPTH + 1):
         mesh = refine_elements(scheme, undivided, mesh)
-        undivided = list(dict.fromkeys(child for element in undivided for child, _ in element.children))
+        undivided = list(dict.fromkeys(child for element in undivided for child in element.child_elements))
         if not undivided:
             return elements
     raise not_isolated(scheme, undivided[0].signature, MOST_DEPTH + 1)

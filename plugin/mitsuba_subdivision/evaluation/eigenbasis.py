@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..schemes.domain import FloatArray
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 # Computed eigenvalues closer than this count as one eigenvalue: rounding splits a defective pair by about the square
 # root of the machine precision, 1.5e-8, while different eigenvalues of the schemes differ by 1e-3 and more.
@@ -150,12 +153,12 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
     return basis
 
 
-def require_basis(matrix: FloatArray, basis: Eigenbasis, probes: FloatArray) -> None:
+def require_basis(matrix: FloatArray | sparse.csr_array, basis: Eigenbasis, probes: FloatArray) -> None:
     """Check that a basis is one of a matrix.
 
     Parameters
     ----------
-    matrix : (K, K) float64
+    matrix : (K, K) float64, or sparse array
     basis : Eigenbasis
     probes : (K, p) float64
         Vectors that the equations are multiplied by: all unit vectors, or a few of random signs, which the products of

@@ -211,14 +211,14 @@ def _times_sparse(stencils: FloatArray, vectors: FloatArray) -> FloatArray:
 
 def _basis(structure: IrregularStructure) -> Eigenbasis:
     """The eigenbasis, by the symmetry or the ring of a high valence if there is one."""
-    found, matrix = None, structure.matrix
+    found = None
     if (orbits := ring_orbits(structure.signature)) is not None:
-        found = symmetric_eigenbasis(matrix, orbits)
+        found = symmetric_eigenbasis(structure.table.matrix, orbits)
     elif (ring := fan_ring(structure.signature)) is not None:
         # At a dart, one of its vertices is no control point, as it equals another.
         order = np.searchsorted(structure.slots, ring[np.isin(ring, structure.slots)])
-        found = fan_eigenbasis(matrix, order)
-    return eigenbasis(matrix) if found is None else found
+        found = fan_eigenbasis(structure.matrix, order)
+    return eigenbasis(structure.matrix) if found is None else found
 
 
 @lru_cache(maxsize=4096)

@@ -264,7 +264,7 @@ class OccupiedPieces:
     def piece(self, part: int) -> Piece:
         """A part that is a piece."""
         group = self.groups[self.parts["group"][part]]
-        return Piece(self._domain(part), group.stencils[self.parts["index"][part]], group.patch)
+        return Piece(self._domain(part), group.stencils[self.parts["index"][part]], group.patch, group.control_count)
 
     def locate(self, part: IntArray, uv: FloatArray, corner: IntArray) -> IntArray:
         """Find the piece ``(s,)`` that each sample lies in.
@@ -360,7 +360,7 @@ class OccupiedPieces:
                 found.append(self._add_part(part, domain, element.kind))
                 continue
             stencils = element.piece.stencils if part.weights is None else element.piece.stencils @ part.weights
-            piece = Piece(element.piece.domain @ domain, stencils, element.piece.patch)
+            piece = Piece(element.piece.domain @ domain, stencils, element.piece.patch, stencils.shape[1])
             if piece.patch is None or not self._piece_levels:
                 found.append(self._add_piece(piece))
             else:
@@ -376,7 +376,8 @@ class OccupiedPieces:
         patch = piece.irregular_patch
         inner = self.scheme.domain.children[number] @ (domain if level else piece.domain)
         if number > 0:
-            return self._add_piece(Piece(inner, patch.eigen_children[number - 1] @ part.weights, None), level)
+            weights = patch.eigen_children[number - 1] @ part.weights
+            return self._add_piece(Piece(inner, weights, None, weights.shape[1]), level)
         if level + 1 == self._piece_levels:
             return self._add_piece(piece)
         smaller = patch.basis.block_matrix() @ part.weights

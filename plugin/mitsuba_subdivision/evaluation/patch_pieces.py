@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,15 +32,18 @@ class Piece:
     ----------
     domain : AffineMap
         From the element's parameters to the piece's own, which have the extraordinary point at (0, 0).
-    stencils : (K_piece, K) float64
-        The piece's control points over the element's one-ring.
+    weights : (K_piece, K) float64, or (K_piece,) int64
+        The piece's control points over the element's one-ring; or which of the element's control points they are.
     patch : IrregularPatch or None
         None for a regular piece, whose control points are in the order of the scheme's lattice.
+    control_count : int
+        K.
     """
 
     domain: AffineMap
-    stencils: FloatArray
+    weights: NDArray[Any]
     patch: IrregularPatch | None
+    control_count: int
 
     @property
     def irregular_patch(self) -> IrregularPatch:
@@ -48,16 +52,34 @@ class Piece:
             raise ValueError("a regular piece; expected one with an extraordinary point")
         return self.patch
 
-    @cached_property
+    @property
+    def stencils(self) -> FloatArray:
+        """``(K_piece, K)`` control points over the element's one-ring."""
+        return self.weights if self.weights.ndim == 2 else self._scattered(np.eye(len(self.weights)))
+
+    @property
+    def absolute_sums(self) -> FloatArray:
+        """``(K_piece,)`` sums of the absolute weights of each control point."""
+        return np.ones(len(self.weights)) if self.weights.ndim == 1 else np.abs(self.weights).sum(axis=1)
+
+    @property
     def coordinates(self) -> FloatArray:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
-        inverse = self.irregular_patch.basis.inverse
-        order = self.stencils.argmax(axis=1)
-        if not np.array_equal(self.stencils, np.eye(self.stencils.shape[1])[order]):
-            return inverse @ self.stencils
-        # Stencils of a whole element only put its points into another order.
-        found = np.zeros(self.stencils.shape)
-        found[:, order] = inverse
+        return self._scattered(self.irregular_patch.basis.inverse) if self.weights.ndim == 1 else self._coordinates
+
+    @cached_property
+    def _coordinates(self) -> FloatArray:
+        return self.irregular_patch.basis.inverse @ self.weights
+
+    def over_controls(self, rows: FloatArray) -> FloatArray:
+        """Rows over the piece's eigen-coordinates, or its control points if it is regular, as weights ``(.., K)``."""
+        if self.weights.ndim == 1:
+            return self._scattered(rows @ self.irregular_patch.basis.inverse)
+        return rows @ (self.weights if self.patch is None else self._coordinates)
+
+    def _scattered(self, weights: FloatArray) -> FloatArray:
+        found = np.zeros((*weights.shape[:-1], self.control_count))
+        found[..., self.weights] = weights
         return found
 
     def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
@@ -70,7 +92,8 @@ class Piece:
         stencils : (K, K_larger) float64
             The element's control points over the larger element's one-ring.
         """
-        return Piece(self.domain @ domain, self.stencils @ stencils, self.patch)
+        weights = stencils[self.weights] if self.weights.ndim == 1 else self.weights @ stencils
+        return Piece(self.domain @ domain, weights, self.patch, stencils.shape[1])
 
 
 @lru_cache(maxsize=4096)
@@ -81,14 +104,14 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
         return None
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
-        return Piece(IDENTITY, lattice, None)
+        return Piece(IDENTITY, lattice, None, lattice.shape[1])
     for corner in range(rotation_count(scheme, signature)):
         structure = irregular_structure(scheme, signature.rotated(corner))
         if structure is not None:
             order = rotation_order(signature, corner)
             turned = scheme.domain.rotation(corner).inverse()
             patch = irregular_patch(scheme, structure)
-            return Piece(turned, np.eye(len(order))[order[structure.slots]], patch)
+            return Piece(turned, order[structure.slots], patch, len(order))
     return None
 
 
@@ -145,25 +168,25 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     if len(ring_pattern(scheme, signature.smoothed).domains) != len(scheme.domain.children):
         return None
     rings = refined_ring(scheme, signature)
-    child, matrix = rings.child(0, 0)
-    if child != signature:
+    if rings.signature(0, 0) != signature:
         return None
     children = []
     for number in range(1, len(scheme.domain.children)):
-        child, stencils = rings.child(0, number)
-        lattice = lattice_stencils(scheme, child)
+        lattice = lattice_stencils(scheme, rings.signature(0, number))
         if lattice is None:
             return None
-        children.append(lattice @ stencils)
-    slots, found = np.arange(len(matrix)), np.stack(children)
+        children.append(lattice @ rings.stencils(0, number))
+    table, found = rings.table(0), np.stack(children)
+    slots = np.arange(table.row_count)
     if (merged := _merged_slots(signature)) is not None:
         kept, dropped = merged
         slots = slots[slots != dropped]
-        for each in (matrix, found):
-            each[..., kept] += each[..., dropped]
-        matrix, found = matrix[slots][:, slots], found[..., slots]
-    rows, columns = np.nonzero(matrix)
-    table = StencilTable(len(matrix), len(matrix), rows, columns, matrix[rows, columns])
+        found[..., kept] += found[..., dropped]
+        found = found[..., slots]
+        number_of = np.searchsorted(slots, np.arange(table.row_count))
+        columns = number_of[np.where(table.columns == dropped, kept, table.columns)]
+        own = table.rows != dropped
+        table = StencilTable(len(slots), len(slots), number_of[table.rows[own]], columns[own], table.weights[own])
     return IrregularStructure(signature, slots, table, found)
 
 

@@ -119,28 +119,47 @@ class RefinedRings:
         self._stencils, self._rows_sum_to_one = stencils, rows_sum_to_one
         # By the numbers of the children.
         self._sharpness: dict[int, FanSharpnessRows] = {}
+        self._tables: dict[int, StencilTable] = {}
 
     def child(self, ring: int, number: int) -> tuple[Signature, FloatArray]:
-        """Signature of a child of one of the elements, and its control points over the element's: ``(K_child, K)``.
+        """`signature` and `stencils` of a child of one of the elements."""
+        return self.signature(ring, number), self.stencils(ring, number)
+
+    def signature(self, ring: int, number: int) -> Signature:
+        """Signature of a child of one of the elements."""
+        signature, _, around = self._pattern.child(number)
+        semi = self._topology.semi_sharpness
+        if semi is None:
+            return signature
+        if number not in self._sharpness:
+            self._sharpness[number] = FanSharpnessRows(self._topology, self._half_edges[:, around], semi)
+        return with_sharpness(signature, self._sharpness[number], ring)
+
+    def stencils(self, ring: int, number: int) -> FloatArray:
+        """Control points of a child over those of the element, ``(K_child, K)``.
 
         Raises
         ------
         SchemeError
             If weights of a control point do not sum to one.
         """
-        signature, vertices, around = self._pattern.child(number)
         if isinstance(self._stencils, StencilTable):
-            stencils = self._stencils.dense(vertices)
-        else:
-            stencils = self._stencils[ring, vertices]
+            return self.table(number).dense(np.arange(self.table(number).row_count))
+        stencils = self._stencils[ring, self._pattern.child(number)[1]]
         if not self._rows_sum_to_one:
-            _require_rows_to_one(self._pattern, stencils)
-        semi = self._topology.semi_sharpness
-        if semi is None:
-            return signature, stencils
-        if number not in self._sharpness:
-            self._sharpness[number] = FanSharpnessRows(self._topology, self._half_edges[:, around], semi)
-        return with_sharpness(signature, self._sharpness[number], ring), stencils
+            _require_rows_to_one(self._pattern, stencils.sum(axis=1))
+        return stencils
+
+    def table(self, number: int) -> StencilTable:
+        """`stencils` of a child of an element that was refined alone."""
+        if number not in self._tables:
+            if not isinstance(self._stencils, StencilTable):
+                raise TypeError("one-rings that were refined together; expected one refined alone")
+            found = self._stencils.chosen(self._pattern.child(number)[1])
+            sums = np.bincount(found.rows, found.weights, minlength=found.row_count)
+            _require_rows_to_one(self._pattern, sums.astype(np.float64))
+            self._tables[number] = found
+        return self._tables[number]
 
 
 @lru_cache(maxsize=1024)
@@ -330,8 +349,7 @@ class RingMesh:
         return found if end == len(half_edges) else None
 
 
-def _require_rows_to_one(pattern: RingPattern, stencils: FloatArray) -> None:
-    sums = stencils.sum(axis=1)
+def _require_rows_to_one(pattern: RingPattern, sums: FloatArray) -> None:
     error = np.abs(sums - 1)
     # Written so that a sum that is not a number is refused as well.
     if not error.max() <= ROW_SUM:

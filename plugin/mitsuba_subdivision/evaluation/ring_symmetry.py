@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,11 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature, TaggedFan, fan_face_count
 from ..schemes.domain import FloatArray
 from .eigenbasis import Eigenbasis, eigenbasis, require_basis, sorting_key
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+Matrix = Union[FloatArray, "sparse.csr_array"]
 
 # From this valence on, the general method takes longer.
 LEAST_VALENCE = 32
@@ -48,6 +54,8 @@ PROBES = 8
 PROBES_OF_FACE = 2
 # Digits of weights by which rings are recognised as equal.
 SAME_DIGITS = 12
+# Rounding errors of what waves make of points that depend on their sum only.
+NEGLIGIBLE = 1e-15
 
 
 def ring_orbits(signature: Signature) -> IntArray | None:
@@ -113,12 +121,12 @@ def fan_ring(signature: Signature) -> IntArray | None:
     return np.concatenate([t.face_vertices[:1], np.stack(columns, axis=1).ravel(), last])
 
 
-def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | None:
+def symmetric_eigenbasis(matrix: Matrix, orbits: IntArray) -> Eigenbasis | None:
     """Eigenbasis of a subdivision matrix with a symmetric ring; None if the matrix has no such symmetry.
 
     Parameters
     ----------
-    matrix : (K, K) float64
+    matrix : (K, K) float64, or sparse array
         As for `eigenbasis`.
     orbits : (m, n) int
         As `ring_orbits` finds them.
@@ -128,15 +136,19 @@ def symmetric_eigenbasis(matrix: FloatArray, orbits: IntArray) -> Eigenbasis | N
     EigenbasisError
         As `eigenbasis`.
     """
+    # A first picture needs no SciPy.
+    from scipy import sparse
+
+    matrix = sparse.csr_array(matrix)
     waves = _waves(matrix, orbits)
     if waves is None:
         return None
-    rest = _rest(len(matrix), orbits)
+    rest = _rest(matrix.shape[0], orbits)
     if np.abs(waves.dual @ (matrix @ rest)).max() > SAME_WEIGHTS:
         return None
-    of_rest, to_rest = rest.T @ matrix @ rest, (rest.T @ matrix) @ waves.vectors
+    of_rest, to_rest = rest.T @ (matrix @ rest), (matrix.T @ rest).T @ waves.vectors
     found = _completed(matrix, waves, rest, _separate(waves, to_rest, np.linalg.eigvals(of_rest)))
-    require_basis(matrix, found, _probes(len(matrix), PROBES))
+    require_basis(matrix, found, _probes(len(rest), PROBES))
     return found
 
 
@@ -198,20 +210,18 @@ def _ring_basis(ring: _RingMatrix) -> Eigenbasis:
     return eigenbasis(ring.matrix)
 
 
-def _completed(matrix: FloatArray, waves: _Waves, rest: FloatArray, is_separate: NDArray[np.bool_]) -> Eigenbasis:
-    """The basis made of separate waves, and of all others together with the rest."""
-    of_rest, to_rest = rest.T @ matrix @ rest, (rest.T @ matrix) @ waves.vectors
+def _completed(matrix: Matrix, waves: _Waves, rest: FloatArray, is_separate: NDArray[np.bool_]) -> Eigenbasis:
+    """The basis made of separate waves, which are unit vectors, and of all others together with the rest."""
+    from_all = (matrix.T @ rest).T
+    of_rest, to_rest = from_all @ rest, from_all @ waves.vectors
     # A wave and what it makes of the rest: (T - of_rest) Y = to_rest for its eigenvalue T.
     systems = waves.eigenvalues[is_separate, None, None] * np.eye(len(of_rest)) - of_rest
     in_rest = np.linalg.solve(systems, to_rest[:, is_separate].T[..., None])[..., 0].T
-    separate = _Waves(
-        waves.vectors[:, is_separate] + rest @ in_rest, waves.dual[is_separate], waves.eigenvalues[is_separate]
-    )
     # The others with the rest, in coordinates in which the separate waves have no part.
     others = np.hstack([rest, waves.vectors[:, ~is_separate]])
-    others_dual = np.vstack([rest.T - in_rest @ separate.dual, waves.dual[~is_separate]])
-    small = eigenbasis(others_dual @ matrix @ others, constant=others_dual.sum(axis=1))
-    return _joined(small, others, others_dual, separate)
+    others_dual = np.vstack([rest.T - in_rest @ waves.dual[is_separate], waves.dual[~is_separate]])
+    small = eigenbasis((matrix.T @ others_dual.T).T @ others, constant=others_dual.sum(axis=1))
+    return _joined(small, others, others_dual, waves, np.flatnonzero(is_separate), rest, in_rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,16 +240,16 @@ class _Waves:
     eigenvalues: FloatArray
 
 
-def _waves(matrix: FloatArray, orbits: IntArray) -> _Waves | None:
+def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
     """The waves of a ring but for constants; None if sectors differ, or a wave has no real block."""
-    kinds, n = orbits.shape
+    (kinds, n), size = orbits.shape, matrix.shape[0]
     ring, next_sector = orbits.ravel(), np.roll(orbits, 1, axis=1).ravel()
-    if np.abs(matrix[np.ix_(next_sector, next_sector)] - matrix[np.ix_(ring, ring)]).max() > SAME_WEIGHTS:
+    if abs(matrix[next_sector][:, next_sector] - matrix[ring][:, ring]).max() > SAME_WEIGHTS:
         return None
     offset = 0.5 * np.arange(kinds)
     k = np.arange(1, (n + 1) // 2)
     # The block of each k: in the first sector, images of complex waves are the block times the waves.
-    sums = np.fft.ifft(matrix[orbits[:, 0]][:, orbits], axis=2, norm="forward")
+    sums = np.fft.ifft(matrix[orbits[:, 0]].toarray()[:, orbits], axis=2, norm="forward")
     angle = 2 * np.pi / n * np.arange(n)
     sums = sums * np.exp(1j * angle * (offset[None, :, None] - offset[:, None, None]))
     if np.abs(sums.imag[..., k]).max() > SAME_WEIGHTS:
@@ -249,9 +259,7 @@ def _waves(matrix: FloatArray, orbits: IntArray) -> _Waves | None:
     if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min() < DEPENDENT:
         return None
     inverses = np.linalg.inv(vectors)
-    found = _Waves(
-        np.zeros((len(matrix), kinds * (n - 1))), np.zeros((kinds * (n - 1), len(matrix))), np.empty(kinds * (n - 1))
-    )
+    found = _Waves(np.zeros((size, kinds * (n - 1))), np.zeros((kinds * (n - 1), size)), np.empty(kinds * (n - 1)))
     end = 0
     for wave in (np.cos, np.sin):
         for kind, orbit in enumerate(orbits):
@@ -300,15 +308,15 @@ def _separate(waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.inexact]) 
     -------
     (w,) bool
     """
-    # A first picture needs no SciPy.
-    from scipy import linalg
-
     near = np.abs(waves.eigenvalues[:, None] - of_rest).min(axis=1) < SEPARATE
     is_separate = ~near
     order = np.flatnonzero(near)[np.argsort(waves.eigenvalues[near])]
     begins = np.flatnonzero(np.diff(waves.eigenvalues[order], prepend=-np.inf) > EQUAL)
     for own in np.split(order, begins[1:]):
         if len(own) > len(to_rest):
+            # A first picture needs no SciPy.
+            from scipy import linalg
+
             (reflectors, scales), triangular = linalg.qr(to_rest[:, own].T, mode="raw")
             waves.vectors[:, own] = _times_rotation(waves.vectors[:, own], reflectors, scales)
             waves.dual[own] = _times_rotation(waves.dual[own].T, reflectors, scales).T
@@ -326,17 +334,41 @@ def _times_rotation(rows: FloatArray, reflectors: FloatArray, scales: FloatArray
     return lapack.dormqr("R", "N", reflectors, scales, rows, max(space, len(rows)))[0]
 
 
-def _joined(small: Eigenbasis, others: FloatArray, others_dual: FloatArray, waves: _Waves) -> Eigenbasis:
-    """The basis of the rest, which is given in coordinates over ``others``, and the separate waves, in one order."""
-    eigenvalues = np.concatenate([small.eigenvalues, waves.eigenvalues])
-    moduli = np.concatenate([small.moduli, np.abs(waves.eigenvalues)])
+def _joined(
+    small: Eigenbasis,
+    others: FloatArray,
+    others_dual: FloatArray,
+    waves: _Waves,
+    separate: IntArray,
+    rest: FloatArray,
+    in_rest: FloatArray,
+) -> Eigenbasis:
+    """The basis of the rest, given in coordinates over ``others``, and the separate waves with their part in the rest.
+
+    The arrays are by far the largest: each is made once, and changed in place.
+    """
+    wave_values = waves.eigenvalues[separate]
+    eigenvalues = np.concatenate([small.eigenvalues, wave_values])
+    moduli = np.concatenate([small.moduli, np.abs(wave_values)])
     order = np.lexsort(sorting_key(moduli, eigenvalues))
     index = np.argsort(order)
     of_small, of_waves = index[: len(small.moduli)], index[len(small.moduli) :]
-    vectors, dual = np.empty((len(order), len(order))), np.empty((len(order), len(order)))
-    lengths = np.linalg.norm(waves.vectors, axis=0)
+    source, added, lengths = (
+        np.zeros(len(order), dtype=np.int64),
+        np.zeros((len(in_rest), len(order))),
+        np.ones(len(order)),
+    )
+    source[of_waves], added[:, of_waves] = separate, in_rest
+    # Waves and the rest are orthogonal.
+    lengths[of_waves] = np.sqrt(1 + (in_rest**2).sum(axis=0))
+    vectors, dual = waves.vectors.take(source, axis=1), waves.dual.take(source, axis=0)
+    for column, row in zip(rest.T, added, strict=True):
+        if np.abs(row).max(initial=0) > NEGLIGIBLE:
+            points = np.flatnonzero(column)
+            vectors[points] += column[points, None] * row
+    vectors /= lengths
+    dual *= lengths[:, None]
     vectors[:, of_small], dual[of_small] = others @ small.vectors, small.inverse @ others_dual
-    vectors[:, of_waves], dual[of_waves] = waves.vectors / lengths, waves.dual * lengths[:, None]
     vectors[:, 0] = 1
     blocks = tuple(
         (slice(index[own.start], index[own.start] + own.stop - own.start), block) for own, block in small.blocks

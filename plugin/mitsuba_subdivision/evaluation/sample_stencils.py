@@ -163,7 +163,7 @@ def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, u
         child, in_child = np.where(is_only, 0, child), np.where(is_only, uv[inner].T, in_child).T
         pairs, pair = np.unique(4 * parent + child, return_inverse=True)
         numbers: dict[DividedElement, int] = {}
-        below = [numbers.setdefault(elements[key // 4].child(key % 4)[0], len(numbers)) for key in pairs.tolist()]
+        below = [numbers.setdefault(elements[key // 4].child_element(key % 4), len(numbers)) for key in pairs.tolist()]
         element_below, uv_below, number = _distinct(np.array(below)[pair], in_child)
         in_pairs = np.split(np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))[:-1])
         groups: list[tuple[int, int, IntArray, int, IntArray]] = [
@@ -201,10 +201,10 @@ def _evaluate_pieces(scheme: Scheme, depths: list[_Depth]) -> None:
             own = slice(begin, begin + len(own_uv))
             begin = own.stop
             seen = _by_parent(rows[:, own], piece.domain.matrix)
-            depth.stencils[number][:] = seen @ (piece.stencils if patch is None else piece.coordinates)
-            by_piece = magnitude[:, own] @ np.abs(piece.stencils).sum(axis=1)
+            depth.stencils[number][:] = piece.over_controls(seen)
+            by_piece = magnitude[:, own] @ piece.absolute_sums
             if patch is not None:
-                by_piece = CANCELLED * by_piece + np.abs(rows[1:, own] @ piece.coordinates).sum(axis=2)
+                by_piece = CANCELLED * by_piece + np.abs(piece.over_controls(rows[1:, own])).sum(axis=2)
             depth.frame_weights[:, depth.samples(number)] = np.abs(piece.domain.matrix).T @ by_piece
 
 
@@ -229,10 +229,10 @@ def _rows(scheme: Scheme, patch: IrregularPatch | None, uv: FloatArray) -> tuple
 def _lift(above: _Depth, below: _Depth) -> None:
     """Find the weights of samples above that lie in children, which are elements below."""
     for element, number, samples, child, samples_below in above.groups:
-        _, stencils = above.elements[element].child(number)
         matrix = above.elements[element].domains[number].matrix
-        rows = _by_parent(below.stencils[child][:, samples_below - below.first[child]], matrix) @ stencils
-        above.stencils[element][:, samples - above.first[element]] = rows
+        rows = _by_parent(below.stencils[child][:, samples_below - below.first[child]], matrix)
+        found = above.elements[element].over_controls(rows, number)
+        above.stencils[element][:, samples - above.first[element]] = found
         above.frame_weights[:, samples] = np.abs(matrix).T @ below.frame_weights[:, samples_below]
 
 

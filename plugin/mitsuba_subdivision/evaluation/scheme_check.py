@@ -30,6 +30,9 @@ OTHER_SIZES = (3, 4, 5)
 SAME_SURFACE = 1e-12
 # Tolerance of weights against those of another call, and of their sum, in each precision.
 SAME_WEIGHTS: dict[np.dtype, float] = {np.dtype(np.float32): 1e-5, np.dtype(np.float64): 1e-12}
+# Digits by which weights count as equal, and faces behind the third in the fans on a border whose weights are compared.
+SAME_DIGITS = 9
+BEHIND = (3, 5)
 # Derivatives are compared with differences over this step, and may be this far from them: the error of a difference
 # goes with the square of the step.
 STEP = 1e-4
@@ -81,6 +84,7 @@ def register_scheme(scheme: Scheme) -> None:
             )
         irregular_patch(scheme, structure)
     _require_derivatives(scheme)
+    _require_local_borders(scheme)
     add_scheme(scheme)
 
 
@@ -155,6 +159,25 @@ def _require_convex(scheme: Scheme, method: str, weights: NDArray) -> None:
         least = float(weights.min(initial=0))
         expected = "none below 0, as has_convex_rules says"
         _require(least >= -SAME_WEIGHTS[weights.dtype], scheme, method, f"a weight of {least:.1e}", expected)
+
+
+def _require_local_borders(scheme: Scheme) -> None:
+    """Check that rules on borders do not depend on inner vertices and the valence, if the scheme says so."""
+    if not (has_phantom_points(scheme) and optional_member(scheme, "has_local_borders")):
+        return
+    faces, (_, *others) = (scheme.regular_face_size,), regular_signature(scheme).fans
+    for rule in (VertexRule.AUTOMATIC, VertexRule.CORNER):
+        occurring = []
+        for behind in BEHIND:
+            signature = Signature("face", (TaggedFan(faces * 3, faces * behind, rule), *others))
+            _, _, stencils = refined_children(scheme, signature)[0]
+            first, *_, last = one_ring(signature).edge_neighbours()
+            inner = float(np.abs(np.delete(stencils[0], [0, first, last])).max())
+            found = f"a weight of {inner:.1e} of an inner vertex for one on a border"
+            _require(inner == 0, scheme, "refine", found, "none, as has_local_borders says")
+            occurring.append(set(stencils.round(SAME_DIGITS).ravel().tolist()))
+        found = f"other weights at a border of {3 + BEHIND[1]} faces than at one of {3 + BEHIND[0]}"
+        _require(occurring[0] == occurring[1], scheme, "refine", found, "the same, as has_local_borders says")
 
 
 def _require_derivatives(scheme: Scheme) -> None:

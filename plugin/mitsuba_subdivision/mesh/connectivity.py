@@ -188,9 +188,32 @@ class Topology:
         return start
 
     @cached_property
+    def open_fan_end(self) -> IndexArray:
+        """``(n_v,)`` half-edge on the border that ends at each border vertex; -1 inside."""
+        end = np.full(self.vertex_count, -1, dtype=np.int32)
+        open_edges = np.flatnonzero(self.twin < 0)
+        end[self.face_vertices[self.following(open_edges)]] = open_edges
+        return end
+
+    def border_neighbours(self, vertices: IntArray) -> tuple[IndexArray, IndexArray]:
+        """Neighbours along the border of vertices there: beside the most clockwise face, and beside the last one."""
+        first = self.following(self.open_fan_start[vertices])
+        return self.face_vertices[first], self.face_vertices[self.open_fan_end[vertices]]
+
+    @cached_property
     def is_border_vertex(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether a border edge ends at the vertex."""
         return self.ends_of(self.twin < 0)
+
+    @property
+    def is_semi_sharp_vertex(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether the vertex is semi-sharp, or an edge there, also one across a cut."""
+        semi = self.semi_sharpness
+        if semi is None:
+            return np.zeros(self.vertex_count, dtype=bool)
+        found = self.ends_of(semi.edges > 0) | (semi.vertices > 0)
+        found[semi.across_vertex] = True
+        return found
 
     def ends_of(self, is_chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """``(n_v,)`` whether some half-edge begins or ends at the vertex; ``is_chosen`` selects half-edges."""

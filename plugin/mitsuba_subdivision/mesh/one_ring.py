@@ -20,9 +20,12 @@ from .connectivity import Topology
 from .glued_faces import GluedFaces
 from .semi_sharpness import SemiSharpness
 from .signature import (
+    NEAR_FACES,
+    ElementKind,
     FanHalfEdges,
     Signature,
     TaggedFan,
+    fan_face_count,
     fan_half_edges,
 )
 
@@ -39,11 +42,15 @@ class OneRing:
         For each local face, the corner of the element and the counter-clockwise turns about it that lead there.
     slots : tuple of (local face, steps)
         For each local vertex, a local face and the steps along it from the half-edge where the walk arrived.
+    cut_fans : list of [local vertex, local vertex, local vertex]
+        Corners of the element in whose fans faces may have been left out (`TaggedFan.near`), each with its two
+        neighbours on the border, as `Topology.border_neighbours` has them.
     """
 
     topology: Topology
     faces: tuple[tuple[int, int], ...]
     slots: tuple[tuple[int, int], ...]
+    cut_fans: list[list[int]]
 
     @property
     def vertex_count(self) -> int:
@@ -84,8 +91,15 @@ class OneRing:
         # of the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        for chunk in chunks_of(len(half_edges)):
-            self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
+        if len(half_edges) == 1:
+            # Around vertices of high valence every face may be the only one of its signature.
+            kind: ElementKind = "face" if any(corner for corner, _ in self.faces) else "vertex"
+            columns[:, 0] = self.vertices_around(topology, fan_half_edges(topology, int(half_edges[0]), kind))
+        else:
+            for chunk in chunks_of(len(half_edges)):
+                self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
+        for centre, first, last in self.cut_fans:
+            columns[first], columns[last] = topology.border_neighbours(columns[centre])
         return columns.T
 
     def vertices_around(self, topology: Topology, fans: list[FanHalfEdges]) -> NDArray[np.int32]:
@@ -177,7 +191,9 @@ def one_ring(signature: Signature) -> OneRing:
         for corner, fan in tagged.items():
             rules[polygons[0][corner]] = fan.rule
         local = local.with_rules(rules, None)
-    return OneRing(local, tuple(glued.walks[face] for face in glued.faces), tuple(slots))
+    cut = [polygons[0][c] for c, fan in tagged.items() if fan.is_open and fan_face_count(fan) == NEAR_FACES]
+    cut_fans = np.stack([cut, *local.border_neighbours(np.array(cut, dtype=np.int32))], axis=1).tolist()
+    return OneRing(local, tuple(glued.walks[face] for face in glued.faces), tuple(slots), cut_fans)
 
 
 class JoinedRings:

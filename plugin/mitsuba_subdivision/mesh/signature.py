@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,10 @@ from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
 from .semi_sharpness import FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
+Number = TypeVar("Number", int, IntArray)
+
+# Faces of a fan between two borders that matter to any one of them, see `TaggedFan.near`.
+NEAR_FACES = 64
 
 
 class TaggedFan(NamedTuple):
@@ -43,6 +47,28 @@ class TaggedFan(NamedTuple):
     rule: VertexRule = VertexRule.AUTOMATIC
     is_closed: bool = False
     sharpness: FanSharpness | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the faces lie between two borders: those on both sides of the crease of a dart lie all around it."""
+        return not self.is_closed and self.rule != VertexRule.DART
+
+    def near(self) -> TaggedFan:
+        """The fan without the faces that are too far away to matter.
+
+        The vertex of an open fan moves by its two neighbours on the borders, and what happens in one face reaches the
+        next ones with each refinement, by a small weight. So a large fan is cut down to a small one around the face,
+        whose last neighbours are still those on the borders (`OneRing.cut_fans`).
+        """
+        if not self.is_open or self.sharpness is not None or fan_face_count(self) <= NEAR_FACES:
+            return self
+        behind = near_behind(len(self.ahead), len(self.behind))
+        return self._replace(ahead=self.ahead[: NEAR_FACES - behind], behind=self.behind[:behind])
+
+
+def near_behind(ahead: Number, behind: Number) -> Number:
+    """How many of `NEAR_FACES` lie behind a face, in the middle of them but for borders: of numbers, or arrays."""
+    return np.minimum(behind, NEAR_FACES - np.minimum(ahead, NEAR_FACES // 2))
 
 
 # The faces around a vertex. Those of a smooth interior vertex are a tuple of their sizes, counter-clockwise from the
@@ -136,6 +162,10 @@ class Signature:
             for fan in self.fans
         )
         return Signature(self.kind, tuple(fans))
+
+    def near(self) -> Signature:
+        """The same without faces that are too far away to matter, see `TaggedFan.near`."""
+        return Signature(self.kind, tuple(fan.near() if isinstance(fan, TaggedFan) else fan for fan in self.fans))
 
     @cached_property
     def is_semi_sharp(self) -> bool:

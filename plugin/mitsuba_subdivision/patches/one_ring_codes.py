@@ -15,22 +15,38 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.chunks import gathered
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.signature import NEAR_FACES, near_behind
 from ..schemes.domain import FloatArray
 
 # Up to this many codes are not renumbered: they fit into two bytes, which sort fast.
 FEW_CODES = 1 << 16
 
 
-def fan_codes(topology: Topology) -> IntArray:
-    """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face."""
+def fan_codes(topology: Topology, *, near: bool = False) -> IntArray:
+    """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face.
+
+    Parameters
+    ----------
+    topology : Topology
+    near : bool
+        Whether the codes are those of fans that have the faces of `TaggedFan.near` only.
+    """
     t = topology
-    columns = [gathered(row_codes([t.vertex_face_count, _vertex_codes(t)]), t.face_vertices)]
+    far_vertices = _has_far_faces(t) if near else np.zeros(0, dtype=bool)
+    face_count = np.where(far_vertices, NEAR_FACES, t.vertex_face_count) if far_vertices.any() else t.vertex_face_count
+    columns, cut = [gathered(row_codes([face_count, _vertex_codes(t)]), t.face_vertices)], None
     if t.is_border_vertex.any():
-        columns.append(_faces_clockwise(t))
+        behind = _faces_clockwise(t)
+        columns.append(behind)
+        if far_vertices.any():
+            far = np.flatnonzero(far_vertices[t.face_vertices])
+            ahead = t.vertex_face_count[t.face_vertices[far]] - behind[far]
+            behind[far] = near_behind(ahead, behind[far])
+            cut = far, behind[far]
     face_codes = _face_codes(t)
     if (face_codes != face_codes[0]).any():
-        columns += _codes_around(t, face_codes)
+        columns += _codes_around(t, face_codes, face_count[t.face_vertices], cut)
     return row_codes(columns)
 
 
@@ -108,26 +124,50 @@ def _faces_clockwise(topology: Topology) -> IntArray:
     return found
 
 
-def _codes_around(topology: Topology, face_codes: IntArray) -> tuple[IntArray, IntArray]:
+def _has_far_faces(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_v,)`` vertices some of whose faces do not see all others, as `TaggedFan.near` says."""
+    t = topology
+    found = t.is_border_vertex & (t.vertex_face_count > NEAR_FACES)
+    return found & (t.vertex_rules != VertexRule.DART) & ~t.is_semi_sharp_vertex if found.any() else found
+
+
+def _codes_around(
+    topology: Topology, face_codes: IntArray, face_count: IntArray, cut: tuple[IntArray, IntArray] | None
+) -> tuple[IntArray, IntArray]:
     """Two columns that encode which faces lie around the vertex of each half-edge, in which order.
 
     Around a vertex whose faces all have the same code, the first column is that code, and the second is 0. Around any
     other, the first column is 0, and the second numbers the whole sequence of codes, from 1 on, counter-clockwise from
     the half-edge's own face.
+
+    Parameters
+    ----------
+    face_codes, face_count : (n_h,) int
+        Code of each half-edge's face; number of faces that it sees around its vertex.
+    cut : ((m,) int, (m,) int), optional
+        Half-edges that see `NEAR_FACES` of their fan only, and how many of them clockwise of their own.
     """
     t = topology
-    valence = t.vertex_face_count[t.face_vertices]
     common, sequence = face_codes.astype(np.int64), np.zeros(t.half_edge_count, dtype=np.int64)
+    # Past the border of an open fan, the sequence continues at the fan's other end.
+    ahead, restart = face_count, t.open_fan_start[t.face_vertices]
+    if cut is not None:
+        far, behind = cut
+        ahead, back = face_count.copy(), far
+        for step in range(NEAR_FACES):
+            back = np.where(step < behind, t.turn_back(back), back)
+        ahead[far], restart[far] = NEAR_FACES - behind, back
     mixed = np.flatnonzero(_sees_different_faces(t, face_codes)[t.face_vertices])
-    for n in np.flatnonzero(np.bincount(valence[mixed])):
-        half_edges = mixed[valence[mixed] == n]
+    for n in np.flatnonzero(np.bincount(face_count[mixed])):
+        half_edges = mixed[face_count[mixed] == n]
         current, columns = half_edges, []
-        for _ in range(n):
+        for step in range(1, n + 1):
             columns.append(face_codes[current])
             following = t.turn(current)
-            # Past the border of an open fan, the sequence continues at the fan's other end.
-            current = np.where(following < 0, t.open_fan_start[t.face_vertices[current]], following)
-        common[half_edges], sequence[half_edges] = 0, 1 + row_codes(columns).astype(np.int64)
+            current = np.where((following < 0) | (step == ahead[half_edges]), restart[half_edges], following)
+        differ = np.any([column != columns[0] for column in columns], axis=0)
+        found = 1 + row_codes(columns).astype(np.int64)
+        common[half_edges], sequence[half_edges] = np.where(differ, 0, columns[0]), np.where(differ, found, 0)
     return common, sequence
 
 

@@ -47,6 +47,7 @@ class CatmullClark(OptionalMembers):
     # Refined face ``h`` is the corner at half-edge ``h`` and begins there.
     splits_corners = True
     has_convex_rules = True
+    has_local_borders = True
     domain = SQUARE
     regular_face_size = 4
     regular_valence = 4

@@ -53,13 +53,16 @@ class DooSabin(OptionalMembers):
         sizes = np.concatenate([t.face_sizes, np.full(len(first), 4), valences[valences > 0]])
         refined = Topology(t.half_edge_count, sizes, np.concatenate([corners, of_edges.ravel(), fans]))
 
-        size = t.face_sizes[t.face]
+        size, begin = t.face_sizes[t.face], t.face_offsets[t.face]
+        # The mask of each face, one weight for each of its corners: of a large face all corners share its cosines.
+        steps = corners - begin
+        mask = np.where(steps == 0, (size + 5) / (4 * size), (3 + 2 * np.cos(2 * np.pi * steps / size)) / (4 * size))
         corner = np.repeat(corners, size)
         steps = ragged.index_in_row(size)
-        begin = t.face_offsets[t.face[corner]]
-        member = t.face_vertices[begin + (corner - begin + steps) % size[corner]]
-        n = size[corner]
-        weight = np.where(steps == 0, (n + 5) / (4 * n), (3 + 2 * np.cos(2 * np.pi * steps / n)) / (4 * n))
+        begin, end = begin[corner], (begin + size)[corner]
+        weight = mask[begin + steps]
+        steps += corner
+        member = t.face_vertices[np.where(steps < end, steps, steps - end + begin)]
         return Refinement(refined, StencilTable.of(t.half_edge_count, t.vertex_count, (corner, member, weight)))
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:

@@ -50,6 +50,7 @@ class Loop(OptionalMembers):
     regular_face_size = 3
     regular_valence = 6
     has_convex_rules = True
+    has_local_borders = True
     # Corners (where w, u, v are one), then across edges, then beside corners.
     regular_lattice = np.array(
         [(0, 0), (1, 0), (0, 1), (1, -1), (1, 1), (-1, 1), (0, -1), (-1, 0), (2, 0), (2, -1), (-1, 2), (0, 2)],

@@ -181,6 +181,10 @@ class OptionalMembers:
     has_convex_rules : bool
         Whether no weight of the rules, or of the regular basis, is negative: then the surface over an element lies in
         the convex hull of its one-ring, which saves time where adaptive tessellations are chosen.
+    has_local_borders : bool
+        Whether a vertex on a border, or a corner, takes weights of its neighbours on the border only, and no weight
+        depends on its valence. If so, faces that lie far away in its fan are left out (`TaggedFan.near`), which saves
+        time.
     crease_method : "uniform" or "chaikin", or None
         Decay of semi-sharp features in `Scheme.refine`. A copy of the scheme gets the value of a cage. With
         None the scheme refuses semi-sharp features.
@@ -193,6 +197,7 @@ class OptionalMembers:
     regular_border_faces: int = 0
     splits_corners: bool = False
     has_convex_rules: bool = False
+    has_local_borders: bool = False
     crease_method: CreaseMethod | None = None
     triangle_rule: TriangleRule | None = None
 

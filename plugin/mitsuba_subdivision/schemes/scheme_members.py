@@ -115,7 +115,7 @@ def _wrong_optional_members(scheme: Any) -> Iterator[tuple[str, str]]:
             )
         if not (_is_integer(scheme.regular_border_faces) and scheme.regular_border_faces >= 1):
             yield "regular_border_faces", "an integer, 1 or more"
-    for member in ("splits_corners", "has_convex_rules"):
+    for member in ("splits_corners", "has_convex_rules", "has_local_borders"):
         if not isinstance(optional_member(scheme, member), (bool, np.bool_)):
             yield member, "True or False"
     for member, names in NAMED_RULES.items():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .domain import FloatArray
 
@@ -56,7 +57,16 @@ class StencilTable:
         from scipy import sparse
 
         shape = self.row_count, self.column_count
-        return sparse.coo_array((self.weights, (self.rows, self.columns)), shape=shape).tocsr()
+        is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
+        rows, columns = (each.astype(np.int32) if is_short else each for each in (self.rows, self.columns))
+        return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
+
+    def chosen(self, rows: IntArray) -> StencilTable:
+        """Stencils of some refined vertices, as a table of as many rows."""
+        counts = np.bincount(self.rows, minlength=self.row_count)
+        entries = np.argsort(self.rows, kind="stable")[ragged.ranges(ragged.offsets(counts)[rows], counts[rows])]
+        own = np.repeat(np.arange(len(rows)), counts[rows])
+        return StencilTable(len(rows), self.column_count, own, self.columns[entries], self.weights[entries])
 
     def dense(self, rows: IntArray) -> FloatArray:
         """Stencils of some refined vertices, ``(len(rows), column_count)``."""
