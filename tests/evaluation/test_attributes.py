@@ -124,7 +124,6 @@ def mixed(scheme, cage, mode):
     return np.random.default_rng(number), KINDS[number % 3], ("uniform", "chaikin")[number % 2]
 
 
-@pytest.mark.core
 @EVERY_CAGE
 @EVERY_MODE
 def test_one_refinement_by_the_reference_has_the_same_values(scheme, cage, mode):
