@@ -11,7 +11,7 @@ import os
 # the time of the processors. Before NumPy is imported; processes that tests start have it from here.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import mitsuba_subdivision  # noqa: F401, I001 - before drjit, so that it chooses the LLVM library
+import quick_kernels  # noqa: F401, I001 - before drjit, as it chooses the LLVM library
 import drjit as dr
 import mitsuba as mi
 import numpy as np

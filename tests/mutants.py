@@ -1,11 +1,13 @@
 """Mutation tests: which damage to the code do the tests notice?
 
-Cosmic Ray makes the mutants and runs ``mutants.py test`` on each. Two commands of this file surround it:
+Cosmic Ray makes the mutants and runs ``mutants.py test`` on each. Three commands of this file surround it:
 
 - ``mutants.py sample SESSION COUNT`` keeps a random sample of the mutants of each package and skips all others. What
-  cannot change results is not drawn: annotations, messages, ``__repr__``.
+  cannot change results is not drawn: annotations, messages, ``__repr__``, and options of calls such as ``strict``.
 - ``mutants.py test`` runs the tests that cover the mutated line, those of its own package first, until one fails. It
   reads which tests these are from the contexts in ``.coverage``.
+- ``mutants.py report SESSION ..`` counts the mutants of each package that change results, and those killed, and shows
+  survivors. Which change nothing, and why, is in ``equivalent_mutants.py``.
 """
 
 import argparse
@@ -34,11 +36,11 @@ OPERATORS = re.compile(
 # Tests that one call of pytest gets: so many are quick to collect, and the first ones kill most mutants.
 FIRST_TESTS = 40
 
-# In bytes, for the tests of one mutant: some mutants allocate without end.
-MEMORY = 6 << 30
-
 # Functions whose calls, and conditions whose blocks, leave results as they are.
 SILENT = ("warnings.warn", "TYPE_CHECKING")
+
+# Options that check what holds anyway, or choose between equal values: of `zip`, `dataclass` and `astype`.
+CHECKS = ("strict", "frozen", "eq", "copy")
 
 
 def lines_without_results(path: Path) -> set[int]:
@@ -62,19 +64,29 @@ def lines_without_results(path: Path) -> set[int]:
     return lines
 
 
+def options_without_results(path: Path) -> set[tuple[int, int]]:
+    """Line, from 1, and column, from 0, of the values of options that leave results as they are."""
+    return {
+        (node.value.lineno, node.value.col_offset)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.keyword) and node.arg in CHECKS
+    }
+
+
 def sample(session: str, count: int, seed: int) -> None:
     """Keep ``count`` mutants of each package, at most one on each line, and delete all others from the session."""
     with closing(sqlite3.connect(session)) as database, database:
         mutations = database.execute(
-            "SELECT module_path, start_pos_row, operator_name, occurrence, job_id FROM mutation_specs"
-            " ORDER BY 1, 2, 3, 4"
+            "SELECT module_path, start_pos_row, start_pos_col, operator_name, occurrence, job_id FROM mutation_specs"
+            " ORDER BY 1, 2, 4, 5"
         ).fetchall()
         places: dict[str, dict[tuple[str, int], list[str]]] = {}
-        without_results: dict[str, set[int]] = {}
-        for path, line, operator, _, job in mutations:
+        without_results: dict[str, tuple[set[int], set[tuple[int, int]]]] = {}
+        for path, line, column, operator, _, job in mutations:
             if path not in without_results:
-                without_results[path] = lines_without_results(Path(path))
-            if OPERATORS.match(operator) and line not in without_results[path]:
+                without_results[path] = lines_without_results(Path(path)), options_without_results(Path(path))
+            lines_without, options_without = without_results[path]
+            if OPERATORS.match(operator) and line not in lines_without and (line, column) not in options_without:
                 package = Path(path).relative_to(PACKAGE).parts[0]
                 places.setdefault(package, {}).setdefault((path, line), []).append(job)
         drawn = set()
@@ -123,16 +135,50 @@ def covering_tests(path: Path, lines: list[int]) -> list[str]:
     return [test for _, _, test in sorted(ranked)] or [own]
 
 
-def run_tests() -> int:
-    """Run the tests that cover the mutant; 0 if all pass."""
+def run_tests(memory: int) -> int:
+    """Run the tests that cover the mutant, in so many GB, as some mutants allocate without end; 0 if all pass."""
     import pytest
 
-    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_DATA, (memory << 30, memory << 30))
     tests = covering_tests(*mutated_lines())
     options = ["-x", "-q", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-p", "no:xdist"]
     return pytest.main([*options, *tests[:FIRST_TESTS]]) or (
         pytest.main([*options, *tests[FIRST_TESTS:]]) if tests[FIRST_TESTS:] else 0
     )
+
+
+def report(sessions: list[str]) -> None:
+    """Print counts of each package, and the survivors that are not known to be equivalent."""
+    from equivalent_mutants import EQUIVALENT
+
+    known = {
+        (module, " ".join(was.split()), " ".join(now.split())) for _, rows in EQUIVALENT for module, was, now in rows
+    }
+    counts: dict[str, dict[str, int]] = {}
+    for session in sessions:
+        with closing(sqlite3.connect(f"file:{session}?mode=ro", uri=True)) as database:
+            results = database.execute(
+                "SELECT module_path, test_outcome, diff FROM work_items LEFT JOIN mutation_specs USING (job_id)"
+                " LEFT JOIN work_results USING (job_id)"
+            ).fetchall()
+        for path, outcome, diff in results:
+            module = Path(path).relative_to(PACKAGE)
+            was, now = (
+                " ".join(" ".join(re.findall(rf"^\{sign}(?!\{sign})(.*)$", diff or "", re.MULTILINE)).split())
+                for sign in "-+"
+            )
+            kind = "not run" if outcome is None else outcome.lower()
+            if kind == "survived":
+                kind = "equivalent" if (str(module), was, now) in known else "open"
+            for name in (module.parts[0], "all"):
+                row = counts.setdefault(name, dict.fromkeys(("killed", "equivalent", "open", "not run"), 0))
+                row[kind] += 1
+            if kind == "open":
+                print(f"{module}\n- {was}\n+ {now}\n")
+    for name, row in sorted(counts.items()):
+        judged = row["killed"] + row["open"]
+        part = f"{100 * row['killed'] / judged:.0f} % killed" if judged else ""
+        print(f"{name:13}", *(f"{count} {kind}," for kind, count in row.items()), part)
 
 
 if __name__ == "__main__":
@@ -142,6 +188,14 @@ if __name__ == "__main__":
     sampling.add_argument("session")
     sampling.add_argument("count", type=int, help="mutants of each package")
     sampling.add_argument("--seed", type=int, default=0)
-    commands.add_parser("test", help="run the tests that cover the mutated line")
+    testing = commands.add_parser("test", help="run the tests that cover the mutated line")
+    testing.add_argument("--memory", type=int, default=6, help="most memory, in GB")
+    reporting = commands.add_parser("report", help="count mutants and show survivors")
+    reporting.add_argument("sessions", nargs="+")
     given = parser.parse_args()
-    sys.exit(run_tests() if given.command == "test" else sample(given.session, given.count, given.seed))
+    if given.command == "sample":
+        sample(given.session, given.count, given.seed)
+    elif given.command == "report":
+        report(given.sessions)
+    else:
+        sys.exit(run_tests(given.memory))

@@ -56,11 +56,14 @@ def executed(notebook: nbformat.NotebookNode, quick: bool) -> nbformat.NotebookN
         environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
         environment |= {"IPYTHONDIR": folder, "JUPYTER_CONFIG_DIR": folder}
         resources = {"metadata": {"path": folder}}
+        arguments = ["--log-level=ERROR"]
+        if quick:
+            arguments.append(f"--IPKernelApp.exec_files={Path(__file__).with_name('quick_kernels.py')}")
         client = NotebookClient(
             notebook,
             timeout=TIMEOUT,
             resources=resources,
-            extra_arguments=["--log-level=ERROR"],
+            extra_arguments=arguments,
             # What a cell prints is one output, however it arrives.
             coalesce_streams=True,
         )

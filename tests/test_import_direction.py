@@ -26,7 +26,7 @@ NUMPY_PACKAGES = [
 ]
 ALLOWED = {
     "llvm": set(),
-    "messages": set(),
+    "messages": {"progress"},
     "interruption": set(),
     "examples": set(),
     **{package: set(NUMPY_PACKAGES[:i]) for i, package in enumerate(NUMPY_PACKAGES)},

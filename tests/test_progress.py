@@ -4,6 +4,7 @@ import io
 
 import pytest
 from mitsuba_subdivision import progress
+from mitsuba_subdivision.messages import print_remark
 
 
 class Terminal(io.StringIO):
@@ -24,6 +25,14 @@ def test_a_line_counts_and_is_wiped(monkeypatch):
     assert list(progress.counted("abc", "Letters")) == ["a", "b", "c"]
     lines = [f"\rLetters [{'#' * 10 * n}{'.' * 10 * (3 - n)}] {n} of 3" for n in range(3)]
     assert terminal.getvalue() == "".join(lines) + "\r\x1b[K"
+
+
+def test_messages_stand_on_lines_of_their_own(monkeypatch):
+    terminal = in_place_of_stderr(monkeypatch, Terminal())
+    for letter in progress.counted("ab", "Letters"):
+        print_remark(letter)
+    text = terminal.getvalue()
+    assert all(f"\r\x1b[Kmitsuba-subdivision: {letter}\n" in text for letter in "ab")
 
 
 def test_an_interrupted_line_is_wiped(monkeypatch):

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
+from .progress import wipe
+
 PROGRAM = "mitsuba-subdivision"
 # Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
@@ -78,6 +80,7 @@ def _print(text: object, stream: TextIO | None) -> None:
         return
     try:
         if text is not None:
+            wipe()
             print(text, file=stream)
         stream.flush()
     except BrokenPipeError:

@@ -253,6 +253,18 @@ def test_matrix_it_cannot_handle_is_an_error(matrix):
         eigenbasis(matrix)
 
 
+@pytest.mark.parametrize("gap", 10.0 ** -np.arange(2, 14))
+def test_a_basis_of_nearly_defective_matrices_holds_or_is_an_error(gap):
+    """Eigenvalues apart by more than rounding splits a defective pair, with vectors that are nearly parallel."""
+    matrix = similar(block_diagonal([[1]], [[0.5, 1], [0, 0.5 - gap]], [[0.3]]))
+    try:
+        basis = eigenbasis(matrix)
+    except EigenbasisError:
+        return
+    found = basis.vectors @ basis.block_matrix() @ basis.inverse
+    np.testing.assert_allclose(found, matrix, rtol=0, atol=POWER)
+
+
 @pytest.mark.parametrize("second", [1, -1, 1 + 1e-3])
 def test_a_matrix_that_does_not_contract_is_an_error(second):
     with pytest.raises(

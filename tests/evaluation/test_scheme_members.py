@@ -213,9 +213,18 @@ WRONG = {
 def test_every_optional_member_has_a_default_and_is_damaged_here():
     declared = OptionalMembers.__annotations__
     assert set(declared) <= set(WRONG)
-    assert {name: optional_member(object(), name) for name in declared} == {
-        name: vars(OptionalMembers)[name] for name in declared
-    }
+    defaults = {name: optional_member(object(), name) for name in declared}
+    assert defaults == {name: vars(OptionalMembers)[name] for name in declared}
+    # Nothing is claimed of a scheme that does not say so.
+    assert not any(defaults.values())
+
+
+@EVERY_SCHEME
+def test_our_schemes_have_convex_rules_and_say_so(original):
+    scheme = original()
+    weights = scheme.refine(CLOSED[original].topology).stencils.matrix.toarray()
+    assert weights.min() >= 0
+    assert scheme.has_convex_rules
 
 
 @pytest.mark.parametrize(
@@ -227,6 +236,11 @@ def test_a_member_of_another_kind_or_shape_is_named(member, number):
         register_scheme(scheme)
     with pytest.raises(SchemeError):
         LimitSurface(cube(), scheme)
+
+
+def test_a_domain_with_other_children_is_named():
+    with pytest.raises(SchemeError, match=r"domain is .*; expected SQUARE or TRIANGLE"):
+        require_members(Members(CatmullClark(), domain=type(SQUARE)("square", SQUARE.corners, QUARTER)))
 
 
 def test_three_faces_may_meet_at_a_regular_vertex():

@@ -311,11 +311,13 @@ def test_numbers_and_words_that_fit_nothing_name_their_line(read, old, new, mess
         read(text.replace(old, new, 1))
 
 
-def test_lists_of_negative_length_are_errors(read):
+@pytest.mark.parametrize(("item", "index"), [("int", "<i4"), ("uchar", "u1")])
+def test_lists_of_negative_length_are_errors(read, item, index):
     header = SHEET[: SHEET.index("end_header")].replace("ascii", "binary_little_endian")
-    header = header.replace("list uchar", "list char").replace("double", "float").replace("face 2", "face 1")
+    header = header.replace("list uchar int", f"list char {item}").replace("double", "float")
+    header = header.replace("face 2", "face 1")
     content = header.encode() + b"end_header\n" + np.zeros(15, "<f4").tobytes()
-    faces = np.arange(5, dtype="<i4").tobytes()
+    faces = np.arange(5, dtype=index).tobytes()
     assert read(content + b"\x05" + faces).face_count == 1
     with pytest.raises(CageError, match="element 'face': row 0: property 'vertex_indices': early end-of-file"):
         read(content + b"\xff" + faces)

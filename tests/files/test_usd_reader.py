@@ -350,6 +350,7 @@ CREASES = "int[] creaseIndices = [0, 1, 2]\nint[] creaseLengths = [{}]\nfloat[] 
         ({"old": POINTS_LINE}, "there are no points; expected a mesh with points and faces"),
         ({"old": "int[] faceVertexCounts = [4, 4]"}, "there are no faceVertexCounts; expected a mesh"),
         ({"old": "[4, 4]", "new": "[]"}, "there are no faceVertexCounts; expected a mesh"),
+        ({"old": "[0, 1, 4, 3, 1, 2, 5, 4]", "new": "[]"}, "there are no faceVertexIndices; expected a mesh"),
         (
             {"old": "[4, 4]", "new": "[4, 3]"},
             "faceVertexCounts add up to 7, but faceVertexIndices has 8 entries; expected as",

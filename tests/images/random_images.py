@@ -3,7 +3,7 @@
 import numpy as np
 from mitsuba_subdivision.images.estimate import Estimate, combine
 from mitsuba_subdivision.images.image import Image
-from mitsuba_subdivision.images.probe import Probe
+from mitsuba_subdivision.images.probe_aovs import Probe
 
 SIZE = 32
 # Standard deviation of a sample, in parts of its mean.

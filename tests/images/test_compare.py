@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import re
 import subprocess
 import sys
 import types
@@ -25,6 +26,8 @@ from mitsuba_subdivision.images.tiers import TIERS, Tier
 from mitsuba_subdivision.images.tolerances import Tolerances
 
 LIMITS = Tolerances()
+# Of a mean of 3,072 squares, and of the variance that few batches measure: five standard deviations and more.
+NOISE = 0.25
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +37,40 @@ def reference():
 
 def statuses(found):
     return {tier.name: tier.status.value for tier in found.tiers}
+
+
+@pytest.mark.parametrize(("first", "second"), [(4, 4), (4, 16), (400, 4)])
+def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
+    """Whatever the numbers of samples: the variance of a difference is the sum of both."""
+    images = (random_image(np_rng, first, "reference"), random_image(np_rng, second, "test"))
+    (line,) = compare(*images).notes
+    measured, expected = map(float, re.fullmatch(r"relMSE (\S+); noise alone would make it (\S+)", line).groups())
+    assert abs(measured / expected - 1) < NOISE
+
+
+def test_equal_images_have_no_worst_pixel(reference):
+    assert compare(reference, reference).worst is None
+
+
+def test_the_worst_pixel_is_none_that_only_one_image_hits(reference, np_rng):
+    """A pixel of the outline is missing, and a normal in the middle is turned."""
+    probe = dome()
+    y, x = np.argwhere(probe.hit)[0]
+    shape, normal = probe.shape.copy(), probe.normal.copy()
+    shape[y, x] = 2**32 - 1
+    normal[y, x], normal[16, 12] = 0, -normal[16, 12]
+    found = compare(reference, random_image(np_rng, probe=replace(probe, shape=shape, normal=normal)))
+    assert statuses(found)["probe"] == "fail"
+    assert (found.worst.x, found.worst.y) == (12, 16)
+
+
+def test_evidence_is_of_the_scale_that_is_clearest(reference):
+    """Its smallest probability is the least of all in units of its limit, which depends on the number of tests."""
+    for seed in range(20):
+        (tile,) = compare(reference, random_image(np.random.default_rng(seed)), tiers=["tile"]).tiers
+        scales = [scale for name, scale in tile.numbers["scales"].items() if name != "whole"]
+        clearest = min(scales, key=lambda scale: scale["smallest_p"] / scale["limit"])
+        np.testing.assert_allclose(tile.maps["evidence"].max(), -np.log10(clearest["smallest_p"]), rtol=1e-9)
 
 
 @pytest.mark.core
@@ -80,6 +117,11 @@ def test_exposures_are_those_that_flip_chooses():
     assert abs(found["start"] - chosen["startExposure"]) < 0.001
     assert abs(found["stop"] - chosen["stopExposure"]) < 0.001
     assert found["count"] == chosen["numExposures"] > 2
+
+
+def test_what_is_below_black_does_not_choose_exposures():
+    pixels = truth() * np.geomspace(0.01, 90, SIZE)[:, None, None] * [-1, 1, 1]
+    assert flip_exposures(pixels) == flip_exposures(np.maximum(pixels, 0))
 
 
 def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):

@@ -18,7 +18,7 @@ SAME = 0.95
 STEP, DIFFERENCES = 1e-6, 1e-7
 # Standard errors of a mean that are allowed; seeds are fixed.
 ERRORS = 4
-COUNT = 50_000
+COUNT = 20_000
 
 # One for each kind of piece and of border: the searches ask for points and derivatives only, which
 # test_surface_kernel compares on all surfaces.
@@ -58,9 +58,9 @@ def device_points(types, points):
 @EVERY_KIND
 def test_nearest_points_are_minima_from_places_beside_them(name, np_rng):
     surface = surface_named(name)
-    size, points = points_near(surface, 300, np_rng)
+    size, points = points_near(surface, 120, np_rng)
     expected = surface.closest_point(points)
-    uv = np.clip(expected.uv + np_rng.normal(size=(300, 2)) * 0.02, 0, 0.5 if surface.scheme.element == "face" else 1)
+    uv = np.clip(expected.uv + np_rng.normal(size=(120, 2)) * 0.02, 0, 0.5 if surface.scheme.element == "face" else 1)
     uv = np.where(expected.uv > 0.45, expected.uv, uv)
     # Both against one search, which takes longer than they do.
     for variant, bar in BARS.items():
@@ -80,10 +80,10 @@ def test_nearest_points_are_minima_from_places_beside_them(name, np_rng):
 def test_minima_on_borders_are_found(name, np_rng):
     """From inside an element, for points that lie beyond a border."""
     surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
-    size, points = points_near(surface, 400, np_rng, 0.3)
+    size, points = points_near(surface, 150, np_rng, 0.3)
     points += np_rng.normal(size=points.shape) * 0.3 * size
     expected = surface.closest_point(points)
-    middle = np.full((400, 2), 1 / 3)
+    middle = np.full((150, 2), 1 / 3)
     found = kernel.closest(
         device_points(kernel.types, points), *on_device(kernel.types, expected.element, middle, expected.corner)
     )

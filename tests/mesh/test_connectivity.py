@@ -3,6 +3,10 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from mitsuba_subdivision.mesh import connectivity
+from mitsuba_subdivision.mesh.connectivity import Topology
+from mitsuba_subdivision.mesh.edge_pairing import paired
+from mitsuba_subdivision.mesh.refinement_differences import differences
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
@@ -101,6 +105,31 @@ def test_edges_are_numbered_without_gaps(any_cage):
     np.testing.assert_array_equal(topology.edge_half_edge, lowest)
 
 
+def test_pairs_of_vertices_have_distinct_numbers_below_their_count(any_cage, monkeypatch):
+    def checked(keys_of, count, key_count):
+        keys = keys_of(slice(0, count))
+        t = any_cage.topology
+        ends = np.sort([t.face_vertices, t.face_vertices[t.next]], axis=0)
+        assert len(np.unique(keys)) == len(np.unique(ends, axis=1).T)
+        assert keys.min() >= 0
+        assert keys.max() < key_count
+        return paired(keys_of, count, key_count)
+
+    monkeypatch.setattr(connectivity, "paired", checked)
+    assert Topology(any_cage.vertex_count, any_cage.face_sizes, any_cage.face_vertices).edge_count
+
+
+def test_refinement_differs_where_one_mesh_is_sharp():
+    smooth = torus(5, 6)
+    sharp = ControlCage(smooth.positions, smooth.face_vertices.reshape(-1, 4).tolist(), creases=[(13, 14, 2.0)])
+    meshes = [cage.cut_mesh.topology for cage in (smooth, sharp)]
+    for expected, found in (meshes, meshes[::-1]):
+        *others, is_sharper = differences(expected, found)
+        assert not np.any(others)
+        np.testing.assert_array_equal(is_sharper, sharp.cut_mesh.topology.semi_sharpness.edges > 0)
+    assert not np.any(differences(*[meshes[0]] * 2))
+
+
 def test_euler_characteristic():
     def euler(cage):
         return cage.vertex_count - cage.topology.edge_count + cage.face_count
@@ -121,6 +150,17 @@ def test_turn_visits_every_face_around_an_interior_vertex_once(any_cage):
             half_edge = topology.turn(half_edge)
         assert half_edge == topology.vertex_half_edge[vertex]
         assert sorted(visited) == sorted(topology.face[topology.face_vertices == vertex])
+
+
+def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(any_cage):
+    t = any_cage.topology
+    offsets, half_edges = t.vertex_fans
+    for vertex in range(t.vertex_count):
+        fan = half_edges[offsets[vertex] : offsets[vertex + 1]]
+        leaving = np.flatnonzero(t.face_vertices == vertex)
+        np.testing.assert_array_equal(np.sort(fan), [] if t.is_border_vertex[vertex] else leaving)
+        np.testing.assert_array_equal(t.turn(fan), np.roll(fan, -1))
+        assert not len(fan) or fan[0] == fan.min()
 
 
 def test_turn_is_counter_clockwise():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.mesh.one_ring import one_ring
-from mitsuba_subdivision.mesh.signature import Signature, fan_half_edges, signature_at
+from mitsuba_subdivision.mesh.signature import Signature, fan_half_edges, half_edges_around, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
 from reference.exact_samples import mesh_of
-from reference.refined_cages import sheet
+from reference.refined_cages import sheet, tagged
 
 pytestmark = pytest.mark.core
 
@@ -53,9 +53,9 @@ def local_faces(ring):
     return polygons(ring.topology)
 
 
-@pytest.mark.parametrize("valences", [*product((3, 4, 5, 7), repeat=4), (2, 4, 3, 4), (2, 5, 2, 6), (30, 4, 4, 4)])
-def test_quad_has_twice_its_valences_less_16_control_points(valences):
-    assert one_ring(quads_at(*valences)).vertex_count == 2 * sum(valences) - 16
+def test_quad_has_twice_its_valences_less_16_control_points():
+    for valences in (*product((3, 4, 5, 7), repeat=4), (2, 4, 3, 4), (2, 5, 2, 6), (30, 4, 4, 4)):
+        assert one_ring(quads_at(*valences)).vertex_count == 2 * sum(valences) - 16
 
 
 @pytest.mark.parametrize("fan", [(4,) * 3, (4,) * 7, (3, 5, 4, 6), (3, 3, 3)])
@@ -139,6 +139,44 @@ def test_vertices_around_fans_are_those_gathered(topology, kind):
         ring = one_ring(signature_at(topology, half_edge, kind))
         found = ring.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
         np.testing.assert_array_equal(found, ring.gather(topology, np.array([half_edge] * 2))[0])
+
+
+@by_name(TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology})
+def test_half_edges_around_each_corner_are_turns_apart(topology):
+    for half_edge in range(topology.half_edge_count):
+        fans = fan_half_edges(topology, half_edge, "face")
+        counts = [len(behind) + len(ahead) for behind, ahead in fans]
+        for fan, (_, ahead) in zip(np.split(half_edges_around(fans), np.cumsum(counts)[:-1]), fans, strict=True):
+            np.testing.assert_array_equal(topology.turn(fan[:-1]), fan[1:])
+            assert ahead[0] in fan
+            assert topology.turn(fan[-1]) in (-1, ahead[0])
+
+
+@pytest.mark.parametrize("cut", [(), [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 5)]], ids=["whole", "cut"])
+def test_creases_of_a_signature_are_equal_if_those_at_its_corners_are(cut, np_rng):
+    """Whatever Chaikin's method makes of them, and on both sides of a cut."""
+    smooth = torus(5, 6)
+    t = smooth.topology
+    edges = {tuple(sorted((int(t.face_vertices[h]), int(t.face_vertices[t.next[h]])))) for h in t.edge_half_edge}
+    creases = {edge: np_rng.choice([2.0, 3.0]) for edge in sorted(edges - set(cut)) if np_rng.random() < 0.2}
+    all_creases = [*creases.items(), *((edge, 10.0) for edge in cut)]
+    cage = tagged(smooth, creases=[(*edge, sharpness) for edge, sharpness in all_creases], crease_method="chaikin")
+    found = []
+    for face, half_edge in enumerate(t.face_offsets[:-1].tolist()):
+        corners = set(polygons(t)[face])
+        there = {sharpness for edge, sharpness in creases.items() if corners & set(edge)}
+        found.append(signature_at(cage.cut_mesh.topology, half_edge, "face").has_equal_creases)
+        assert found[-1] == (len(there) <= 1)
+    assert len(set(found)) == 2
+
+
+@pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
+def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
+    """Beside a crease that is, in a face that does not see it."""
+    cage = tagged(torus(5, 6), corners=[(0, sharpness)], creases=[(13, 14, 1.0)])
+    at_corner, at_crease = (signature_at(cage.cut_mesh.topology, 4 * face, "face") for face in (0, 13))
+    assert at_crease.is_semi_sharp
+    assert at_corner.is_semi_sharp == (sharpness < 10)
 
 
 @by_name(TOPOLOGIES)

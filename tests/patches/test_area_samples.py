@@ -75,7 +75,7 @@ def test_points_are_uniform_inside_elements(name):
     bounds = surface.bounds()
     element = int(bounds.element[np.linalg.norm(bounds.upper - bounds.lower, axis=1).argmax()])
     # What `sample` evaluates, of which there have to be many for enough of them to lie in one element.
-    start, uv = uniform_locations(surface._all_pieces, surface._areas, 20 * COUNT, np.random.default_rng(2))
+    start, uv = uniform_locations(surface._all_pieces, surface._areas, 5 * COUNT, np.random.default_rng(2))
     elements, corners = surface._element_and_corner(start)
     own = elements == element
     if surface.patches.is_whole[element]:
@@ -108,6 +108,16 @@ def test_seeds_determine_points():
     rng = np.random.default_rng(7)
     np.testing.assert_array_equal(surface.sample(100, rng).p, first.p)
     assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
+
+
+def test_samples_do_not_depend_on_the_unit_of_length():
+    cage = cube()
+    metres, millimetres = (LimitSurface(cage.with_positions(unit * cage.positions)) for unit in (1, 1024))
+    first, second = metres.sample(100, 3), millimetres.sample(100, 3)
+    np.testing.assert_array_equal(first.uv, second.uv)
+    cells, scaled = metres._sampling_cells(), millimetres._sampling_cells()
+    np.testing.assert_array_equal(cells.offsets, scaled.offsets)
+    np.testing.assert_allclose(1024**2 * cells.areas, scaled.areas, rtol=1e-12)
 
 
 def test_points_are_those_of_their_parameters():

@@ -10,7 +10,9 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.patches import closest_points
+from mitsuba_subdivision.patches import closest_points, polynomial_pieces
+from mitsuba_subdivision.patches.nearest_in_piece import nearest_in_pieces
+from mitsuba_subdivision.patches.turned_boxes import TurnedBoxes
 from patches.closed_cages import bumpy, cage_of
 from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
@@ -18,13 +20,13 @@ from scipy.spatial import cKDTree
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # Points of each kind: all around, near the surface, on it, and far away.
-COUNT = 40
+COUNT = 15
 # Of distances, in sizes of the surface: both are sums of some tens of rounded products.
 ROUNDED = 1e-13
 # Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
-SAMPLES, REFINED = 20_000, 12
+SAMPLES, REFINED = 6_000, 8
 STEPS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
 
 
@@ -174,6 +176,64 @@ def test_levels_that_are_made_when_needed_change_nothing(kept, np_rng, monkeypat
     monkeypatch.setattr(closest_points, "MOST_KEPT", kept)
     found = LimitSurface(surface.cage).closest_point(points)
     np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["mixed torus", "semi-sharp ring"])
+def test_elements_that_are_divided_when_needed_change_nothing(name, np_rng, monkeypatch):
+    surface = surface_named(name)
+    points = np_rng.uniform(-1.5, 3, (20, 3))
+    expected = surface.closest_point(points)
+    monkeypatch.setattr(polynomial_pieces, "MOST_PIECES", 1)
+    monkeypatch.setattr(polynomial_pieces, "DIVISIONS", 1)
+    found = LimitSurface(surface.cage).closest_point(points)
+    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
+
+
+def test_descents_are_the_same_in_every_unit_of_length(np_rng):
+    """From anywhere, also where the distance is not convex."""
+    cage, count = surface_named("mixed torus").cage, 500
+    points, begin, found = np_rng.normal(size=(count, 3)) * 3, np_rng.uniform(0.1, 0.9, (count, 2)), []
+    # Powers of two, by which all products are scaled exactly.
+    for unit in (1, 2.0**-20):
+        pieces = LimitSurface(cage.with_positions(unit * cage.positions))._all_pieces.regular
+        found.append(nearest_in_pieces(pieces, np.arange(count) % len(pieces), unit * points, begin, unit)[0])
+    np.testing.assert_array_equal(*found)
+
+
+def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_rng):
+    """Between random pairs of points in a piece, where its box says that squared distances from a point are convex."""
+    pieces, count = surface_named("rook")._all_pieces.regular, 5000
+    which, boxes = np_rng.integers(0, len(pieces), count), TurnedBoxes.around(pieces)
+    beside = np_rng.normal(size=(count, 3)) * np_rng.uniform(0, 0.5, (count, 1))
+    points = boxes.points[which] + np.linalg.norm(boxes.halves[which], axis=1)[:, None] * beside
+    near, _, away = boxes.near(points, which, np.full(count, np.inf))
+    is_convex = boxes.are_convex(away, which[near])
+    assert 0 < np.count_nonzero(is_convex) < count
+    one, other = np_rng.random((2, count, 2))
+    squared = []
+    for uv in (one, other, (one + other) / 2):
+        p = np.einsum("sb,sbx->sx", pieces.basis.values(uv), pieces.coefficients[which]) + pieces.origins[which]
+        squared.append(((p - points) ** 2).sum(axis=1)[near])
+    mean = (squared[0] + squared[1]) / 2
+    assert (squared[2] <= (1 + ROUNDED) * mean)[is_convex].all()
+
+
+def test_bounds_around_extraordinary_points_move_with_them():
+    cage = surface_named("mixed torus").cage
+    here, there = (LimitSurface(cage.with_positions(cage.positions + away))._all_pieces.tips for away in (0.0, 64.0))
+    for one, other in zip(here, there, strict=True):
+        np.testing.assert_allclose(one.reach(2), other.reach(2), rtol=1e-9)
+
+
+def test_descents_end_at_local_minima(np_rng):
+    """From anywhere in a piece, also where the distance is not convex: nothing within a small step is nearer."""
+    pieces = surface_named("mixed torus")._all_pieces.regular
+    points, which = np_rng.normal(size=(500, 3)) * 3, np.arange(500) % len(pieces)
+    uv, squared, _ = nearest_in_pieces(pieces, which, points, np_rng.uniform(0, 1, (500, 2)), 1.0)
+    for step in 1e-4 * STEPS:
+        values = pieces.basis.values(np.clip(uv + step, 0, 1))
+        p = np.einsum("sb,sbx->sx", values, pieces.coefficients[which]) + pieces.origins[which]
+        assert (((p - points) ** 2).sum(axis=1) >= (1 - ROUNDED) * squared).all()
 
 
 def test_nearest_points_move_with_the_surface(np_rng):

@@ -16,7 +16,7 @@ SAMPLES = 5000
 # Diagonals of boxes, in those of the tight ones.
 LONGER = 1.05
 # Samples on a grid leave out some of the tight box: a part of the bend between two of them.
-GRID, BETWEEN = 24, 1.002
+GRID, BETWEEN = 16, 1.005
 
 
 def assert_contained(surface, np_rng, count=SAMPLES):

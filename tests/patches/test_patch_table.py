@@ -87,10 +87,10 @@ def test_controls_are_the_one_rings(scheme, name):
 
 
 @EVERY_SURFACE
-def test_patch_of_corner_leads_back_to_it(scheme, name):
+def test_the_patch_at_a_corner_leads_back_to_it(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
     elements = table.elements
-    classes, patches, turns = table.patch_of_corner
+    classes, patches, turns = table.patch_at(np.arange(elements.half_edge_count))
     for corner in range(elements.half_edge_count):
         found = table.classes[classes[corner]].corners[patches[corner]]
         for _ in range(turns[corner]):

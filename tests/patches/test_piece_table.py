@@ -155,6 +155,7 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
         table.refinement @ positions, refined.matrix @ positions[surface.cage.cut_mesh.vertex], rtol=0, atol=ROUNDING
     )
     np.testing.assert_array_equal(table.controls, refined.table.controls)
+    assert surface.sampling(1).refinement is table.refinement
     # The patch at a half-edge is the refined face there.
     corners = np.concatenate([each.corners for each in refined.table.classes])
     for half_edge, code in enumerate(table.half_edges[:, CODE]):

@@ -1,12 +1,13 @@
-"""Passes on a local Dask cluster of two processes."""
+"""Passes and frames on a local Dask cluster of two processes."""
 
 import os
 from functools import partial
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.commands.command_line import parser
-from mitsuba_subdivision.commands.render import _load_still
+from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.commands import pictures
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.cluster import render_on_cluster
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
@@ -16,22 +17,18 @@ from regression.defects import SCENES
 SCENE, SAMPLING, PASSES = SCENES / "valence3.xml", Sampling(8, 16), 4
 
 
-def test_two_workers_give_the_bits_of_one_machine(variant_llvm_ad_rgb):
+@pytest.fixture(scope="module")
+def address():
     distributed = pytest.importorskip("distributed")
-    parameters = {"resolution": 16}
-    loaded = load_scene(SCENE, parameters, "box")
-    alone = merge_passes([render_pass(loaded, SAMPLING, i + 1, PASSES, with_probe=True) for i in range(PASSES)])
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        together = render_on_cluster(
-            cluster.scheduler_address,
-            SCENE,
-            parameters,
-            variant_llvm_ad_rgb,
-            SAMPLING,
-            PASSES,
-            "box",
-            with_probe=True,
-        )
+        yield cluster.scheduler_address
+
+
+def test_two_workers_give_the_bits_of_one_machine(variant_llvm_ad_rgb, address):
+    load = partial(load_scene, SCENE, {"resolution": 16}, "box")
+    loaded = load()
+    alone = merge_passes([render_pass(loaded, SAMPLING, i + 1, PASSES, with_probe=True) for i in range(PASSES)])
+    together = render_on_cluster(address, load, variant_llvm_ad_rgb, SAMPLING, PASSES, with_probe=True)
     assert np.array_equal(together.pixels, alone.pixels)
     assert np.array_equal(together.estimate.variance, alone.estimate.variance)
     assert np.array_equal(together.paired, alone.paired)
@@ -41,30 +38,45 @@ def test_two_workers_give_the_bits_of_one_machine(variant_llvm_ad_rgb):
 def test_no_cluster_is_said():
     pytest.importorskip("distributed")
     with pytest.raises(RegressionError, match="no Dask scheduler"):
-        render_on_cluster("nonsense://", SCENE, {}, "llvm_ad_rgb", SAMPLING, 0)
+        render_on_cluster("nonsense://", load_scene, "llvm_ad_rgb", SAMPLING, 0)
 
 
-def _load_after_a_death(load, marker):
-    """End the process of the first worker that loads."""
-    try:
-        marker.touch(exist_ok=False)
-    except FileExistsError:
-        return load()
-    os._exit(1)
+def pixels(path):
+    return np.array(mi.Bitmap(str(path)))
 
 
-def test_a_model_on_two_workers_one_killed_has_the_bits_of_one_machine(variant_scalar_rgb, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    cage = tmp_path / "cage.obj"
-    cage.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 1\nf 1 2 3 4\n")
-    arguments = ["render", str(cage), "--dask", "x", "-o", "x.exr", "--size", "16x16", "--spp", "4", "--filter", "box"]
-    options = vars(parser().parse_args(arguments))
-    load = partial(_load_still, {k: v for k, v in options.items() if k not in ("run", "parser")})
-    sampling = Sampling(4, 1)
-    alone = merge_passes([render_pass(load(), sampling, i, 2) for i in (1, 2)])
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        address = cluster.scheduler_address
-        dying = partial(_load_after_a_death, load, tmp_path / "died")
-        together = render_on_cluster(address, cage, {}, variant_scalar_rgb, sampling, 2, "box", load=dying)
+def frame_after_a_death(frame, marker, command, number):
+    """End the process of the worker that renders the second frame, once."""
+    if number == 2:
+        try:
+            marker.touch(exist_ok=False)
+            os._exit(1)
+        except FileExistsError:
+            pass
+    return frame(command, number)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_frames_and_passes_of_a_model_have_the_bits_of_one_machine_although_a_worker_dies(
+    address, tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "model.usda").write_text(
+        '#usda 1.0\ndef Mesh "cage" {\nint[] faceVertexCounts = [4]\nint[] faceVertexIndices = [0, 1, 2, 3]\n'
+        "point3f[] points.timeSamples = {1: [(0,0,0), (1,0,0), (1,1,0), (0,1,1)], "
+        "3: [(0,0,0), (2,0,0), (1,1,0), (0,1,1)]}\n"
+        '}\ndef SpatialAudio "sound" {}\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    common = ["render", "model.usda", "--size", "16x12", "--spp", "4", "--filter", "box", "-m", "scalar_rgb"]
+    on_cluster = ["--dask", address]
+    monkeypatch.setattr(pictures, "_frame", partial(frame_after_a_death, pictures._frame, tmp_path / "died"))
+    assert main([*common, "--frames", "1:3", "-o", "together.exr", *on_cluster]) == 0
+    assert capsys.readouterr().err.count("SpatialAudio") == 1
+    assert main([*common, "--frames", "1:3", "-o", "alone.exr"]) == 0
+    assert main([*common, "--passes", "2", "-o", "together_0004.exr", *on_cluster]) == 0
+    assert main([*common, "--passes", "2", "-o", "alone_0004.exr"]) == 0
     assert (tmp_path / "died").is_file()
-    assert np.array_equal(together.pixels, alone.pixels)
+    frames = [[(tmp_path / f"{name}_000{i}.exr") for i in range(1, 5)] for name in ("together", "alone")]
+    for together, alone in zip(*frames, strict=True):
+        assert np.array_equal(pixels(together), pixels(alone))
+    assert not np.array_equal(*map(pixels, frames[0][::2]))

@@ -164,6 +164,7 @@ def merge(folder, *words):
     return main(["merge", *(str(folder / f"{word}.exr") for word in words), "-o", str(folder / "merged.exr")])
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -241,9 +242,13 @@ SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
         (with_metadata(sampling=[1]), r"sampling is \[1\]; expected a seed"),
         (with_metadata(sampling={**SAMPLING, "batch": 0}), "expected a seed, the samples of a batch, and ranges"),
         (with_metadata(sampling={**SAMPLING, "batches": [[5, 2]]}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "batches": []}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "batches": 3}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "batches": [1, 2]}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "batches": [[2, 5], [6]]}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "seed": "0"}), "expected a seed, the samples of a batch"),
+        (with_metadata(paired={"seed": 0}), "expected a seed and samples per pixel"),
+        (with_metadata(paired={"spp": 4}), "expected a seed and samples per pixel"),
         (with_metadata(files=[1]), r"files is \[1\]; expected checksums by name"),
         (with_metadata(variant=7), "variant is 7; expected a name"),
         (with_metadata(schema=9), "metadata of schema 9; this version reads schema 1"),

@@ -93,6 +93,7 @@ def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
         SAMPLING.share(3, 2)
 
 
+@pytest.mark.core
 def test_the_filter_is_replaced_whether_the_scene_names_one_or_not(variant, tmp_path):  # noqa: ARG001
     named = tmp_path / "scene.xml"
     film = '<film type="hdrfilm"><rfilter type="tent"/></film>'
@@ -105,6 +106,7 @@ def test_the_filter_is_replaced_whether_the_scene_names_one_or_not(variant, tmp_
         load_scene(mi.load_dict(described), filter_name="box")
 
 
+@pytest.mark.core
 def test_every_file_of_a_scene_has_a_checksum(loaded, tmp_path):
     assert set(loaded.files) == {"valence3.xml", "cages/valence3.obj"}
     (tmp_path / "cages").mkdir()
@@ -125,6 +127,7 @@ def test_scenes_that_cannot_be_rendered_are_refused(variant, tmp_path):  # noqa:
         render_pass(loaded, SAMPLING)
 
 
+@pytest.mark.core
 def test_lights_keep_the_order_of_the_scene(variant_llvm_ad_rgb):  # noqa: ARG001
     import mitsuba as mi
 

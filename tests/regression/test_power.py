@@ -1,4 +1,4 @@
-"""What the tiers see, and what they do not: defects put in on purpose, and twenty seeds without any."""
+"""What the tiers see, and what they do not: defects put in on purpose, and ten seeds without any."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ CAUGHT_BY = {
     "a weight wrong by 1e-3, from one neighbour": {"probe", "paired"},
     "a weight wrong by 1e-3, from all neighbours": {"probe", "paired"},
 }
-SEEDS = 20
+SEEDS = 10
 
 
 @pytest.fixture(scope="module", params=[3, 5], ids="valence{}".format)

@@ -16,6 +16,7 @@ def loaded(variants_all_rgb):  # noqa: ARG001
     return load_scene(SCENES / "valence3.xml", {"resolution": SIZE}, "box")
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("size", [(1, 1), (64, 64), (512, 512), (1920, 1080), (10000, 10000)])
 @pytest.mark.parametrize("spp", [1, 16, 17, 100, 1000, 16384])
 def test_parts_have_all_samples_and_no_part_is_small_or_much_too_large(size, spp):

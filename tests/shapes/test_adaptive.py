@@ -7,7 +7,7 @@ import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface, pixel_error_for
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
 from shapes.test_subdivision import SINGLE, buffer

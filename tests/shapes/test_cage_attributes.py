@@ -14,7 +14,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import refine_first
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
@@ -119,6 +119,19 @@ def assert_alike(shape, expected):
 
 
 # What follows
+
+
+@every_variant
+def test_equal_values_share_their_memory_until_those_of_one_shape_change():
+    first, second = (mi.traverse(make(cube())) for _ in range(2))
+    for name in NAMES:
+        one, other = first[f"cage_{name}"], second[f"cage_{name}"]
+        assert not dr.is_jit_v(one) or one.index == other.index
+    before = np.array(second["cage_texcoords"])
+    dr.scatter(first["cage_texcoords"], 7.0, dr.uint32_array_t(type(first["cage_texcoords"]))(0))
+    first.update()
+    assert np.array(first["cage_texcoords"])[0] == 7
+    np.testing.assert_array_equal(np.array(second["cage_texcoords"]), before)
 
 
 @every_variant

@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -144,8 +144,11 @@ def heights(kind):
 
 
 @every_variant
-@pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
-@pytest.mark.parametrize("to_world", [None, MATRIX, MIRROR], ids=["plain", "sheared", "mirrored"])
+@pytest.mark.parametrize(
+    ("kind", "to_world"),
+    [("vertex_height", None), ("bitmap", None), ("vertex_height", MATRIX), ("bitmap", MIRROR)],
+    ids=["heights", "bitmap", "heights, sheared", "bitmap, mirrored"],
+)
 @pytest.mark.parametrize("name", CAGES)
 def test_vertices_lie_on_the_displaced_surface_with_its_normals(name, to_world, kind):
     cage = CAGES[name]()
@@ -255,8 +258,9 @@ def from_inside(resolution=64):
 
 
 @every_variant
-@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
-@pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
+@pytest.mark.parametrize(
+    ("kind", "shading"), [pytest.param("vertex_height", "exact", marks=exact), ("bitmap", "vertex")]
+)
 @pytest.mark.parametrize("triangles", [{"tessellation_rate": RATE}, {"tessellation": "adaptive", "chord_error": 0.01}])
 @pytest.mark.parametrize("name", ["islands", "creases", "creased islands", "pyramid"])
 def test_vertices_in_one_place_stay_in_one_place_bit_by_bit(name, triangles, kind, shading):

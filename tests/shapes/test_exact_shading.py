@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 if hook_problem():
     pytest.skip(str(hook_problem()), allow_module_level=True)

@@ -6,7 +6,7 @@ import pytest
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import exact_shading_support
 from mitsuba_subdivision.shapes.exact_shading_support import exact_shading_problem
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 
 def _made(**parameters):

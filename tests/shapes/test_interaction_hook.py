@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import exact_shading
-from mitsuba_subdivision.shapes.hook import hook_trial, interaction_hook, trampoline
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook import hook_trial, interaction_hook, machine_code
 
 if interaction_hook.hook_problem():
     pytest.skip(str(interaction_hook.hook_problem()), allow_module_level=True)
@@ -555,7 +555,7 @@ def _asked_again():
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "_asked_again")
 def test_a_shape_says_why_it_cannot_be_hooked(monkeypatch, place, value, message):
     monkeypatch.setattr(interaction_hook, "_hooks", {})
-    monkeypatch.setattr(f"mitsuba_subdivision.shapes.hook.interaction_hook.{place}", value)
+    monkeypatch.setattr(f"mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook.{place}", value)
     with pytest.raises(RuntimeError, match=message):
         make()
     assert mi.load_dict({"type": "subdivision", **named_cages.cube().as_properties(mi)}).face_count() > 0
@@ -567,7 +567,7 @@ def test_a_shape_says_that_no_memory_can_be_executed(monkeypatch):
         raise OSError("refused")
 
     monkeypatch.setattr(interaction_hook, "_hooks", {})
-    monkeypatch.setattr(trampoline, "_protect", refuse)
+    monkeypatch.setattr(machine_code, "_protect", refuse)
     with pytest.raises(RuntimeError, match="memory for machine code: refused"):
         make()
 

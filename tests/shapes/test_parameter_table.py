@@ -70,6 +70,15 @@ def test_a_description_names_all_choices(row):
     assert not row.description.endswith(".")
 
 
+@pytest.mark.parametrize("row", [row for row in ROWS if row.default is not None], ids=lambda row: row.name)
+def test_a_stated_default_is_the_value_as_scene_files_have_it(row):
+    stated = row.default_text or re.search(r"\(Default: ``(.*)``\)$|\(Default: (.*)\)$", row.text)
+    if not isinstance(stated, str):
+        stated = stated[1] or stated[2]
+        kinds = {bool: {"true": True, "false": False}.get, str: str}
+        assert kinds.get(type(row.default), float)(stated) == row.default
+
+
 def test_names_with_placeholders_are_those_of_attributes():
     placeholders = {name for name in PARAMETER_OF_NAME if "NAME" in name}
     assert placeholders == {name for name in PARAMETER_OF_NAME if is_attribute_parameter(name)} - {

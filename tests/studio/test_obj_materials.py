@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageWarning, studio_scene
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.studio.obj_materials import material_bsdf, read_materials
 
 LIBRARY = """newmtl red
 Kd 1 0 0.25 # pure
@@ -59,3 +60,16 @@ def test_a_missing_library_leaves_one_shape(file):
         scene = studio_scene(file, size=(8, 6), rate=2, shading="vertex")
     assert "material" not in scene["surface"]
     assert "surface_2" not in scene
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_pictures_are_upright(tmp_path):
+    # White at the top left, where u is small and v large.
+    mi.util.write_bitmap(str(tmp_path / "a b.png"), mi.TensorXf(np.array([[1.0, 0.0], [0.0, 0.0]])[..., None]))
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n")
+    (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd .\\a b.png\n")
+    picture = material_bsdf(read_materials(tmp_path / "a.obj")["a"], "a")["bsdf"]["base_color"]
+    texture, hit = mi.load_dict(picture), mi.SurfaceInteraction3f()
+    for uv, expected in (([0.25, 0.75], 1), ([0.25, 0.25], 0), ([0.75, 0.75], 0)):
+        hit.uv = uv
+        np.testing.assert_allclose(texture.eval(hit), expected, atol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import exact_shading_support
-from mitsuba_subdivision.shapes.hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import StillPicture, Turntable
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
 from mitsuba_subdivision.studio.look import Look

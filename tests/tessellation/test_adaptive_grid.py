@@ -146,14 +146,21 @@ def with_a_diagonal_twice():
     return ControlCage(np.array(points, dtype=float), faces)
 
 
-def test_elements_that_meet_twice_have_no_edge_twice():
-    """The diagonals of two patches would be one edge, with four triangles."""
-    surface = LimitSurface(with_a_diagonal_twice())
+def two_triangles():
+    """Back to back; they meet along both edges of each corner."""
+    return ControlCage([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [2, 1, 0]])
+
+
+@pytest.mark.parametrize(("cage", "scheme"), [(with_a_diagonal_twice(), "catmull_clark"), (two_triangles(), "loop")])
+def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme):
+    """The diagonals of two patches would be one edge, with four triangles; so would cuts across their corners."""
+    surface = LimitSurface(cage, scheme)
     table = table_of(surface, 100, 1)
     edges = directed_edges(table.triangles)
     keys, twins = (np.sort(numbered(each, table.vertex_count)) for each in (edges, edges[:, ::-1]))
     assert (np.diff(keys) > 0).all()
     np.testing.assert_array_equal(keys, twins)
+    assert len(np.unique(np.sort(table.triangles, axis=1), axis=0)) == len(table.triangles)
     assert_elements_are_covered(surface, table)
     assert_vertices_lie_where_triangles_say(surface, table)
 

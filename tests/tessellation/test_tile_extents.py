@@ -75,3 +75,13 @@ def test_nothing_fits_below_zero():
     count = values.shape[2]
     parts = [TileParts(tile, 0 * values, np.arange(count))]
     assert not fit_within(surface.scheme, np.full(count, -1.0), parts).any()
+
+
+@pytest.mark.parametrize("name", FEW_SURFACES)
+def test_surfaces_do_not_fit_where_only_their_corners_do(name, np_rng):
+    """A limit that the corners of a tile reach exactly, and the surface between them exceeds."""
+    surface = surface_named(name)
+    for tile, values, size in tiles_of(surface, surface.scheme, np_rng.normal(size=(3, 1))):
+        limit = np.ptp(np.einsum("ck,kdt->cdt", tile.corners, values), axis=0)[0]
+        found = fit_within(surface.scheme, limit, [TileParts(tile, values, np.arange(len(limit)))])
+        assert not found[size > (1 + MISSED) * limit].any()

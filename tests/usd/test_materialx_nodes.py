@@ -212,3 +212,13 @@ def test_heights_become_normals(monkeypatch):
     expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
     found = baked(expression, source({"a.png": height})).values
     np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
+
+
+def test_lookups_of_a_linear_image_are_linear(np_rng):
+    """Between the centres of its pixels; v points up."""
+    y, x = np.indices((5, 7))
+    values = (2 * x + 3 * y).astype(np.float64)[..., None]
+    column, row = np_rng.uniform(0, [6, 4], (50, 2)).T
+    uv = np.stack([(column + 0.5) / 7, 1 - (row + 0.5) / 5], axis=1)
+    found = baking._looked_up(values, uv, "clamp")
+    np.testing.assert_allclose(found[:, 0], 2 * column + 3 * row, rtol=0, atol=1e-5)

@@ -289,7 +289,7 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
         + mesh("unseen", CUBE + 'token visibility = "invisible"')
         + mesh("guide", CUBE + 'uniform token purpose = "guide"')
         + mesh("proxy", CUBE + 'uniform token purpose = "proxy"')
-        + mesh("rendered", CUBE + 'uniform token purpose = "render"')
+        + mesh("rendered", CUBE + 'uniform token purpose = "render"\nuniform token model:drawMode = "cards"')
         + mesh("bilinear", CUBE + 'uniform token subdivisionScheme = "bilinear"')
         + mesh("broken", CUBE.replace("5]", "50]"))
         + f'def Scope "off" {{ token visibility = "invisible"\n {mesh("below", CUBE)} }}\n'
@@ -300,7 +300,8 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     names = {"seen", "rendered", "bilinear", "unseen", "guide", "proxy", "broken", "off_below"} & scene.keys()
     assert names == {"seen", "rendered", "bilinear"}
     messages = [str(each.message) for each in record]
-    assert len(messages) == 3
+    assert len(messages) == 4
+    assert any("draw modes of models are ignored; their meshes are shown (/rendered)" in text for text in messages)
     assert any("BasisCurves are ignored (/c0, /c1, /c2 and 2 more)" in message for message in messages)
     assert any("scheme bilinear become polygons (/bilinear)" in message for message in messages)
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
@@ -753,8 +754,10 @@ def test_normals_of_polygons(stage):
     faceted = msub.usd_scene(stage(mesh("square", SQUARE)), mi)["square"]
     assert not faceted.has_vertex_normals()
     normals = 'normal3f[] normals = [(1,0,0), (0,1,0), (0,0,1), (0,0.6,0.8)] (interpolation = "faceVarying")\n'
-    for hand in ("rightHanded", "leftHanded"):
-        body = f'{SQUARE}{normals}uniform token orientation = "{hand}"'
+    indexed = normals.replace("normals =", "primvars:normals =").replace("(1,0,0), (0,1,0)", "(0,1,0), (1,0,0)")
+    indexed += "int[] primvars:normals:indices = [1, 0, 2, 3]\n"
+    for hand, authored in (("rightHanded", normals), ("leftHanded", normals), ("rightHanded", indexed)):
+        body = f'{SQUARE}{authored}uniform token orientation = "{hand}"'
         shape = msub.usd_scene(stage(mesh("square", body)), mi)["square"]
         found = dict(
             zip(
@@ -765,6 +768,12 @@ def test_normals_of_polygons(stage):
         )
         assert found[(-1, -1)] == [1, 0, 0]
         assert found[(1, -1)] == [0, 1, 0]
+
+
+def test_planes_are_rectangles(stage):
+    plane = msub.usd_scene(stage('def Plane "plane" { double width = 4\ndouble length = 6 }'), mi)["plane"]
+    corners = np.unique(positions(plane), axis=0)
+    np.testing.assert_allclose(corners, [(-2, -3, 0), (-2, 3, 0), (2, -3, 0), (2, 3, 0)])
 
 
 @pytest.mark.parametrize("kind", ["Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane"])
@@ -848,3 +857,19 @@ def test_messages_of_one_kind_are_one(stage):
     (message,) = (str(each.message) for each in record)
     assert "prim /broken0: " in message
     assert message.endswith("; likewise 4 other prims (/broken1, /broken2, /broken3 and 1 more)")
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_scene_of_the_chess_set_finds_the_set_on_the_search_path(tmp_path):
+    from pxr import Ar
+
+    (tmp_path / "OpenChessSet").mkdir()
+    stand_in = f'#usda 1.0\n( defaultPrim = "set" )\ndef Xform "set" {{\ndef Mesh "king" {{{CUBE}}}\n}}\n'
+    (tmp_path / "OpenChessSet" / "chess_set.usda").write_text(stand_in)
+    Ar.DefaultResolver.SetDefaultSearchPath([str(tmp_path)])
+    try:
+        scene = msub.usd_scene(msub.example_file("chess_set.usda"), mi)
+    finally:
+        Ar.DefaultResolver.SetDefaultSearchPath([])
+    assert "Scene_ChessSet_king" in scene
+    assert {"thinlens", "envmap", "directional"} <= {each["type"] for each in scene.values() if isinstance(each, dict)}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 from ..images.tolerances import Tolerances
@@ -30,7 +31,7 @@ def add_pass_options(render: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--dask",
         metavar="ADDRESS",
-        help="render the passes, or one picture of a model, on the Dask cluster of this scheduler",
+        help="render the passes, or the frames of a model, on the Dask cluster of this scheduler",
     )
     group.add_argument(
         "--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)"
@@ -52,8 +53,9 @@ def add_tolerances(group: argparse._ActionsContainer, text: str) -> None:
 
 
 def wants_passes(options: argparse.Namespace) -> bool:
-    """Whether the options of ``render`` ask for rendering by passes."""
-    return bool(options.share or options.passes or options.dask or options.reference)
+    """Whether the options of ``render`` ask for rendering by passes. A worker renders a frame as a whole."""
+    on_cluster = options.dask and not (options.frames or options.turntable or options.shutter)
+    return bool(options.share or options.passes or options.reference or on_cluster)
 
 
 def validate_pass_options(options: argparse.Namespace) -> None:
@@ -92,7 +94,7 @@ def validate_pass_options(options: argparse.Namespace) -> None:
 def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene] | None = None) -> None:
     """Render by passes according to the options of ``render``, in the current variant, and write the image.
 
-    A model is loaded by ``load``, here and on the workers of a cluster.
+    A model is loaded by ``load``, here and on the workers of a cluster; it must be picklable.
 
     Raises
     ------
@@ -108,27 +110,27 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     from ..regression.scene import BOX, load_scene
 
     filter_name = BOX if options.reference else options.filter
-    parameters = dict(options.parameters)
-    loaded = load() if load else load_scene(options.scene, parameters, filter_name)
+    is_model = load is not None
+    if load is None:
+        # Workers may be in another folder.
+        path = options.scene.resolve() if options.dask else options.scene
+        load = partial(load_scene, path, dict(options.parameters), filter_name)
+    loaded = load()
     require_writable(options.output, loaded.file_paths)
     spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
     tolerances = Tolerances().with_values(dict(options.tolerances))
     number, count = options.share or (1, options.passes or 1)
     batch = options.batch or min(BATCH, max(1, spp // max(2, count)))
+    if is_model:
+        from ..studio.studio_entries import sampler
+
+        # Mitsuba would round each batch up, and more samples than recorded would count.
+        batch = sampler(batch)["sample_count"]
     sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
     settings = {"with_probe": options.reference}
     if options.dask:
-        image = render_on_cluster(
-            options.dask,
-            options.scene,
-            parameters,
-            str(mi.variant()),
-            sampling,
-            options.passes or 0,
-            filter_name,
-            load=load,
-            **settings,
-        )
+        variant = str(mi.variant())
+        image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
     elif options.share:
         image = render_pass(loaded, sampling, number, count, **settings)
     else:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..files.formats import FORMATS
 from ..messages import print_remark, print_result
@@ -20,11 +18,12 @@ from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
 from .arguments import add_cage_options, add_variant, finite, positive, set_variant
 from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes
+from .pictures import as_data, load_still, pictures, render_picture, threads
 
 if TYPE_CHECKING:
-    from ..regression.scene import LoadedScene
-    from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
-    from ..studio.look import Look
+    import numpy as np
+    from numpy.typing import NDArray
+
     from .parser import Commands
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
@@ -46,11 +45,9 @@ _OF_MODELS = (
     "cage",
     "texture_size",
 )
-# Options that select one mesh of a USD file.
-_OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that do not apply to a model's scene.
-_OF_SCENES = ("parameters", "sensor", "share", "passes", "batch", "reference", "tolerances")
+_OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
 
 
 def add_parser(commands: Commands) -> None:
@@ -206,6 +203,10 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
         raise ValueError("--turntable turns one model, --frames shows several; expected only one of them")
     if options.fps and options.output.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(VIDEO_SUFFIXES)}")
+    if options.passes and has_frames:
+        raise ValueError("--passes are of one picture; expected no --frames or --turntable beside it")
+    if options.save_scene and (options.dask or options.passes):
+        raise ValueError("--save-scene writes a scene that is rendered at once; expected no --dask or --passes")
     if options.time is not None and options.frames:
         raise ValueError("--time is one time, --frames are several; expected only one of them")
     if options.shutter and (options.turntable or (options.time is None and not options.frames)):
@@ -240,7 +241,7 @@ def _render_scene(options: argparse.Namespace) -> None:
     if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
     if wants_passes(options):
-        with _threads(options.threads):
+        with threads(options.threads):
             render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
@@ -249,84 +250,29 @@ def _render_scene(options: argparse.Namespace) -> None:
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, as the integrator has AOVs')
-    _write_image(options, [loaded], options.output, options.spp)
+    _write_image(options, render_picture(options, [loaded], options.spp), options.output)
     print_result(options.output)
 
 
 def _render_model(options: argparse.Namespace) -> None:
-    from ..studio.animation import FrameRange, StillPicture, Turntable
-    from ..studio.scene_file import save_scene
-
     if not options.frames:
         if not options.scene.is_file():
             hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         require_writable(options.output, [options.scene])
-    if options.dask:
-        if options.frames or options.turntable or options.shutter or options.save_scene:
-            raise ValueError(
-                "--dask renders one picture of a model; expected no --frames, --turntable, --shutter or --save-scene"
-            )
-        # Plain data, from which each worker builds the scene again.
-        given = {name: value for name, value in vars(options).items() if name not in ("run", "parser")}
-        with _threads(options.threads):
-            render_by_passes(options, partial(_load_still, given | {"scene": options.scene.resolve()}))
+    if wants_passes(options):
+        with threads(options.threads):
+            render_by_passes(options, partial(load_still, as_data(options)))
         return
-    source = _source(options)
-    shown: FrameRange | Turntable | StillPicture
-    if options.frames or options.shutter:
-        shown = FrameRange(source, options.frames or range(1, 2))
-    elif options.turntable:
-        shown = Turntable(source, options.turntable)
-    else:
-        shown = StillPicture(source, follows_sensor=not options.save_scene)
-    # The contents of a stage may be large.
-    del source
-    if options.save_scene:
-        save_scene(shown.scene, options.save_scene, [options.scene])
     if options.frames or options.turntable:
-        _write_frames(options, shown)
+        _write_frames(options)
         return
-    _write_image(options, shown.frames(shown.numbers, options.filter), options.output)
+    _, image = next(pictures(options, [1]))
+    _write_image(options, image, options.output)
     print_result(options.output)
 
 
-def _load_still(options: dict[str, Any]) -> LoadedScene:
-    """The scene of a still picture, by the options of the command; also runs on workers."""
-    from ..studio.animation import StillPicture
-
-    given = argparse.Namespace(**options)
-    return next(StillPicture(_source(given)).frames([1], given.filter))
-
-
-def _source(options: argparse.Namespace) -> SceneSource[Any]:
-    """One mesh, or a whole USD file."""
-    from ..studio.picture import shading_for
-    from ..studio.studio_entries import variant_in_use
-
-    look, which = _look(options), {"time": options.time, "numbers": options.frames}
-    is_usd = options.scene.suffix.lower().startswith(".usd")
-    if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
-        from ..usd.stage_scenes import StageScenes
-
-        given = {"tessellation_rate": options.rate, "shading": options.shading}
-        parameters = {name: v for name, v in given.items() if v is not None}
-        return StageScenes(options.scene, look, parameters, shutter=options.shutter, **which)
-    if options.shutter:
-        raise ValueError(
-            f'--shutter was given for one cage of "{options.scene}", which has no camera; expected a whole USD file'
-        )
-    if options.texture_size:
-        raise ValueError(
-            f'--texture-size was given for one cage of "{options.scene}"; expected it for a whole USD file'
-        )
-    from ..studio.cage_scenes import CageScenes
-
-    shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
-    return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
-
-
-def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | StillPicture) -> None:
+def _write_frames(options: argparse.Namespace) -> None:
     """Render the missing frames, and join all to a video if requested."""
     from ..progress import counted
     from ..studio.video import VIDEO_SUFFIXES, require_encoder, write_video
@@ -335,71 +281,34 @@ def _write_frames(options: argparse.Namespace, moving: FrameRange | Turntable | 
     if is_video:
         require_encoder(options.output)
     suffix = ".png" if is_video else options.output.suffix
-    pictures = {n: options.output.with_name(f"{options.output.stem}_{n:04d}{suffix}") for n in moving.numbers}
-    require_writable(next(iter(pictures.values())))
-    missing = [number for number, path in pictures.items() if not path.is_file()]
-    if len(missing) < len(pictures):
-        there = len(pictures) - len(missing)
-        print_remark(f"{there} of {len(pictures)} frames exist and are kept; remove them to render them again")
-    scenes = moving.frames(missing, options.filter)
-    for number in counted(missing, "Frames"):
-        _write_image(options, islice(scenes, options.shutter or 1), pictures[number])
-        print_result(pictures[number])
+    numbers = options.frames or range(1, options.turntable + 1)
+    paths = {n: options.output.with_name(f"{options.output.stem}_{n:04d}{suffix}") for n in numbers}
+    require_writable(next(iter(paths.values())))
+    missing = [number for number, path in paths.items() if not path.is_file()]
+    if len(missing) < len(paths):
+        there = len(paths) - len(missing)
+        print_remark(f"{there} of {len(paths)} frames exist and are kept; remove them to render them again")
+    found = pictures(options, missing)
+    for _ in counted(missing, "Frames"):
+        number, image = next(found)
+        _write_image(options, image, paths[number])
+        print_result(paths[number])
     if is_video:
-        write_video(options.output, list(pictures.values()), options.fps or DEFAULT_FPS)
+        write_video(options.output, list(paths.values()), options.fps or DEFAULT_FPS)
         print_result(options.output)
 
 
-def _write_image(
-    options: argparse.Namespace, scenes: Iterable[LoadedScene], path: Path, spp: int | None = None
-) -> None:
-    """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
+def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
     import mitsuba as mi
 
     from ..images.exr import METADATA_ATTRIBUTE
-    from ..regression.rendering import render_image
 
-    count = options.shutter or 1
-    image = None
-    with _threads(options.threads):
-        for part, loaded in enumerate(scenes):
-            seed = (options.seed * count + part) % 2**32
-            found = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
-            if options.denoise:
-                from ..studio.denoising import denoised
-
-                # Each by itself, as its albedo and normals are those of its time.
-                found = denoised(loaded, found, seed)
-            image = found / count if image is None else image + found / count
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
         bitmap = mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
         if options.denoise:
             bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
         bitmap.write(str(beside))
-
-
-@contextmanager
-def _threads(count: int | None) -> Iterator[None]:
-    """Render with so many threads. With one, Mitsuba would wait for ever when it writes OpenEXR files."""
-    import drjit as dr
-
-    before = dr.thread_count()
-    dr.set_thread_count(count or before)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(before)
-
-
-def _look(options: argparse.Namespace) -> Look:
-    from ..studio.look import Look
-
-    azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
-    azimuth = azimuth if options.azimuth is None else options.azimuth
-    elevation = elevation if options.elevation is None else options.elevation
-    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage", "texture_size")}
-    return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
 
 
 def _seed(text: str) -> int:

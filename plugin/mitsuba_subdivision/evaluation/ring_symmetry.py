@@ -308,15 +308,15 @@ def _separate(waves: _Waves, to_rest: FloatArray, of_rest: NDArray[np.inexact]) 
     -------
     (w,) bool
     """
-    # A first picture needs no SciPy.
-    from scipy import linalg
-
     near = np.abs(waves.eigenvalues[:, None] - of_rest).min(axis=1) < SEPARATE
     is_separate = ~near
     order = np.flatnonzero(near)[np.argsort(waves.eigenvalues[near])]
     begins = np.flatnonzero(np.diff(waves.eigenvalues[order], prepend=-np.inf) > EQUAL)
     for own in np.split(order, begins[1:]):
         if len(own) > len(to_rest):
+            # A first picture needs no SciPy.
+            from scipy import linalg
+
             (reflectors, scales), triangular = linalg.qr(to_rest[:, own].T, mode="raw")
             waves.vectors[:, own] = _times_rotation(waves.vectors[:, own], reflectors, scales)
             waves.dual[own] = _times_rotation(waves.dual[own].T, reflectors, scales).T

@@ -49,19 +49,19 @@ class Format:
     write_triangles: str | None = None
     has_prims: bool = False
     refers_to_files: bool = False
-    up: str | None = None
+    up: str | None = "y"
 
 
-_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", True, True)
+_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", True, True, up=None)
 # Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
 FORMATS = {
-    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles", up="y"),
+    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles"),
     ".ply": Format("ply_reader:read_ply", "ply_writer:write_ply", "ply_writer:write_ply_triangles", up="z"),
     ".usd": _USD,
     ".usda": _USD,
     ".usdc": _USD,
     # An archive of finished USD files, which can be read but not written.
-    ".usdz": Format(_USD.read, has_prims=True, refers_to_files=True),
+    ".usdz": Format(_USD.read, has_prims=True, refers_to_files=True, up=None),
 }
 
 

@@ -14,7 +14,7 @@ from . import ImageError
 from .estimate import Estimate
 from .exr import Channels, read_channels, write_channels
 from .metadata import require_metadata
-from .probe import Probe
+from .probe_aovs import Probe
 
 SCHEMA = 1
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .image import Image
 from .panel import Panel
 from .png import colours
-from .probe import Probe
+from .probe_aovs import Probe
 from .tier import Status, TierResult, pixel_of_largest, skipped_without
 from .tolerances import Tolerances
 

@@ -10,10 +10,10 @@ import drjit as dr
 import numpy as np
 
 from .array_types import NO_CONFLICTS, ArrayTypes
+from .control_values import WeightedValues
 from .dense_batch import DenseBatch, padded_size
 from .lanes import Batch
 from .product_batch import ProductBatch
-from .sparse_matrix import SparseMatrix
 from .types import FloatBuffer, Vector3
 from .unit_normal import RoundingBound, UnitNormal
 
@@ -45,12 +45,10 @@ class WeightKernel:
         self.vector3 = self._types.vector3
         self._batches = list(_batches(self._types, table))
         self._refined_count = table.control_count
-        self._refine: SparseMatrix | None = None
-        self._refine_transposed: SparseMatrix | None = None
+        self._refinement: WeightedValues | None = None
         if table.refinement is not None:
             self._refined_count = table.refinement.shape[0]
-            self._refine = SparseMatrix(table.refinement, float_type, is_relative=True)
-            self._refine_transposed = SparseMatrix(table.refinement.T.tocsr(), float_type, is_relative=False)
+            self._refinement = WeightedValues.shared(table.refinement, float_type)
         self._weld_target = self._types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
@@ -115,7 +113,9 @@ class WeightKernel:
         finish : callable
             Computes the vectors from a point, two tangents, and the `RoundingBound` of the tangents.
         """
-        padded = self._types.padded(control_points if self._refine is None else self._refine(control_points))
+        padded = self._types.padded(
+            control_points if self._refinement is None else self._refinement.product(control_points)
+        )
         buffers: tuple[FloatBuffer, ...] = tuple(
             dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(count)
         )
@@ -145,7 +145,7 @@ class WeightKernel:
         sums: FloatBuffer = dr.zeros(self._types.float, 3 * self._refined_count)
         for batch in self._batches:
             batch.add_transposed(fetch, sums)
-        return sums if self._refine_transposed is None else self._refine_transposed(sums)
+        return sums if self._refinement is None else self._refinement.transposed(sums)
 
 
 def _batches(types: ArrayTypes, table: VertexTable) -> Iterator[Batch]:

@@ -11,11 +11,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh.shared import Content, Shared, SharedArray
 from .alignment import aligned
 from .types import FloatBuffer, Index, IndexBuffer, Mask, Vector3
 
 # For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
+_UPLOADED: Shared[SharedArray] = Shared()
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,10 @@ class ArrayTypes:
         """Upload an array of numbers, flattened."""
         values = aligned(values, dtype=np.float64 if self.is_double else np.float32)
         return self.float(values) if self.is_jit else values
+
+    def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
+        """Upload an array of numbers, flattened; equal ones share their memory while one is referenced."""
+        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(self.floats(values)))
 
     def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:
         """Gather a number or a vector from an array that `indices` or `floats` uploaded.

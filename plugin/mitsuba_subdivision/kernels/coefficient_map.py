@@ -13,7 +13,7 @@ from ..mesh import ragged
 from ..mesh.shared import Shared
 from ..patches.piece_table import NOTHING, PACKET, piece_packets
 from .array_types import NO_CONFLICTS, ArrayTypes
-from .sparse_matrix import SparseMatrix
+from .control_values import WeightedValues
 from .types import FloatBuffer, Index, IndexBuffer, Vector3, Vector4
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class CoefficientMap:
     def apply(self, points: FloatBuffer) -> FloatBuffer:
         """The coefficients on a device, without derivatives."""
         types, steps = self._types, self._steps
-        padded = types.padded(points if steps.refine is None else steps.refine(points))
+        padded = types.padded(points if steps.refinement is None else steps.refinement.product(points))
         if steps.parts is not None:
             own, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
             every: Index = dr.arange(types.index, steps.refined_count)
@@ -114,7 +114,7 @@ class CoefficientMap:
             steps.parts.add_transposed(type(sums)(sums), sums)
         own = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
         found = dr.ravel(types.vector3(own.x, own.y, own.z))
-        return found if steps.refine_transposed is None else steps.refine_transposed(found)
+        return found if steps.refinement is None else steps.refinement.transposed(found)
 
     @cached_property
     def _steps(self) -> _Steps:
@@ -131,8 +131,8 @@ class _Steps:
 
     Attributes
     ----------
-    refine, refine_transposed : SparseMatrix or None
-        Map to the control points of the cage refined once, and its transpose.
+    refinement : WeightedValues or None
+        Map to the control points of the cage refined once.
     refined_count, point_count : int
         Of these control points, and of all together with those of parts.
     parts : _Rows or None
@@ -147,31 +147,27 @@ class _Steps:
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
         refinement = table.refinement
         self.refined_count = table.control_count if refinement is None else refinement.shape[0]
-        self.refine = self.refine_transposed = None
-        if refinement is not None:
-            self.refine = SparseMatrix(refinement, types.float, is_relative=True)
-            self.refine_transposed = SparseMatrix(refinement.T.tocsr(), types.float, is_relative=False)
+        self.refinement = None if refinement is None else WeightedValues.shared(refinement, types.float)
         controls = table.controls
         monomial_count = next((maps[0].pieces.shape[1] for maps in table.maps if maps), 1)
         of_piece = piece_packets(monomial_count)
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
         self.point_count = self.refined_count
         # Control points of parts follow all others.
-        shift = self.point_count - len(controls)
         for maps, (first, count, control_count, packet, size, ring) in zip(
             table.maps, table.classes.tolist(), strict=True
         ):
             for first_piece, stencils, weights in maps:
-                own_first, own_count = first, control_count
+                own_first, own_count, is_part = first, control_count, stencils is not None
                 if stencils is not None:
-                    own_first, own_count = self.point_count - shift, len(stencils)
+                    own_first, own_count = self.point_count, len(stencils)
                     parts.add(stencils[:, None], first, count, control_count, self.point_count, count, 1)
                     self.point_count += count * own_count
                 to = packet + ring + first_piece * of_piece
-                pieces.add(weights, own_first, count, own_count, to, of_piece, size)
-        every = np.arange(self.refined_count, self.point_count, dtype=controls.dtype)
-        every = types.indices(np.concatenate([controls, every]))
-        self.parts, self.pieces = (each.rows(types, every) if each.added else None for each in (parts, pieces))
+                pieces.add(weights, own_first, count, own_count, to, of_piece, size, is_part=is_part)
+        # Not aligned, and so not copied, because kernels only gather from it.
+        listed = types.index(controls)
+        self.parts, self.pieces = (each.rows(types, listed) if each.added else None for each in (parts, pieces))
         self.rings = None
         if table.classes[:, 5].any():
             rings = []
@@ -195,7 +191,8 @@ class _Blocks:
     ----------
     added : list of tuple of ints
         Of what was added: how many blocks; of each its number of patches; the index of its first control, and how many
-        controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches.
+        controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches;
+        and whether its controls are those of parts.
     """
 
     def __init__(self, width: int) -> None:
@@ -205,14 +202,24 @@ class _Blocks:
         self._row_count = 0
 
     def add(
-        self, weights: np.ndarray, first: int, count: int, control_count: int, to: int, apart: int, step: int
+        self,
+        weights: np.ndarray,
+        first: int,
+        count: int,
+        control_count: int,
+        to: int,
+        apart: int,
+        step: int,
+        *,
+        is_part: bool = False,
     ) -> None:
         """Add a block for each of some ``(b, width, K)`` weights."""
         key = id(weights)
         if key not in self._weights:
             self._weights[key] = weights, self._row_count
             self._row_count += len(weights) * control_count
-        self.added.append((len(weights), count, first, control_count, self._weights[key][1], to, apart, step))
+        row = self._weights[key][1]
+        self.added.append((len(weights), count, first, control_count, row, to, apart, step, int(is_part)))
 
     def rows(self, types: ArrayTypes, controls: IndexBuffer) -> _Rows:
         """Upload the blocks."""
@@ -227,9 +234,9 @@ class _Blocks:
             own[:, 0, 0] += 1
         added = np.array(self.added)
         index = ragged.index_in_row(added[:, 0])
-        _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
+        _, count, first, control_count, row, to, apart, step, is_part = np.repeat(added, added[:, 0], axis=0).T
         # Controls of a block's patches are as far apart as there are patches.
-        columns = [count, first, count, control_count, row + index * control_count, to + index * apart, step, 0 * to]
+        columns = [count, first, count, control_count, row + index * control_count, to + index * apart, step, is_part]
         return _Rows(types, self.width, np.stack(columns, axis=1), weights, controls)
 
 
@@ -243,7 +250,8 @@ class _Rows:
         As in `_Blocks`.
     columns : (b, 8) int
         Of each block its number of patches; the index of its first control, how far those of a patch are apart, and how
-        many they are; its first row of weights; where it writes to, how far patches are apart there; and zero.
+        many they are; its first row of weights; where it writes to, how far patches are apart there; and whether the
+        indices of controls are themselves those of control points, instead of places in `controls`.
     weights : (w, ..) float
         A row for each control point of a block, with a number for each vector that it makes.
     controls : index array
@@ -306,12 +314,13 @@ class _Rows:
         lane: Index = dr.arange(types.index, self._count)
         block = types.fetch(types.index, self._block, lane)
         first_lane, first_control, patch_count, control_count = types.fetch(types.index4, self._blocks, 2 * block)
-        row, first_packet, step, _ = types.fetch(types.index4, self._blocks, 2 * block + 1)
+        row, first_packet, step, is_part = types.fetch(types.index4, self._blocks, 2 * block + 1)
         patch = lane - first_lane
-        at = first_control + patch
+        at, is_listed = first_control + patch, is_part == 0
 
         def control(k: Index) -> Index:
-            return types.fetch(types.index, self._controls, dr.fma(k, patch_count, at))
+            index = dr.fma(k, patch_count, at)
+            return dr.select(is_listed, types.fetch(types.index, self._controls, index, is_listed), index)
 
         return control, control_count, row, dr.fma(patch, step, first_packet)
 

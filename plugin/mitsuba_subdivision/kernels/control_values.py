@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
+from ..mesh.shared import Content, Shared
 from .array_types import ArrayTypes
 from .sparse_matrix import SparseMatrix
 from .types import FloatBuffer, Index, Mask, Value
@@ -31,6 +32,12 @@ class WeightedValues:
 
     def __init__(self, weights: sparse.csr_array, float_type: type) -> None:
         self._weights, self._float = weights, float_type
+
+    @classmethod
+    def shared(cls, weights: sparse.csr_array, float_type: type) -> WeightedValues:
+        """The same object for equal weights, while it is referenced."""
+        key = float_type, *map(Content, (weights.data, weights.indices, weights.indptr)), weights.shape
+        return _WEIGHTED.get(key, lambda: cls(weights, float_type))
 
     def __call__(self, values: FloatBuffer, size: int) -> FloatBuffer:
         """The weighted values, each of `size` components: flat, or in NumPy one per row."""
@@ -89,7 +96,12 @@ class ControlValues:
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
         self.flat: FloatBuffer = types.float() if types.is_jit else None
-        self.set(types.floats(values.ravel()))
+        if not types.is_jit:
+            self.set(values)
+            return
+        # Kept, so that others that are equal share its memory.
+        self._given = types.shared_floats(values)
+        self.set(self._given.array)
 
     def set(self, values: FloatBuffer) -> None:
         """Set new values of the cage, flat. Later lookups are attached to them."""
@@ -110,3 +122,6 @@ class ControlValues:
     def fetch(self, index: Index, active: Mask = True) -> Value:
         """Gather the value at an index, where a mask is set."""
         return self._types.fetch(self._types.vector(self.size), self.flat, index, active)
+
+
+_WEIGHTED: Shared[WeightedValues] = Shared()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from threading import RLock
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
@@ -39,6 +40,13 @@ class Content:
         if a is b or a is None or b is None:
             return a is b
         return a.dtype == b.dtype and np.array_equal(a, b)
+
+
+@dataclass(frozen=True, eq=False)
+class SharedArray:
+    """An array as a value of `Shared`: on a device, or of NumPy."""
+
+    array: Any
 
 
 class Shared(Generic[Value]):

@@ -259,7 +259,7 @@ def contracts_alike(channel: Channel, patches: PatchTable, half_edge: IntArray) 
         return np.ones(len(half_edge), dtype=bool)
     tables = channel.patches, patches
     # For both, the class and the corner that the fan is at.
-    places = np.array([table.patch_of_corner[i][half_edge] for table in tables for i in (0, 2)])
+    places = np.array([found for table in tables for found in table.patch_at(half_edge)[::2]])
     kinds, which = np.unique(places, axis=1, return_inverse=True)
     fans = (
         [table.classes[a].signature.fans[b] for a, b in kinds[2 * i : 2 * i + 2].T] for i, table in enumerate(tables)

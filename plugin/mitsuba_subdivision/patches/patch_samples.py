@@ -58,7 +58,7 @@ class PatchSampler:
         evaluator, dtype, derivatives
             As for `LimitSurface.evaluate`.
         """
-        class_index, patch, patch_corner = (found[half_edge] for found in self.patches.patch_of_corner)
+        class_index, patch, patch_corner = self.patches.patch_at(half_edge)
         samples = ElementSamples.empty(len(uv), self.control_values.shape[1], dtype, derivatives)
         # Second derivatives, and single precision, have no bits to lose; and the other forms are about these levels.
         is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64

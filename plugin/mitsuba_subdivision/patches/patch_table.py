@@ -14,6 +14,7 @@ from ..mesh import ragged
 from ..mesh.chunks import gathered
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
+from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.scheme import Scheme
@@ -218,13 +219,16 @@ class PatchTable:
         if refined is not None:
             from scipy import sparse
 
-            # Copies of a control point share a column, where their weights add up. This is done in place.
-            weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-            refinement = sparse.csr_array(
-                (weights.data, control_of_vertex[weights.indices], weights.indptr), shape=shape, copy=True
-            )
-            refinement.sum_duplicates()
-            return refined.table.controls.view(np.uint32), refinement
+            def make() -> sparse.csr_array:
+                # Copies of a control point share a column, where their weights add up. This is done in place.
+                weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
+                columns = control_of_vertex.astype(weights.indices.dtype)[weights.indices]
+                matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
+                matrix.sum_duplicates()
+                return matrix
+
+            key = refined, Content(control_of_vertex), control_count
+            return refined.table.controls.view(np.uint32), _REFINEMENTS.get(key, make)
         controls = self.controls
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             controls = gathered(control_of_vertex.astype(np.int32), controls)
@@ -249,11 +253,16 @@ class PatchTable:
         """By their `OccupiedPieces.piece_levels`, those of classes in which samples have lain; and these' numbers."""
         return {}
 
+    def patch_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The class, the patch in it, and which of the patch's corners it is, for some half-edges of `elements`."""
+        index, patch, patch_corner = (found[corners].astype(np.int64) for found in self._patch_of_corner)
+        return index, patch, patch_corner
+
     @cached_property
-    def patch_of_corner(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """The class, the patch in it, and which of the patch's corners it is, for each half-edge of `elements`."""
+    def _patch_of_corner(self) -> tuple[IndexArray, IndexArray, IndexArray]:
+        """`patch_at` all half-edges."""
         t = self.elements
-        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=np.int64) for _ in range(3))
+        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=np.int32) for _ in range(3))
         for index, patch_class in enumerate(self.classes):
             corners = patch_class.corners
             whole = self.is_whole[t.face_of(corners[0])]
@@ -369,3 +378,7 @@ class RefinedPatches:
         # By `splits_corners` of the scheme, face h of the refined cage lies at half-edge h of the cage, and
         # begins there.
         return self.table.topology.face_of(patch_class.corners)
+
+
+# Tessellations and exact shading refine the same control values.
+_REFINEMENTS: Shared[sparse.csr_array] = Shared()

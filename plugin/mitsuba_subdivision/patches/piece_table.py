@@ -60,10 +60,8 @@ class PieceTable:
         `PieceTree.kinds` plus `TURN` times the turn; first child, or first packet of the piece, counted from the
         patch's own; first row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
         `CONTROL` times the number of control points in the one-ring.
-    weights : (w, m) float64
-        Blocks of all classes, one row for each control point.
-    maps : tuple of tuples of PieceMap
-        `PieceTree.maps` of each class.
+    trees : tuple of PieceTree
+        Of each class.
     classes : (c, 6) uint32
         Of each class the index of its first control in ``controls``, its numbers of patches and of controls, its first
         packet, how many packets each patch has, and how many of these are for control points.
@@ -78,8 +76,7 @@ class PieceTable:
     piece_levels: int
     patch_starts: NDArray[np.uint32]
     nodes: NDArray[np.uint32]
-    weights: FloatArray
-    maps: tuple[tuple[PieceMap, ...], ...]
+    trees: tuple[PieceTree, ...]
     classes: NDArray[np.uint32]
     controls: NDArray[np.uint32]
     refinement: sparse.csr_array | None
@@ -137,19 +134,27 @@ class PieceTable:
             np.stack([packet + size * np.arange(count), np.full(count, node)], axis=1)
             for packet, size, count, node in zip(first_packets, sizes, counts, first_nodes, strict=True)
         ]
-        blocks = [tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in trees]
         return cls(
             patches,
             control_count,
             piece_levels,
             np.concatenate(starts).astype(np.uint32),
             _joined_nodes(trees, [each.controls.shape[1] for each in table.classes], rings, packets_of_piece),
-            np.concatenate(blocks),
-            tuple(tree.maps for tree in trees),
+            tuple(trees),
             np.array(classes, dtype=np.uint32),
             controls,
             refinement,
         )
+
+    @property
+    def maps(self) -> list[tuple[PieceMap, ...]]:
+        """`PieceTree.maps` of each class."""
+        return [tree.maps for tree in self.trees]
+
+    @property
+    def weights(self) -> FloatArray:
+        """``(w, m)`` blocks of all classes, one row for each control point; made at each call, as kernels keep them."""
+        return np.concatenate([tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in self.trees])
 
     @property
     def half_edges(self) -> NDArray[np.uint32]:
@@ -165,7 +170,7 @@ class PieceTable:
         # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
         table = patches if refined is None else refined.table
         own = every if refined is None else table.topology.face_offsets[:-1]
-        class_index, patch, patch_corner = (values[own] for values in table.patch_of_corner)
+        class_index, patch, patch_corner = table.patch_at(own)
         first_patch = ragged.starts(np.array([len(each.corners) for each in table.classes]))
         face = t.face_of(every)
         is_whole = patches.is_whole[face]

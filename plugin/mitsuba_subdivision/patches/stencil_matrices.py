@@ -108,7 +108,7 @@ def sample_matrices(
 def _sample_rows(
     patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray, derivatives: int
 ) -> Iterator[StencilRows]:
-    class_index, patch, patch_corner = (found[half_edge] for found in patches.patch_of_corner)
+    class_index, patch, patch_corner = patches.patch_at(half_edge)
     order = np.argsort(class_index, kind="stable")
     begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
     for of_class in counted(np.split(order, begins[1:]) if len(order) else [], "Weights of patch classes"):
@@ -141,7 +141,7 @@ def value_matrix(
 def _value_rows(
     patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray
 ) -> Iterator[StencilRows]:
-    class_index, patch, patch_corner = (found[half_edge] for found in patches.patch_of_corner)
+    class_index, patch, patch_corner = patches.patch_at(half_edge)
     # Samples of the same class in the same place of their patches have the same weights.
     keys = np.stack([class_index, patch_corner, *uv.T])
     order = np.lexsort(keys[::-1])

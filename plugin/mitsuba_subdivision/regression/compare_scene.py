@@ -16,7 +16,7 @@ from ..images.tolerances import Tolerances
 from ..llvm import best_variant
 from .environment import variant_problem
 from .passes import Sampling, render_pass
-from .probing import probe_scene
+from .probe_render import probe_scene
 from .reference import TEST_SPP, sampling_of
 from .scene import SceneSource, load_scene
 

@@ -16,7 +16,7 @@ from ..images.image import Image
 from ..progress import timed
 from . import RegressionError
 from .environment import environment
-from .probing import probe_scene
+from .probe_render import probe_scene
 from .rendering import render_pixels
 from .scene import LoadedScene
 

@@ -57,7 +57,9 @@ class StencilTable:
         from scipy import sparse
 
         shape = self.row_count, self.column_count
-        return sparse.coo_array((self.weights, (self.rows, self.columns)), shape=shape).tocsr()
+        is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
+        rows, columns = (each.astype(np.int32) if is_short else each for each in (self.rows, self.columns))
+        return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
 
     def chosen(self, rows: IntArray) -> StencilTable:
         """Stencils of some refined vertices, as a table of as many rows."""

@@ -20,13 +20,12 @@ import numpy as np
 
 from ..kernels.alignment import aligned
 from ..kernels.types import FloatBuffer
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, Shared, SharedArray
 from ..schemes.domain import FloatArray
 from ..variants import Variant
 from .attribute_parameters import mesh_name
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
-from .triangles import SharedArray
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -68,9 +67,11 @@ class CageAttributes:
         self._source = surface.cage.source.name
         self._float = variant.Float if dr.is_jit_v(variant.Float) else None
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
+        # Meshes of equal values share their memory until one is assigned.
+        self._given = {name: self._control_values(channel) for name, channel in self._channels.items()}
         kind = self._float or dr.scalar.ArrayXf
         self.values: dict[str, FloatBuffer] = {
-            f"{PREFIX}{name}": kind(channel.values.ravel()) for name, channel in self._channels.items()
+            f"{PREFIX}{name}": kind(given.array) for name, given in self._given.items()
         }
         self.moving: set[str] = set()
         self._followers: list[tuple[str, Callable[[FloatBuffer], None]]] = []
@@ -132,6 +133,13 @@ class CageAttributes:
         """Mesh buffers of some attributes, by default of all, keyed by buffer name."""
         chosen = self._channels if names is None else names
         return {mesh_name(name): self._at_vertices(name) for name in chosen if name in self._loaded}
+
+    def _control_values(self, channel: Channel) -> SharedArray:
+        if self._float is None:
+            return SharedArray(channel.values.ravel())
+        from ..kernels.array_types import ArrayTypes
+
+        return ArrayTypes.of(self._float).shared_floats(channel.values)
 
     def _upload(self, values: FloatArray) -> SharedArray:
         """A mesh buffer; in JIT variants, meshes with equal values share one array."""

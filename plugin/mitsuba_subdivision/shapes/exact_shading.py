@@ -189,7 +189,7 @@ class ExactShading:
         flags: int,
         active: Mask,
     ) -> None:
-        """Complete a surface interaction; see `InteractionHook`."""
+        """Complete a surface interaction as Mitsuba asks for it."""
         kernel, vector3 = self.kernel, self.kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:
@@ -253,7 +253,7 @@ class ExactShading:
         return counts
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
-        """Value of an attribute; see `InteractionHook`."""
+        """Value of an attribute as Mitsuba asks for it."""
         if name not in self._attributes:
             return None
         vector3 = self.kernel.types.vector3
@@ -379,6 +379,8 @@ def _welded(table: VertexTable, split: AttributeLayout | None = None, first: Int
     """
 
     def triangles() -> NDArray[np.uint32]:
+        if not table.copies.size:
+            return table.triangles
         return table.weld_target.astype(np.uint32)[table.triangles]
 
     def make() -> AttributeLayout:

@@ -7,7 +7,7 @@ from functools import cache
 import drjit as dr
 
 from ..variants import Variant
-from .hook.interaction_hook import hook_problem, interaction_hook
+from .mitsuba_3_9_hook.interaction_hook import hook_problem, interaction_hook
 
 
 def exact_shading_problem(variant: Variant) -> str | None:

@@ -148,7 +148,7 @@ def make_subdivision(variant: Variant) -> type:
             )
             if self._exact is not None:
                 from .device_state import DeviceState
-                from .hook.interaction_hook import interaction_hook
+                from .mitsuba_3_9_hook.interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -11,20 +10,13 @@ import numpy as np
 
 from ..kernels.alignment import aligned
 from ..kernels.types import FloatBuffer, IndexBuffer
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, Shared, SharedArray
 from ..variants import Variant
 from .vertices import split_weld_targets
 
 if TYPE_CHECKING:
     from ..mesh.connectivity import IntArray
     from ..tessellation import AttributeTable, VertexTable
-
-
-@dataclass(frozen=True, eq=False)
-class SharedArray:
-    """A buffer of several meshes."""
-
-    array: FloatBuffer | IndexBuffer
 
 
 class Triangles:

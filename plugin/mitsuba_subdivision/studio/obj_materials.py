@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import mitsuba as mi
+
 from ..cage.errors import shortened, warn
 from ..variants import SceneNode
 
@@ -79,7 +81,9 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
     texture = material.get(_TEXTURE)
     if isinstance(texture, Path):
         if texture.is_file():
-            colour = {"type": "bitmap", "filename": str(texture.resolve())}
+            # OBJ's v points up, a bitmap's down; pictures repeat.
+            upright = mi.ScalarTransform4f().scale([1, -1, 1])
+            colour = {"type": "bitmap", "filename": str(texture.resolve()), "to_uv": upright}
         else:
             warn(f'material "{name}": there is no picture "{texture}"; its colour is Kd')
     (exponent,), (illumination,) = _numbers(material, "Ns", [0.0]), _numbers(material, "illum", [2.0])

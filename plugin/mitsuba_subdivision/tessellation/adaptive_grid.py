@@ -186,9 +186,9 @@ class AdaptiveGrid:
             corner = np.where(turn >= step, t.following(corner), corner)
         return turn, corner
 
-    @cached_property
+    @property
     def triangle_locations(self) -> tuple[IntArray, FloatArray]:
-        """Locations of the corners of triangles.
+        """Locations of the corners of triangles; computed at each call, as kernels keep them.
 
         Returns
         -------

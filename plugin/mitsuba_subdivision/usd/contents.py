@@ -61,7 +61,7 @@ class NodeContents:
     Parameters
     ----------
     category : str
-        Such as "multiply"; see `nodes.OPERATIONS`.
+        Such as "multiply"; see `materialx_nodes.OPERATIONS`.
     type : str
         Of its output: "float", "color3", "vector2" and so on.
     inputs : dict of str to Input

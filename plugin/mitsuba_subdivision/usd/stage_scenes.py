@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageError
+from ..progress import timed
 from ..regression.scene import LoadedScene
 from ..studio.animation import load_quietly
 from ..studio.frame_files import FrameFiles
@@ -136,6 +137,7 @@ class StageScenes:
         """Whether the stage lacks a camera or lights."""
         return contents.camera is None or not contents.is_lit
 
+    @timed("Choosing triangles and textures")
     def scene(
         self, contents: SceneContents, points: NDArray[np.float64] | None = None, *, follows_sensor: bool = False
     ) -> SceneNode:

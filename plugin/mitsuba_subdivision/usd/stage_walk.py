@@ -31,6 +31,8 @@ from .stage_warnings import StageWarnings
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
+# Draw modes by which a viewer shows a model as it is.
+_FULL_MODES = (None, "default", "inherited")
 # Prims that hold others, or that are read with others.
 _SILENT = (
     "", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "Mesh", "PointInstancer", *GPRIMS,
@@ -177,6 +179,9 @@ class _StageWalk:
             name = str(prim.GetPath()).removeprefix(above)
             self._count += 1
             self._at(f"prim {self._count}")
+            draw_mode = prim.GetAttribute("model:drawMode")
+            if draw_mode and draw_mode.Get(self._code) not in _FULL_MODES:
+                self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
             if prim != root and prim.IsInstance():
                 self._add_instance(prim, name, to_root, found)
             elif prim.IsA(UsdGeom.PointInstancer):

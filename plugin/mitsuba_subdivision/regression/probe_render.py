@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.probe import NOTHING, Probe
+from ..images.probe_aovs import NOTHING, Probe
 from .scene import LoadedScene
 
 # Mesh attribute of the shape `subdivision`: the face of the cage that each triangle belongs to.

@@ -37,8 +37,8 @@ from ...kernels.types import Mask, Value
 from ...variants import Variant
 from ..garbage_collection import paused_collection
 from .hook_trial import trial_problem
+from .machine_code import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 from .original_error import clear_frames, origin, raise_itself
-from .trampoline import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
 # Functions of the library of Mitsuba's Python bindings: from a Python object to its C++ instance, and back; and the
 # size of the latter in bytes.

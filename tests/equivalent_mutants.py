@@ -1,0 +1,198 @@
+"""Mutants that change no result, with the reason; `mutants.py report` counts them apart.
+
+Each is a module, its line and the mutated line, by their text, so that they are found wherever the line has moved.
+"""
+
+EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
+    (
+        "a bound on work: blocks, runs, thresholds between two paths of equal results, depths beyond any that occurs",
+        (
+            ("evaluation/divided_element.py", "for _ in range(MOST_DEPTH + 1):", "for _ in range(MOST_DEPTH + 2):"),
+            ("evaluation/piece_tree.py", "SHARED_PIECES = 64", "SHARED_PIECES = 65"),
+            ("mesh/connectivity.py", "FEW_HALF_EDGES = 1 << 13", "FEW_HALF_EDGES = 1 << 12"),
+            ("patches/energies.py", "CHUNK = 1 << 21", "CHUNK = 1 << 22"),
+            ("patches/nearest_in_piece.py", "STEPS = 60", "STEPS = 61"),
+            (
+                "patches/patch_table.py",
+                "if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):",
+                "if self.class_count < max(MANY_CLASSES, self.patch_count // FEW_PATCHES):",
+            ),
+            (
+                "patches/polynomial_pieces.py",
+                "if element.regular_count > MOST_PIECES and depth == DIVISIONS:",
+                "if element.regular_count > MOST_PIECES and depth != DIVISIONS:",
+            ),
+            (
+                "patches/surface_area.py",
+                "for at, columns in pieces.runs(MOST_POINTS // len(du)):",
+                "for at, columns in pieces.runs(MOST_POINTS * len(du)):",
+            ),
+            (
+                "tessellation/quad_grid.py",
+                "for corners in slices_of(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):",
+                "for corners in slices_of(t.half_edges_of(t.face_sizes != 4), self.half** 3 + 1):",
+            ),
+            (
+                "tessellation/vertex_table.py",
+                "number = (np.cumsum(vertex_counts[kinds]) - 1) // max(1, BLOCK_WEIGHTS // size)",
+                "number = (np.cumsum(vertex_counts[kinds]) - 1) * max(1, BLOCK_WEIGHTS // size)",
+            ),
+        ),
+    ),
+    (
+        "a faster path: what it leaves out is read or computed by the slower one",
+        (
+            ("files/ply_lists.py", "for each in self._element.properties:", "for each in []:"),
+            ("files/obj_tags.py", "continue", "break"),
+            ("files/obj_tags.py", "for name, (head, width) in _PLAIN_TAGS.items():", "for name, (head, width) in []:"),
+            (
+                "files/obj_tags.py",
+                "positions = obj.statement_start[statements][:, None] + np.arange(len(head))",
+                "positions = obj.statement_start[statements][:, None] - np.arange(len(head))",
+            ),
+            (
+                "patches/patch_samples.py",
+                'is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64',
+                'is_usual = evaluator == "stabilized" and derivatives != 1 and np.dtype(dtype) == np.float64',
+            ),
+        ),
+    ),
+    (
+        "values that no one reads: masked, overwritten, or of a loop over nothing",
+        (
+            (
+                "evaluation/equations.py",
+                "ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)",
+                "ratios = np.where(kept, basis.eigenvalues / base, 1).astype(real)",
+            ),
+            (
+                "files/obj_reader.py",
+                "return None if vertices is None else (vertices, has_texcoord, vertices[:0])",
+                "return None if vertices is None else (vertices, has_texcoord, vertices[: -1])",
+            ),
+            ("patches/nearest_in_piece.py", "break", "continue"),
+            (
+                "patches/one_ring_codes.py",
+                "beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))",
+                "beyond = np.zeros((t.vertex_count, int(count.max(initial= 1)), 3))",
+            ),
+            (
+                "schemes/crease_masks.py",
+                "twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]",
+                "twin_refined = semi.edges_refined[np.maximum(t.twin, -1)]",
+            ),
+        ),
+    ),
+    (
+        "the same element, or another of the same value: all half-edges of a fan begin at its vertex, all channels have"
+        " as many pixels, a fan that begins at half-edge 0 is found either way, closed meshes have no valence of one",
+        (
+            (
+                "images/paired_tier.py",
+                'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
+                " int(difference[..., 0].size)}",
+                'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
+                " int(difference[..., 1].size)}",
+            ),
+            (
+                "mesh/manifold.py",
+                "start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])"
+                "[count > 0]",
+                "start = np.where(t.open_fan_start[run] <= 0, t.vertex_half_edge[run], t.open_fan_start[run])"
+                "[count > 0]",
+            ),
+            (
+                "mesh/signature.py",
+                "rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))",
+                "rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[ -1]]]))",
+            ),
+            (
+                "schemes/scheme.py",
+                'return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[0]]}",'
+                ' f"valence {least} or more")',
+                'return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[ -1]]}",'
+                ' f"valence {least} or more")',
+            ),
+        ),
+    ),
+    (
+        "another name for the same thing: keys stay as distinct, and what is below zero counts as smooth",
+        (
+            (
+                "mesh/manifold.py",
+                "is_again = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)",
+                "is_again = _is_later(t.edge.astype(np.int64) * t.face_count - t.face)",
+            ),
+            (
+                "mesh/seams.py",
+                "sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))",
+                "sharpness = Sharpness(np.where(seam, INFINITE, -1.0), np.zeros(topology.vertex_count))",
+            ),
+            (
+                "patches/one_ring_codes.py",
+                "common[half_edges], sequence[half_edges] = 0, 1 + row_codes(columns).astype(np.int64)",
+                "common[half_edges], sequence[half_edges] = -1, 1 + row_codes(columns).astype(np.int64)",
+            ),
+        ),
+    ),
+    (
+        "a difference within rounding, or a tie of two results that are both right",
+        (
+            ("mesh/refinement_differences.py", "DECIMALS = 12", "DECIMALS = 13"),
+            ("patches/area_samples.py", "ROUNDED = 1 + 1e-9", "ROUNDED = 1 - 1e-9"),
+            (
+                "patches/closest_points.py",
+                "self._slope[self._squared_distance > limit] = np.inf",
+                "self._slope[self._squared_distance >= limit] = np.inf",
+            ),
+            (
+                "patches/nearest_in_piece.py",
+                "bend = np.where(is_newton[slides], bend, flat + damped[slides])",
+                "bend = np.where(is_newton[slides], bend, flat - damped[slides])",
+            ),
+        ),
+    ),
+    (
+        "a probe or a step among many as good: any power checks a basis, any places a linear function, and steps of"
+        " either sign shrink until one leads nearer",
+        (
+            ("evaluation/eigenbasis.py", "POWER = 20", "POWER = 19"),
+            ("evaluation/ring_symmetry.py", "PROBES_OF_FACE = 2", "PROBES_OF_FACE = 1"),
+            (
+                "patches/channel.py",
+                "uv = np.array([(0.1, 0.2), (0.5, 0.25), (0.3, 0.6)])",
+                "uv = np.array([(0.1, 0.2), ( 1.5, 0.25), (0.3, 0.6)])",
+            ),
+            ("patches/nearest_in_piece.py", "SHORTER = 0.25", "SHORTER = -0.75"),
+        ),
+    ),
+    (
+        "the length or the digits of a message, or of a stated number",
+        (
+            (
+                "files/usd_stage.py",
+                "_MOST_SHOWN, _MOST_SEARCHED = 200, 10_000",
+                "_MOST_SHOWN, _MOST_SEARCHED = 200, 9999",
+            ),
+            (
+                "images/flip_tier.py",
+                'return {"start": round(start, 3), "stop": round(stop, 3),'
+                ' "count": max(2, int(np.ceil(stop - start)))}',
+                'return {"start": round(start, 3), "stop": round(stop, 4),'
+                ' "count": max(2, int(np.ceil(stop - start)))}',
+            ),
+            ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 61"),
+            ("tessellation/memory.py", "ADAPTIVE_TRIANGLE_BYTES = 400", "ADAPTIVE_TRIANGLE_BYTES = 399"),
+        ),
+    ),
+    (
+        "less than one texel is needed: an image has one at least",
+        (
+            (
+                "usd/texture_detail.py",
+                "found[texture.file] = max(needed, found.get(texture.file, 0.0))",
+                "found[texture.file] = max(needed, found.get(texture.file, 1.0))",
+            ),
+        ),
+    ),
+)

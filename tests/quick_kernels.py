@@ -1,0 +1,22 @@
+"""Kernels without LLVM's optimisations, compiled in a quarter of the time: most kernels of tests run once.
+
+``conftest.py`` imports this before Dr.Jit, and kernels of notebooks run it as a file. Other processes that tests start
+compile as those of users do.
+"""
+
+import ctypes
+import os
+from pathlib import Path
+
+from mitsuba_subdivision.llvm import select_llvm
+
+# The extra `llvm` brings this version or a newer one. An unknown option would end the process.
+LLVM = 19
+
+# Users' kernels stay fast.
+os.environ.setdefault("DRJIT_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "d" / "drjit"))
+library = select_llvm()
+if library.path and (library.version or 0) >= LLVM:
+    options = (b"pytest", b"-opt-bisect-limit=0", b"-opt-bisect-verbose=0")
+    arguments = (ctypes.c_char_p * len(options))(*options)
+    ctypes.CDLL(library.path).LLVMParseCommandLineOptions(len(options), arguments, None)
