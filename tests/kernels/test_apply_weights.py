@@ -204,7 +204,7 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     # The collector looks at what is new only.
     gc.freeze()
     table = surface.sampling(3)
-    seen = [weakref.ref(found) for found in (table, table.runs, table.runs.patch, *table.classes)]
+    seen = [weakref.ref(found) for found in (table, table.vertex_stencils, table.vertex_stencils.patch, *table.classes)]
     kernel = WeightKernel(table, float_type)
     del table
     gc.collect()

@@ -20,6 +20,8 @@ MISSED = 0.03
 LOOSE, MOST = 0.5, 0.9
 # Sums of products of many matrices.
 ROUNDING = 1e-9
+# Distance of the origin: single precision would lose an extent of about one.
+FAR = 1e6
 FEW_SURFACES = ["cube", "rook", "loop mixed torus", "doo_sabin mixed torus", "dart", "semi-sharp ring"]
 
 
@@ -40,11 +42,11 @@ def tiles_of(surface, scheme, axes):
             yield tile, np.einsum("kj,tjd->kdt", rows, values), np.linalg.norm(np.ptp(samples, axis=1), axis=1)
 
 
-def fits(scheme, tiles, factor):
+def fits(scheme, tiles, factor, unit=1.0):
     counts = [len(size) for _, _, size in tiles]
     owners = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
     parts = [TileParts(tile, values, owner) for (tile, values, _), owner in zip(tiles, owners, strict=True)]
-    return fit_within(scheme, factor * np.concatenate([size for _, _, size in tiles]) + ROUNDING, parts)
+    return fit_within(scheme, factor * np.concatenate([size for _, _, size in tiles]) + ROUNDING * unit, parts)
 
 
 @pytest.mark.parametrize("axis_count", [1, 3])
@@ -67,6 +69,19 @@ def test_rules_that_are_not_convex_take_longer_and_say_the_same(name, np_rng):
     assert tiles
     assert not fits(scheme, tiles, 1 - MISSED).any()
     assert np.mean(fits(scheme, tiles, 1 + LOOSE)) > MOST
+
+
+@pytest.mark.parametrize("unit", [1e-60, 1e60])
+def test_the_unit_and_the_origin_do_not_matter(unit, np_rng):
+    surface = surface_named("cube")
+    tiles = []
+    for tile, values, size in tiles_of(surface, surface.scheme, np_rng.normal(size=(3, 1))):
+        # Of eigen-coordinates, the first one is a point.
+        values[: 1 if tile.is_self_similar else None] += FAR
+        tiles.append((tile, unit * values, unit * size))
+    assert tiles
+    assert not fits(surface.scheme, tiles, 1 - MISSED, unit).any()
+    assert np.mean(fits(surface.scheme, tiles, 1 + LOOSE, unit)) > MOST
 
 
 def test_nothing_fits_below_zero():

@@ -37,11 +37,15 @@ def test_runs_write_every_vertex_once(scheme, name, rate):
 
 def assert_runs_write_every_vertex_once(table):
     written = []
-    for runs in (table.runs, table.runs.along_patches()):
-        patch_count = np.array([len(stencils.controls) for stencils in table.classes])[runs.class_of_kind][runs.kind]
-        assert runs.patch.min() >= 0
-        assert (runs.patch < patch_count).all()
-        for vertex, count in zip(runs.first_vertex, runs.counts[runs.kind], strict=True):
+    for vertex_stencils in (table.vertex_stencils, table.vertex_stencils.along_patches()):
+        patch_count = np.array([len(stencils.controls) for stencils in table.classes])[vertex_stencils.class_of_kind][
+            vertex_stencils.kind
+        ]
+        assert vertex_stencils.patch.min() >= 0
+        assert (vertex_stencils.patch < patch_count).all()
+        for vertex, count in zip(
+            vertex_stencils.first_vertex, vertex_stencils.counts[vertex_stencils.kind], strict=True
+        ):
             written.append(vertex + np.arange(count))
         np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
         written.clear()
@@ -52,8 +56,8 @@ def assert_runs_write_every_vertex_once(table):
 def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
     for number, stencils in enumerate(table.classes):
-        kinds = np.flatnonzero(table.runs.class_of_kind == number)
-        sample_count = 1 + max(table.runs.samples_of(kind).max() for kind in kinds.tolist())
+        kinds = np.flatnonzero(table.vertex_stencils.class_of_kind == number)
+        sample_count = 1 + max(table.vertex_stencils.samples_of(kind).max() for kind in kinds.tolist())
         assert stencils.weights.shape[0] == 3
         assert stencils.weights.shape[1] >= sample_count
         assert stencils.weights.shape[2] == stencils.controls.shape[1]

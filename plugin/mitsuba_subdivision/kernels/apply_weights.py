@@ -153,22 +153,26 @@ def _batches(types: ArrayTypes, table: VertexTable) -> Iterator[Batch]:
     # Not aligned, because kernels only gather from it.
     controls = types.index(table.controls)
     are_rounded = table.refinement is not None
-    runs = table.runs.along_patches()
-    counts = np.bincount(runs.class_of_kind, runs.counts * runs.run_counts, minlength=len(runs.classes))
+    vertex_stencils = table.vertex_stencils.along_patches()
+    counts = np.bincount(
+        vertex_stencils.class_of_kind,
+        vertex_stencils.counts * vertex_stencils.run_counts,
+        minlength=len(vertex_stencils.classes),
+    )
     first = count = 0
-    for index, stencils in enumerate(runs.classes):
+    for index, stencils in enumerate(vertex_stencils.classes):
         is_product = stencils.product is not None and counts[index] > FEW_SAMPLES
-        is_other_size = first < index and _padded_size(stencils) != _padded_size(runs.classes[index - 1])
+        is_other_size = first < index and _padded_size(stencils) != _padded_size(vertex_stencils.classes[index - 1])
         if first < index and (is_product or (count > FEW_SAMPLES and is_other_size)):
-            yield DenseBatch(types, runs.of_classes(first, index), controls, are_rounded)
+            yield DenseBatch(types, vertex_stencils.of_classes(first, index), controls, are_rounded)
             first, count = index, 0
         if is_product:
-            yield ProductBatch(types, runs.of_classes(index, index + 1), controls, are_rounded)
+            yield ProductBatch(types, vertex_stencils.of_classes(index, index + 1), controls, are_rounded)
             first = index + 1
         else:
             count += int(counts[index])
-    if first < len(runs.classes):
-        yield DenseBatch(types, runs.of_classes(first, len(runs.classes)), controls, are_rounded)
+    if first < len(vertex_stencils.classes):
+        yield DenseBatch(types, vertex_stencils.of_classes(first, len(vertex_stencils.classes)), controls, are_rounded)
 
 
 def _padded_size(stencils: ClassStencils) -> int:

@@ -14,7 +14,7 @@ from .lanes import Emit, Fetch, Lanes
 from .types import FloatBuffer, Index, IndexBuffer, Vector3
 
 if TYPE_CHECKING:
-    from ..tessellation import Runs
+    from ..tessellation import VertexStencils
 
 # One-rings are padded to a multiple of this many control points, so that few kernels serve all cages.
 CONTROL_STEP = 4
@@ -31,16 +31,16 @@ class DenseBatch:
     lane for each sample would take one for every sample and control point.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Runs, controls: IndexBuffer, are_rounded: bool) -> None:
+    def __init__(self, types: ArrayTypes, vertices: VertexStencils, controls: IndexBuffer, are_rounded: bool) -> None:
         self._types = types
-        self.width = padded_size(max(stencils.controls.shape[1] for stencils in runs.classes))
-        self._lanes = Lanes(types, runs, controls, are_rounded)
-        sample_counts = [stencils.weights.shape[1] for stencils in runs.classes]
+        self.width = padded_size(max(stencils.controls.shape[1] for stencils in vertices.classes))
+        self._lanes = Lanes(types, vertices, controls, are_rounded)
+        sample_counts = [stencils.weights.shape[1] for stencils in vertices.classes]
         begins = np.cumsum(sample_counts) - sample_counts
         # Three numbers for every sample and control point of a class. Lanes mostly gather the same ones, which is
         # faster by scalar loads than by packet.
         weights = np.zeros((sum(sample_counts), self.width, 3))
-        for begin, stencils in zip(begins, runs.classes, strict=True):
+        for begin, stencils in zip(begins, vertices.classes, strict=True):
             _, sample_count, count = stencils.weights.shape
             own = weights[begin : begin + sample_count]
             own[:, :count] = stencils.weights.transpose(1, 2, 0)
@@ -49,9 +49,9 @@ class DenseBatch:
             # NumPy sums faster along the first axis.
             own[:, 0] = (1, 0, 0) - np.ascontiguousarray(own[:, 1:].transpose(1, 0, 2)).sum(axis=0)
         self._weights = types.float(weights.ravel())
-        self._weights_at = types.indices((begins * self.width)[runs.class_of_kind])
-        self._order = types.indices(runs.samples)
-        self._order_at, self._counts = types.indices(runs.starts), types.indices(runs.counts)
+        self._weights_at = types.indices((begins * self.width)[vertices.class_of_kind])
+        self._order = types.indices(vertices.samples)
+        self._order_at, self._counts = types.indices(vertices.starts), types.indices(vertices.counts)
 
     def sample(self, padded: FloatBuffer, emit: Emit) -> None:
         """See `Batch.sample`."""

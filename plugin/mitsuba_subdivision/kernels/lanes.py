@@ -14,7 +14,7 @@ from .types import Float, FloatBuffer, Index, IndexBuffer, Vector3
 from .unit_normal import LEAST_EXTENT, TANGENT_ROUNDING, RoundingBound
 
 if TYPE_CHECKING:
-    from ..tessellation import Runs
+    from ..tessellation import VertexStencils
 
 # Receives for every lane a vertex, its point, its two tangents, and the rounding bound of the tangents.
 Emit = Callable[[Index, Vector3, Vector3, Vector3, RoundingBound], None]
@@ -51,12 +51,12 @@ class Batch(Protocol):
 
 
 class Lanes:
-    """The lanes that evaluate some runs, one each, and the control points of their patches, on the device.
+    """The lanes that evaluate runs of vertices, one each, and the control points of their patches, on the device.
 
     Parameters
     ----------
     types : ArrayTypes
-    runs : Runs
+    vertices : VertexStencils
         Of one class or several.
     controls : Dr.Jit index array
         `VertexTable.controls` on the device.
@@ -69,17 +69,20 @@ class Lanes:
         Number of lanes.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Runs, controls: IndexBuffer, are_rounded: bool) -> None:
-        self.count = len(runs.kind)
+    def __init__(self, types: ArrayTypes, vertices: VertexStencils, controls: IndexBuffer, are_rounded: bool) -> None:
+        self.count = len(vertices.kind)
         self._index = types.index
         self._controls = controls
         self._rounding = LEAST_EXTENT[dr.type_v(types.float)] if are_rounded else 0
-        self._patch, self._first_vertex = types.indices(runs.patch), types.indices(runs.first_vertex)
-        self._kind = types.indices(runs.kind)
-        of_classes = [(each.first_control, *each.controls.shape) for each in runs.classes]
-        of_kinds = np.array(of_classes)[runs.class_of_kind].T
+        self._patch, self._first_vertex = (
+            types.indices(vertices.patch),
+            types.indices(vertices.first_vertex),
+        )
+        self._kind = types.indices(vertices.kind)
+        of_classes = [(each.first_control, *each.controls.shape) for each in vertices.classes]
+        of_kinds = np.array(of_classes)[vertices.class_of_kind].T
         self._first_control, self._patch_count, self._control_count = (types.indices(values) for values in of_kinds)
-        self._frame_weights = types.float(TANGENT_ROUNDING[dr.type_v(types.float)] * np.ravel(runs.frame_weights()))
+        self._frame_weights = types.float(TANGENT_ROUNDING[dr.type_v(types.float)] * np.ravel(vertices.frame_weights()))
         self._float = types.float
 
     def at(self, lane: Index) -> tuple[Index, Index, Index]:

@@ -14,7 +14,7 @@ from .lanes import Emit, Fetch, Lanes
 from .types import Float, FloatBuffer, Index, IndexBuffer, Vector3
 
 if TYPE_CHECKING:
-    from ..tessellation import Runs
+    from ..tessellation import VertexStencils
 
 
 class ProductBatch:
@@ -25,15 +25,15 @@ class ProductBatch:
     with the weights for u.
     """
 
-    def __init__(self, types: ArrayTypes, runs: Runs, controls: IndexBuffer, are_rounded: bool) -> None:
-        (stencils,) = runs.classes
+    def __init__(self, types: ArrayTypes, vertices: VertexStencils, controls: IndexBuffer, are_rounded: bool) -> None:
+        (stencils,) = vertices.classes
         product = stencils.product
         if product is None:
             raise ValueError("patches whose weights are no products; expected a class with a ProductPatch")
         self._types, self._count = types, product.lattice_index.shape[1]
-        self._lanes = Lanes(types, runs, controls, are_rounded)
+        self._lanes = Lanes(types, vertices, controls, are_rounded)
         self._lattice_index = types.indices(product.lattice_index)
-        rows = [product.rows(stencils.uv[runs.samples_of(kind)]) for kind in range(len(runs.counts))]
+        rows = [product.rows(stencils.uv[vertices.samples_of(kind)]) for kind in range(len(vertices.counts))]
         # Parameters along u of all kinds, then those along v.
         parameters = [r.u for r in rows] + [r.v for r in rows]
         lengths = np.array([len(p) for p in parameters])

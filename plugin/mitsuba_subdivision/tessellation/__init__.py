@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from .adaptive import adaptive_table
     from .attribute_table import AttributeLayout, AttributeTable
     from .criterion import Criterion, DisplacementBound, Measure, Sensor
-    from .runs import ClassStencils, Runs
     from .triangle_mesh import Tessellation
     from .uniform import uniform_table
     from .uniform_grid import UniformGrid
+    from .vertex_stencils import ClassStencils, VertexStencils
     from .vertex_table import VertexMatrices, VertexTable
 
 __all__ = [
@@ -53,11 +53,11 @@ __all__ = [
     "Criterion",
     "DisplacementBound",
     "Measure",
-    "Runs",
     "Sensor",
     "Tessellation",
     "UniformGrid",
     "VertexMatrices",
+    "VertexStencils",
     "VertexTable",
     "adaptive_table",
     "uniform_table",
@@ -68,11 +68,11 @@ __getattr__ = deferred(
     {
         "AttributeLayout": "attribute_table",
         "AttributeTable": "attribute_table",
-        "ClassStencils": "runs",
+        "ClassStencils": "vertex_stencils",
         "Criterion": "criterion",
         "DisplacementBound": "criterion",
         "Measure": "criterion",
-        "Runs": "runs",
+        "VertexStencils": "vertex_stencils",
         "Sensor": "criterion",
         "Tessellation": "triangle_mesh",
         "UniformGrid": "uniform_grid",

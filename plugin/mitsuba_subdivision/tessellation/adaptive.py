@@ -14,9 +14,9 @@ from ..schemes.domain import FloatArray
 from .adaptive_grid import AdaptiveGrid
 from .criterion import Criterion
 from .patch_frames import PatchFrames
-from .runs import WEIGHTS_TOGETHER, ClassStencils, Runs
 from .tile_choice import choose_tiles
 from .tile_sides import UNIT
+from .vertex_stencils import WEIGHTS_TOGETHER, ClassStencils, VertexStencils
 from .vertex_table import VertexTable
 
 
@@ -49,12 +49,14 @@ def adaptive_table(
     tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate)
     grid = AdaptiveGrid.of(tiles, frames)
     controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
-    runs = _runs(patches, grid, controls)
-    return VertexTable(len(control_points), patches.patch_count, grid, runs, controls, grid.copies(), refinement)
+    vertex_stencils = _vertex_stencils(patches, grid, controls)
+    return VertexTable(
+        len(control_points), patches.patch_count, grid, vertex_stencils, controls, grid.copies(), refinement
+    )
 
 
-def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> Runs:
-    """Runs of one vertex each; vertices of the same stencil are of a kind."""
+def _vertex_stencils(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> VertexStencils:
+    """VertexStencils of one vertex each; vertices of the same stencil are of a kind."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     # In the order of their sizes, so that kernels pad them alike.
@@ -64,9 +66,9 @@ def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32])
     of_corner, patch_of_corner = (np.empty(patches.elements.half_edge_count, dtype=np.int32) for _ in range(2))
     of_corner[corners] = np.repeat(np.arange(len(classes), dtype=np.int32), patch_counts)
     patch_of_corner[corners] = ragged.index_in_row(patch_counts)
-    tile, places = grid.vertex_places()
+    tile, parameters = grid.vertex_parameters()
     corner = grid.tiles.corner[tile]
-    of_class, patch, uv = of_corner[corner], patch_of_corner[corner], places / UNIT
+    of_class, patch, uv = of_corner[corner], patch_of_corner[corner], parameters / UNIT
     order, is_new = _by_stencil(of_class, uv)
     found = order[is_new]
     own_uv, counts = np.ascontiguousarray(uv[:, found].T), np.bincount(of_class[found], minlength=len(classes))
@@ -84,7 +86,7 @@ def _runs(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32])
     )
     kinds = len(found)
     run_counts = np.diff(np.flatnonzero(is_new), append=len(order))
-    return Runs(
+    return VertexStencils(
         stencils,
         np.repeat(np.arange(len(used)), counts[used]),
         np.ones(kinds, dtype=np.int64),

@@ -131,7 +131,7 @@ class AdaptiveGrid:
         """``(m,)`` element of each triangle."""
         return self.frames.topology.face_of(self.tiles.corner)[self.tile].astype(np.uint32)
 
-    def _inner_places(self) -> tuple[IndexArray, FloatArray]:
+    def _inner_parameters(self) -> tuple[IndexArray, FloatArray]:
         """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in units of 1 / `UNIT`."""
         tile = np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._inner_counts)
         steps = inner_steps(self.tiles.rates, self._corner_count) / self.tiles.rates[tile]
@@ -140,15 +140,15 @@ class AdaptiveGrid:
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
         """``(2, n)`` parameters in patches, in units of 1 / `UNIT`, from parameters in tiles."""
         size: FloatArray = (UNIT >> self.tiles.depth[tile]).astype(np.float64)
-        return size * (self.tiles.place[tile].T + np.where(self.tiles.is_flipped[tile], 1 - uv, uv))
+        return size * (self.tiles.origin[tile].T + np.where(self.tiles.is_flipped[tile], 1 - uv, uv))
 
-    def vertex_places(self) -> tuple[IndexArray, FloatArray]:
-        """Locations of vertices, each in one of its tiles.
+    def vertex_parameters(self) -> tuple[IndexArray, FloatArray]:
+        """Parameters of vertices, each in one of its tiles.
 
         Returns
         -------
         tile : (n,) int32
-        places : (2, n) float64
+        parameters : (2, n) float64
             In the tile's patch, in parts of `UNIT`.
         """
         numbers, spans = self._numbers, self.spans
@@ -158,15 +158,15 @@ class AdaptiveGrid:
         along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
         along = np.concatenate([np.zeros(len(numbers.of_point)), along])
         of_lines = np.concatenate([numbers.of_point, span])
-        tile, places = self._inner_places()
+        tile, parameters = self._inner_parameters()
         return (
             np.concatenate([spans.side[of_lines] // self._corner_count, tile]),
-            np.concatenate([self.spans.along(of_lines, along), places], axis=1),
+            np.concatenate([self.spans.along(of_lines, along), parameters], axis=1),
         )
 
-    def _seen(self, tile: IntArray, turn: IntArray, places: FloatArray) -> FloatArray:
+    def _seen(self, tile: IntArray, turn: IntArray, parameters: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters in elements, seen from the corner after so many turns; of patches that are whole."""
-        uv: FloatArray = np.ascontiguousarray(places.T) / UNIT
+        uv: FloatArray = np.ascontiguousarray(parameters.T) / UNIT
         domain = self.frames.domain
         for corner in range(1, domain.corner_count):
             at = np.flatnonzero(turn == corner)
@@ -174,12 +174,12 @@ class AdaptiveGrid:
                 uv[at] = domain.rotation(corner).inverse()(uv[at])
         return uv * self.frames.scale[self.frames.topology.face_of(self.tiles.corner[tile])][:, None]
 
-    def _nearest_corner(self, tile: IntArray, places: FloatArray) -> tuple[IntArray, IntArray]:
+    def _nearest_corner(self, tile: IntArray, parameters: FloatArray) -> tuple[IntArray, IntArray]:
         """The turn to the nearest corner of each patch, and the half-edge that begins there."""
         t, domain = self.frames.topology, self.frames.domain
         is_whole = self.frames.is_whole[t.face_of(self.tiles.corner[tile])]
         corners = domain.corners * UNIT
-        far = [np.maximum(*np.abs(places - corner[:, None])) for corner in corners]
+        far = [np.maximum(*np.abs(parameters - corner[:, None])) for corner in corners]
         turn = np.where(is_whole, np.argmin(far, axis=0), 0)
         corner = self.tiles.corner[tile]
         for step in range(1, domain.corner_count):
@@ -201,15 +201,15 @@ class AdaptiveGrid:
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
         span, along = self.spans.samples()
-        samples = np.concatenate([self.spans.along(span, along), self._inner_places()[1]], axis=1)
+        samples = np.concatenate([self.spans.along(span, along), self._inner_parameters()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, self.sample_triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """See `Grid.locations`."""
-        tile, places = self.vertex_places()
-        turn, corner = self._nearest_corner(tile, places)
-        return corner.astype(np.int64), self._seen(tile, turn, places)
+        tile, parameters = self.vertex_parameters()
+        turn, corner = self._nearest_corner(tile, parameters)
+        return corner.astype(np.int64), self._seen(tile, turn, parameters)
 
 
 def _stitched(spans: Spans, keeps_corner: NDArray[np.bool_] | None) -> tuple[IndexArray, IndexArray]:

@@ -15,13 +15,19 @@ PARALLEL = 1e-9
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """``(.., t)`` products of vectors ``(.., 3, t)``."""
-    return a[..., 0, :] * b[..., 0, :] + a[..., 1, :] * b[..., 1, :] + a[..., 2, :] * b[..., 2, :]
+    found: FloatArray = a[..., 0, :] * b[..., 0, :]
+    found += a[..., 1, :] * b[..., 1, :]
+    found += a[..., 2, :] * b[..., 2, :]
+    return found
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """``(.., 3, t)`` cross products of vectors ``(.., 3, t)``."""
-    (ax, ay, az), (bx, by, bz) = (np.moveaxis(each, -2, 0) for each in (a, b))
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-2)
+    found = np.empty(np.broadcast_shapes(a.shape, b.shape), dtype=np.result_type(a, b))
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        np.subtract(a[..., i, :] * b[..., j, :], a[..., j, :] * b[..., i, :], out=found[..., axis, :])
+    return found
 
 
 @dataclass(frozen=True, eq=False)

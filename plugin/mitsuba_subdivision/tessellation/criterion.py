@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -187,8 +188,8 @@ class Criterion:
         second = [uu, uv, vv]
         if corner_count == 3:
             # Along an angle: the mean, plus a cosine and a sine of twice the angle.
-            mean = (2 * uu - 2 * uv + 2 * vv) / 3
-            second = [mean, uu - mean, (2 * uv - uu) / np.sqrt(3)]
+            mean = (uu - uv + vv) * (2 / 3)
+            second = [mean, uu - mean, (uv - uu / 2) * (2 / sqrt(3))]
         # Distance from the surface: along its normals, and a little more where the difference has a tangential part, as
         # the surface has curved away there; at most the whole difference.
         longest = [dot(d, d).max(axis=0) for d in second]
@@ -227,22 +228,6 @@ class Criterion:
             return np.ones(len(limit), dtype=np.int64)
         furthest = SQUARE_ERROR * np.sqrt(dot(second, second).max(axis=0))
         return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
-
-    def is_flat(
-        self, lower: FloatArray, upper: FloatArray, heights: FloatArray, limit: FloatArray
-    ) -> NDArray[np.bool_]:
-        """``(t,)`` whether triangles between the corners suffice for surfaces inside boxes and between two planes.
-
-        Parameters
-        ----------
-        lower, upper : (3, t) float64
-        heights : (t,) float64
-            Distance of the planes.
-        limit : (t,) float64
-        """
-        if self.measure is Measure.EDGE:
-            return np.linalg.norm(upper - lower, axis=0) <= limit
-        return heights <= limit
 
 
 def _isotropic(values: FloatArray) -> FloatArray:

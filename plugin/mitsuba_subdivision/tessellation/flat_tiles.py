@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import times
-from ..evaluation.divided_tile import DividedTile
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
+from ..schemes.scheme_members import optional_member
 from .cones import NormalCone, TangentCone, cross, dot
 from .criterion import Measure
 from .tile_extents import TileParts, fit_within
@@ -39,26 +39,9 @@ class PatchGroup(NamedTuple):
     at: IntArray
     points: FloatArray
 
-
-class TileGroup(NamedTuple):
-    """Tiles of several pieces with the same subdivision.
-
-    Attributes
-    ----------
-    tile : DividedTile
-    at : (n,) int64
-        Which of some tiles they are.
-    points : (K, 3, n) float64
-        Control points.
-    """
-
-    tile: DividedTile
-    at: IntArray
-    points: FloatArray
-
-    def chosen(self, which: NDArray[np.bool_]) -> TileGroup:
-        """Some of the tiles."""
-        return TileGroup(self.tile, self.at[which], np.ascontiguousarray(self.points[..., which]))
+    def chosen(self, which: NDArray[np.bool_]) -> PatchGroup:
+        """Some of the patches."""
+        return self if which.all() else self._replace(at=self.at[which], points=self.points[..., which])
 
 
 def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) -> NDArray[np.bool_]:
@@ -77,31 +60,36 @@ def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) ->
     axis, extent = axis_across(corners), np.empty(count)
     for each in groups:
         extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
-    return rates.are_within(tiles, lower, upper, axis, extent) & ~tiles.sides.any(axis=1)
+    limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
+    fits = np.linalg.norm(upper - lower, axis=0) <= limit
+    if rates.criterion.measure is Measure.EDGE:
+        return fits
+    return fits | (axis.any(axis=0) & (extent <= limit) & ~tiles.sides.any(axis=1))
 
 
-def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileGroup]) -> NDArray[np.bool_]:
-    """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along watched sides."""
+def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray[np.bool_]:
+    """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along feature edges."""
     count, m = len(tiles), rates.domain.corner_count
     lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((m, 3, count))
     for each in groups:
-        ring = each.tile.one_ring_points(each.points)
-        lower[:, each.at], upper[:, each.at] = ring.min(axis=0), ring.max(axis=0)
-        corners[..., each.at] = times(each.tile.corners, each.points)
+        ring = each.tile.one_ring_points(each.values)
+        lower[:, each.owner], upper[:, each.owner] = ring.min(axis=0), ring.max(axis=0)
+        corners[..., each.owner] = times(each.tile.corners, each.values)
     limit, axis = rates.limit(tiles, lower, upper, NormalCone.of_any(count)), axis_across(corners)
     if rates.criterion.measure is Measure.EDGE:
-        return fit_within(rates.scheme, limit, [TileParts(each.tile, each.points, each.at) for each in groups])
-    parts = [TileParts(each.tile, dot(each.points, axis[:, each.at])[:, None], each.at) for each in groups]
+        return fit_within(rates.scheme, limit, groups)
+    parts = [TileParts(each.tile, dot(each.values, axis[:, each.owner])[:, None], each.owner) for each in groups]
     # A tile without a normal, or folded across it, is tested by its size only.
-    fits = np.linalg.norm(upper - lower, axis=0) <= limit
-    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis)
+    fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & bool(optional_member(rates.scheme, "has_convex_rules"))
+    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis) if m > 3 else axis.any(axis=0)
     found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
     if rates.criterion.outline is not None:
         cone = NormalCone(axis, _normal_sines(rates, tiles, groups, axis))
         higher = np.where(~found & (cone.sine < 1), rates.limit(tiles, lower, upper, cone), -1.0)
         found |= fit_within(rates.scheme, higher, parts)
-    if (found[:, None] & (tiles.sides > 0)).any():
-        found &= ~_have_curved_sides(rates, tiles, groups, found, corners, limit)
+    may_curve = found & ~fits & tiles.sides.any(axis=1)
+    if may_curve.any():
+        found &= ~_have_curved_sides(rates, tiles, groups, may_curve, corners, limit)
     return found
 
 
@@ -116,7 +104,7 @@ def _are_folded(corners: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
     return folded
 
 
-def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileGroup], axis: FloatArray) -> FloatArray:
+def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileParts], axis: FloatArray) -> FloatArray:
     """``(t,)`` sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles.
 
     One where normals are unknown, and along a border, which may be a silhouette for any normals. Nearer to an
@@ -124,40 +112,40 @@ def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileGroup], axis:
     """
     found, basis = np.ones(len(tiles)), rates.basis
     for each in groups:
-        inside = np.logical_not(tiles.sides[each.at].any(axis=1))
+        inside = np.logical_not(tiles.sides[each.owner].any(axis=1))
         if each.tile.pieces is None or not inside.any():
             continue
         own, pieces = each.chosen(inside), each.tile.pieces
-        coefficients = times(pieces.reshape(-1, pieces.shape[2]), own.points)
+        coefficients = times(pieces.reshape(-1, pieces.shape[2]), own.values)
         by_coefficient = coefficients.reshape(-1, len(basis.indices), *coefficients.shape[1:]).swapaxes(0, 1)
         by_coefficient = np.ascontiguousarray(by_coefficient)
         tangents = [TangentCone.of(times(derivative, by_coefficient)) for derivative in basis.derivatives]
-        found[own.at] = NormalCone.of(*tangents).around(axis[:, own.at]).sine.max(axis=0)
+        found[own.owner] = NormalCone.of(*tangents).around(axis[:, own.owner]).sine.max(axis=0)
     return found
 
 
 def _have_curved_sides(
     rates: TileRates,
     tiles: Tiles,
-    groups: list[TileGroup],
+    groups: list[TileParts],
     are_asked: NDArray[np.bool_],
     corners: FloatArray,
     limit: FloatArray,
 ) -> NDArray[np.bool_]:
-    """``(t,)`` whether a watched side of some tiles with these corners is no straight line within the limit."""
+    """``(t,)`` whether tiles with these corners have a feature edge that is no straight line within the limit."""
     m, asked = rates.domain.corner_count, []
     for side in range(m):
         for each in groups:
-            on = are_asked[each.at] & (tiles.sides[each.at, side] > 0)
+            on = are_asked[each.owner] & (tiles.sides[each.owner, side] > 0)
             if on.any():
                 asked.append((side, each.chosen(on)))
-    at = np.concatenate([each.at for _, each in asked])
-    sides = np.repeat([number for number, _ in asked], [len(each.at) for _, each in asked])
+    at = np.concatenate([each.owner for _, each in asked])
+    sides = np.repeat([number for number, _ in asked], [len(each.owner) for _, each in asked])
     across = np.stack(_normals_to(corners[(sides + 1) % m, :, at].T - corners[sides, :, at].T))
     parts, begin = [], 0
     for number, each in asked:
-        own = slice(begin, begin + len(each.at))
-        values = np.einsum("kit,dit->kdt", each.points, across[..., own])
+        own = slice(begin, begin + len(each.owner))
+        values = np.einsum("kit,dit->kdt", each.values, across[..., own])
         parts.append(TileParts(each.tile, values, np.arange(own.start, own.stop), number))
         begin = own.stop
     found = np.zeros(len(tiles), dtype=bool)

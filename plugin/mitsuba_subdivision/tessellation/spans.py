@@ -124,7 +124,7 @@ class Spans:
         number = side - m * tile + m * tiles.is_flipped[tile]
         corners = self.frames.domain.corners.T.astype(np.int32)
         steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
-        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.place.T, steps, strict=True)]
+        found = [size * (at[tile] + step[number]) for at, step in zip(tiles.origin.T, steps, strict=True)]
         return np.stack(found).astype(np.int32)
 
     def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[SidePoints]]]:
@@ -143,8 +143,8 @@ class Spans:
         return self.tiles.corner[self.side[block] // self.frames.domain.corner_count]
 
     @cached_property
-    def _places(self) -> tuple[IndexArray, IndexArray]:
-        """``(s,)`` number of the place of each point, and the first point of each."""
+    def _points(self) -> tuple[IndexArray, IndexArray]:
+        """``(s,)`` number of the point at which each span begins, and the first span of each."""
         frames, t = self.frames, self.frames.topology
         vertex_count, count = int(frames.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
@@ -174,14 +174,9 @@ class Spans:
 
     def _vertices(self, borders: list[SidePoints]) -> tuple[IntArray, IntArray]:
         """Points at vertices, and half-edges that begin there."""
-        t = self.frames.topology
-        found = [
-            (border.on[border.at == position], edge[border.at == position])
-            for border in borders
-            if not border.is_spoke
-            for position, edge in ((0, border.edge), (EDGE, t.following(border.edge)))
-        ]
-        on, edge = (np.concatenate(each) for each in zip(*found, strict=True))
+        # The end of each side is the beginning of the next one.
+        chosen = [(border, np.flatnonzero(border.at == 0)) for border in borders if not border.is_spoke]
+        on, edge = (np.concatenate(each) for each in zip(*((own.on[i], own.edge[i]) for own, i in chosen), strict=True))
         return on, edge
 
     def numbered(self, edge: IndexArray, vertex: IndexArray) -> SpanVertices:
@@ -194,7 +189,7 @@ class Spans:
             lie in the same place, and on edges and vertices of the same numbers.
         """
         frames = self.frames
-        point, of_point = self._places
+        point, of_point = self._points
         span, of_span = self.at, first_of_each(self.at)
         if _is_finer(edge, frames.edge) or _is_finer(vertex, frames.vertex):
             of_points = np.zeros(len(point), dtype=np.int32)
@@ -297,6 +292,8 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:
     """Whether some names distinguish items with equal other names."""
+    if names is others:
+        return False
     one = np.zeros(int(others.max(initial=0)) + 1, dtype=names.dtype)
     one[others] = names
     return bool((one[others] != names).any())

@@ -10,18 +10,20 @@ from numpy.typing import NDArray
 
 from ..evaluation.bernstein import times
 from ..evaluation.divided_element import divided_elements
-from ..evaluation.divided_tile import DividedTile, part_of_tile
+from ..evaluation.divided_tile import part_of_tile
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme_members import optional_member
 from .criterion import Criterion
-from .flat_tiles import PatchGroup, TileGroup, are_flat, have_flat_rings
+from .feature_edges import feature_edges, sides_on
+from .flat_tiles import PatchGroup, are_flat, have_flat_rings
 from .patch_frames import PatchFrames
+from .spans import joined
+from .tile_extents import TileParts, alike
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
-from .watched_sides import sides_on, watched_edges
 
 # Number of patches, or their pieces, processed together, which bounds temporary memory.
 PATCHES_AT_ONCE = 1 << 14
@@ -60,19 +62,19 @@ def choose_tiles(
         If their triangles would not fit into memory.
     """
     points = control_points[control_of_vertex]
-    rates, watched = TileRates(patches.scheme, frames, criterion), watched_edges(patches, frames, points, criterion)
+    rates, features = TileRates(patches.scheme, frames, criterion), feature_edges(patches, frames, points, criterion)
     found: list[Tiles] = []
     triangle_count = 0
-    for tiles, groups in _blocks(patches, frames, points, watched, max_rate):
-        for chosen in _chosen(rates, tiles, groups, triangle_count):
+    for block, groups in _blocks(patches, frames, points, features, max_rate):
+        for chosen in _chosen(rates, block, groups, triangle_count):
             triangle_count += rates.cost(chosen)
             found.append(chosen)
-    joined = Tiles.joined(found)
-    return joined[_order(joined, frames)]
+    tiles = Tiles.joined(found)
+    return tiles[_order(tiles)]
 
 
 def _blocks(
-    patches: PatchTable, frames: PatchFrames, points: FloatArray, watched: NDArray[np.bool_], max_rate: int
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, features: NDArray[np.bool_], max_rate: int
 ) -> Iterator[tuple[Tiles, list[PatchGroup]]]:
     """All patches, each as one tile, class by class, in blocks that bound temporary memory.
 
@@ -80,11 +82,12 @@ def _blocks(
     ----------
     points : (n_v, 3) float64
         At the vertices of the mesh.
-    watched : (n_h,) bool
-        As `watched_edges`.
+    features : (n_h,) bool
+        As `feature_edges`.
     """
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
+    coordinates = np.ascontiguousarray(points.T)
     groups: list[PatchGroup] = []
     corners: list[IntArray] = []
     count = 0
@@ -93,19 +96,21 @@ def _blocks(
         for begin in range(0, len(of_class), PATCHES_AT_ONCE):
             own = slice(begin, begin + PATCHES_AT_ONCE)
             corners.append(of_class[own])
-            controls = np.ascontiguousarray(points[patch_class.controls[own].T].swapaxes(1, 2))
+            controls = np.empty((patch_class.controls.shape[1], 3, len(corners[-1])))
+            for axis, values in enumerate(coordinates):
+                controls[:, axis] = values.take(patch_class.controls[own].T, mode="clip")
             groups.append(PatchGroup(patch_class.signature, np.arange(count, count + len(corners[-1])), controls))
             count += len(corners[-1])
             if count >= PATCHES_AT_ONCE:
-                yield _whole(frames, corners, max_rate, watched), groups
+                yield _whole(frames, corners, max_rate, features), groups
                 groups, corners, count = [], [], 0
     if groups:
-        yield _whole(frames, corners, max_rate, watched), groups
+        yield _whole(frames, corners, max_rate, features), groups
 
 
-def _whole(frames: PatchFrames, corners: list[IntArray], max_rate: int, watched: NDArray[np.bool_]) -> Tiles:
-    joined = np.concatenate(corners)
-    return Tiles.whole(joined, max_rate, sides_on(watched, frames, joined))
+def _whole(frames: PatchFrames, corners: list[IntArray], max_rate: int, features: NDArray[np.bool_]) -> Tiles:
+    every = np.concatenate(corners)
+    return Tiles.whole(every, max_rate, sides_on(features, frames, every))
 
 
 def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_count: int) -> Iterator[Tiles]:
@@ -128,11 +133,7 @@ def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_
     if optional_member(rates.scheme, "has_convex_rules"):
         is_flat = have_flat_rings(rates, tiles, patches)
         yield tiles[is_flat]
-        patches = [
-            PatchGroup(each.signature, each.at[~is_flat[each.at]], each.points[..., ~is_flat[each.at]])
-            for each in patches
-            if not is_flat[each.at].all()
-        ]
+        patches = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
     flat, pieces, coefficients = _divided(rates, tiles, patches)
     yield flat
     for begin in range(0, len(pieces), PATCHES_AT_ONCE):
@@ -154,40 +155,43 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
     scheme = rates.scheme
     flat: list[Tiles] = [tiles[:0]]
     pieces: list[tuple[Tiles, FloatArray]] = [(tiles[:0], np.empty((len(rates.basis.indices), 3, 0)))]
-    waiting: list[TileGroup] = []
+    waiting: list[TileParts] = []
     for each, element in zip(patches, divided_elements(scheme, [own.signature for own in patches]), strict=True):
-        tile, rows = part_of_tile(element, np.eye(element.control_count))
-        points = times(rows, each.points)
+        every = np.eye(element.control_count)
+        tile, rows = part_of_tile(element, every)
+        points = each.points if rows is every else times(rows, each.points)
         if tile is None:
             pieces.append((tiles[each.at], points))
         else:
-            waiting.append(TileGroup(tile, each.at, points))
+            waiting.append(TileParts(tile, points, each.at))
     while waiting:
-        tiles, waiting = _numbered(tiles, _alike(waiting))
+        tiles, waiting = _numbered(tiles, alike(waiting))
         # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
         is_done = are_flat(rates, tiles, waiting) | (tiles.depth >= DEEPEST - 1)
         for group in waiting:
             if not group.tile.is_self_similar:
-                is_done[group.at] |= tiles.most[group.at] == 1
+                is_done[group.owner] |= tiles.most[group.owner] == 1
         flat.append(tiles[is_done])
+        index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
         children = [tiles.child(number, scheme.domain) for number in range(4)]
         most = np.concatenate([each.most for each in children])
         divided, waiting = waiting, []
         of_pieces, coefficients = [], []
         for group in divided:
-            rest = group.chosen(~is_done[group.at])
-            if not len(rest.at):
+            if is_done[group.owner].all():
                 continue
+            rest = group.chosen(~is_done[group.owner])
+            parents = index[rest.owner]
             for number, (tile, rows) in enumerate(group.tile.children):
-                at, points = number * len(tiles) + rest.at, times(rows, rest.points)
+                at, points = number * len(tiles) + parents, times(rows, rest.values)
                 if tile is None:
                     of_pieces.append(at)
                     coefficients.append(points)
                     continue
                 if tile is group.tile:
                     # Each ring around an extraordinary point may have as many segments as the one around it.
-                    most[at] = tiles.most[rest.at]
-                waiting.append(TileGroup(tile, at, points))
+                    most[at] = tiles.most[parents]
+                waiting.append(TileParts(tile, points, at))
         tiles = replace(Tiles.joined(children), most=most)
         if of_pieces:
             pieces.append((tiles[np.concatenate(of_pieces)], np.concatenate(coefficients, axis=2)))
@@ -195,37 +199,20 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
     return Tiles.joined(flat), in_pieces, np.concatenate([each for _, each in pieces], axis=2)
 
 
-def _alike(groups: list[TileGroup]) -> list[TileGroup]:
-    """The same tiles, with groups of the same subdivision merged."""
-    found: dict[DividedTile, list[TileGroup]] = {}
-    for group in groups:
-        found.setdefault(group.tile, []).append(group)
-    return [
-        own[0]
-        if len(own) == 1
-        else TileGroup(
-            tile, np.concatenate([each.at for each in own]), np.concatenate([each.points for each in own], axis=2)
-        )
-        for tile, own in found.items()
-    ]
-
-
-def _numbered(tiles: Tiles, groups: list[TileGroup]) -> tuple[Tiles, list[TileGroup]]:
+def _numbered(tiles: Tiles, groups: list[TileParts]) -> tuple[Tiles, list[TileParts]]:
     """The tiles of some groups only, one group after the other."""
-    ends = np.cumsum([len(group.at) for group in groups]).tolist()
-    chosen = tiles[np.concatenate([group.at for group in groups])]
+    ends = np.cumsum([len(group.owner) for group in groups]).tolist()
+    chosen = tiles[np.concatenate([group.owner for group in groups])]
     return chosen, [
-        TileGroup(group.tile, np.arange(end - len(group.at), end), group.points)
-        for group, end in zip(groups, ends, strict=True)
+        group._replace(owner=np.arange(end - len(group.owner), end)) for group, end in zip(groups, ends, strict=True)
     ]
 
 
-def _order(tiles: Tiles, frames: PatchFrames) -> IntArray:
-    """Tiles in the order of their elements, then of their patches, along a curve of Morton's."""
-    code = _interleaved(tiles.place[:, 0] << (DEEPEST - tiles.depth)) | (
-        _interleaved(tiles.place[:, 1] << (DEEPEST - tiles.depth)) << 1
-    )
-    return np.lexsort([tiles.is_flipped, code, tiles.corner, frames.topology.face_of(tiles.corner)])
+def _order(tiles: Tiles) -> IntArray:
+    """Tiles in the order of their patches' corners, and so of the elements, along a curve of Morton's."""
+    depth = int(tiles.depth.max(initial=0))
+    u, v = (_interleaved(axis.astype(np.int64) << (depth - tiles.depth)) for axis in tiles.origin.T)
+    return np.argsort(joined(tiles.corner, (u | v << 1) << 1 | tiles.is_flipped, 2 * depth + 1), kind="stable")
 
 
 def _interleaved(values: IntArray) -> IntArray:

@@ -153,7 +153,7 @@ class TileRates:
             # What is outside lies in the next element; the samples are mirrored at the diagonal.
             u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
         flipped, size = tiles.is_flipped, 0.5**tiles.depth
-        uv = [size * (place + np.where(flipped, 1 - t, t)) for place, t in zip(tiles.place.T, (u, v), strict=True)]
+        uv = [size * (origin + np.where(flipped, 1 - t, t)) for origin, t in zip(tiles.origin.T, (u, v), strict=True)]
         corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
         scale = self.frames.scale[self.frames.topology.face_of(tiles.corner)]
         found = displacement.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
@@ -173,7 +173,7 @@ class TileRates:
         return np.stack([a, b, c])[None]
 
     def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
-        """`Tiles.sides`: as many segments as keep curves along watched sides to the limit."""
+        """`Tiles.sides`: as many segments as keep curves along feature edges to the limit."""
         sides = np.zeros_like(tiles.sides)
         _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0].astype(np.float64)
         along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]

@@ -28,8 +28,8 @@ def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
     """``(2, t, m)`` corners of tiles in their patches, in parts of `UNIT`, counter-clockwise from the tile's (0, 0)."""
     size = (UNIT >> tiles.depth).astype(np.int32)[:, None]
     found = []
-    for place, steps in zip(tiles.place.T, domain.corners.astype(np.int32).T, strict=True):
-        found.append(place.astype(np.int32)[:, None] + np.where(tiles.is_flipped[:, None], 1 - steps, steps))
+    for origin, steps in zip(tiles.origin.T, domain.corners.astype(np.int32).T, strict=True):
+        found.append(origin.astype(np.int32)[:, None] + np.where(tiles.is_flipped[:, None], 1 - steps, steps))
         found[-1] *= size
     return np.stack(found)
 
@@ -126,7 +126,7 @@ def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
     """Find the lines of some tiles' sides."""
     t, m, flipped = frames.topology, frames.domain.corner_count, tiles.is_flipped
     size = (UNIT >> tiles.depth).astype(np.int32)
-    u, v = (place.astype(np.int32) * size for place in tiles.place.T)
+    u, v = (origin.astype(np.int32) * size for origin in tiles.origin.T)
     far_u, far_v, diagonal = u + size, v + size, u + v + size
     # Lines inside patches are numbered by their direction and patch, after edges and spokes.
     shape = len(tiles), m

@@ -25,11 +25,11 @@ class Tiles:
     corner : (t,) int32
         Corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`.
     depth : (t,) int64
-    place : (t, 2) int64
+    origin : (t, 2) int64
         Where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``.
     is_flipped : (t,) bool
         Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
-        at ``place + 1``.
+        at ``origin + 1``.
     most : (t,) int64
         The highest rate that a tile may have.
     rates : (t, 2) int64
@@ -41,7 +41,7 @@ class Tiles:
 
     corner: IntArray
     depth: IntArray
-    place: IntArray
+    origin: IntArray
     is_flipped: NDArray[np.bool_]
     most: IntArray
     rates: IntArray
@@ -55,7 +55,7 @@ class Tiles:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.corner, self.depth, self.place, self.is_flipped, self.most, self.rates, self.sides
+        return self.corner, self.depth, self.origin, self.is_flipped, self.most, self.rates, self.sides
 
     @classmethod
     def joined(cls, parts: list[Tiles]) -> Tiles:
@@ -76,7 +76,7 @@ class Tiles:
         return Tiles(
             self.corner,
             self.depth + 1,
-            2 * self.place + step,
+            2 * self.origin + step,
             self.is_flipped ^ is_middle,
             np.maximum(1, self.most // 2),
             self.rates,

@@ -19,8 +19,8 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .memory import require_memory
 from .quad_grid import QuadGrid
-from .runs import WEIGHTS_TOGETHER, ClassStencils, Runs
 from .uniform_grid import GridPart, UniformGrid
+from .vertex_stencils import WEIGHTS_TOGETHER, ClassStencils, VertexStencils
 from .vertex_table import VertexTable
 
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
@@ -55,8 +55,8 @@ def uniform_table(
         count = control_count or patches.topology.vertex_count
         control = np.arange(count) if control_of_vertex is None else control_of_vertex
         controls, refinement = patches.control_rows(control, count)
-        runs, copies = _runs(patches, grid, controls), _copies(patches, grid, control)
-        return VertexTable(count, patches.patch_count, grid, runs, controls, copies, refinement)
+        vertex_stencils, copies = _vertex_stencils(patches, grid, controls), _copies(patches, grid, control)
+        return VertexTable(count, patches.patch_count, grid, vertex_stencils, controls, copies, refinement)
 
     return _TABLES.get((patches, _checked_rate(rate), Content(control_of_vertex), control_count), make)
 
@@ -101,7 +101,7 @@ def _checked_rate(rate: int) -> int:
     return checked
 
 
-def _runs(patches: PatchTable, grid: UniformGrid, controls: NDArray[np.uint32]) -> Runs:
+def _vertex_stencils(patches: PatchTable, grid: UniformGrid, controls: NDArray[np.uint32]) -> VertexStencils:
     """The vertices, class by class: part by part of the grid, with the stencils of all classes that have any.
 
     Patches that are whole elements come before others; of both, those whose weights are products come first, then those
@@ -124,7 +124,7 @@ def _runs(patches: PatchTable, grid: UniformGrid, controls: NDArray[np.uint32]) 
                     kinds.append((number, part.samples, part.patches[rows] - bounds[index], part.first_vertex[rows]))
         found += _stencils(patches.scheme, [classes[index] for index in used], uv, controls)
     class_of_kind, samples, patch, first_vertex = zip(*kinds, strict=True)
-    return Runs(
+    return VertexStencils(
         tuple(found),
         np.array(class_of_kind),
         np.array([len(own) for own in samples]),
@@ -152,7 +152,7 @@ def _stencils(
 
 
 def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:
-    """Classes whose patches have grids of a kind, in the order of `_runs`, and `UniformGrid.layout` of all these.
+    """Classes whose patches have grids of a kind, in the order of `_vertex_stencils`, and `UniformGrid.layout` of all.
 
     A patch's grid is that of a whole element, or of an element's corner.
     """

@@ -15,7 +15,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .grid import Grid
-from .runs import ClassStencils, Runs
+from .vertex_stencils import ClassStencils, VertexStencils
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -44,7 +44,7 @@ class VertexTable:
     control_count, patch_count : int
     grid : Grid
         Numbers the vertices and triangles, and says where on the surface they lie.
-    runs : Runs
+    vertex_stencils : VertexStencils
         The stencil and the patch of each vertex.
     controls : (n,) uint32
         `ClassStencils.controls` of all classes: control points or, if there is a ``refinement``, refined ones.
@@ -58,7 +58,7 @@ class VertexTable:
     control_count: int
     patch_count: int
     grid: Grid
-    runs: Runs
+    vertex_stencils: VertexStencils
     controls: NDArray[np.uint32]
     copies: IntArray
     refinement: sparse.csr_array | None = None
@@ -66,7 +66,7 @@ class VertexTable:
     @property
     def classes(self) -> tuple[ClassStencils, ...]:
         """The classes that have samples to evaluate."""
-        return self.runs.classes
+        return self.vertex_stencils.classes
 
     @property
     def vertex_count(self) -> int:
@@ -166,15 +166,17 @@ class VertexTable:
         return list(self._made_blocks())
 
     def _made_blocks(self) -> Iterator[_Block]:
-        runs = self.runs
-        vertex_counts = runs.counts * runs.run_counts
+        vertex_stencils = self.vertex_stencils
+        vertex_counts = vertex_stencils.counts * vertex_stencils.run_counts
         is_shared = vertex_counts >= SHARED
-        sizes = np.array([stencils.controls.shape[1] for stencils in self.classes], dtype=np.int64)[runs.class_of_kind]
-        first_runs = ragged.starts(runs.run_counts)
+        sizes = np.array([stencils.controls.shape[1] for stencils in self.classes], dtype=np.int64)[
+            vertex_stencils.class_of_kind
+        ]
+        first_runs = ragged.starts(vertex_stencils.run_counts)
         for kind in np.flatnonzero(is_shared).tolist():
-            count = int(runs.counts[kind])
+            count = int(vertex_stencils.counts[kind])
             length = max(1, min(BLOCK_SAMPLES // count, BLOCK_WEIGHTS // int(sizes[kind])))
-            end = int(first_runs[kind] + runs.run_counts[kind])
+            end = int(first_runs[kind] + vertex_stencils.run_counts[kind])
             for begin in range(int(first_runs[kind]), end, length):
                 yield self._product_block(kind, slice(begin, min(begin + length, end)))
         for size in np.unique(sizes[~is_shared]).tolist():
@@ -184,32 +186,35 @@ class VertexTable:
                 yield self._gathered_block(own, first_runs[own])
 
     def _product_block(self, kind: int, own: slice) -> _Block:
-        """Some runs of one kind."""
-        runs = self.runs
-        stencils, samples = self.classes[int(runs.class_of_kind[kind])], runs.samples_of(kind)
+        """Some vertex_stencils of one kind."""
+        vertex_stencils = self.vertex_stencils
+        stencils, samples = self.classes[int(vertex_stencils.class_of_kind[kind])], vertex_stencils.samples_of(kind)
         weights = stencils.weights[:, samples].transpose(0, 2, 1)
-        vertices = np.add.outer(np.arange(len(samples)), runs.first_vertex[own])
-        return _Block(vertices.ravel(), weights, stencils.controls[runs.patch[own]].T, None)
+        vertices = np.add.outer(np.arange(len(samples)), vertex_stencils.first_vertex[own])
+        return _Block(vertices.ravel(), weights, stencils.controls[vertex_stencils.patch[own]].T, None)
 
     def _gathered_block(self, kinds: IntArray, first_runs: IntArray) -> _Block:
-        """All runs of some kinds, on patches with as many control points."""
-        runs = self.runs
+        """All vertex_stencils of some kinds, on patches with as many control points."""
+        vertex_stencils = self.vertex_stencils
         # Of each run.
-        run, kind = ragged.ranges(first_runs, runs.run_counts[kinds]), np.repeat(kinds, runs.run_counts[kinds])
-        number, counts = runs.class_of_kind[kind], runs.counts[kind]
-        classes, used = np.unique(runs.class_of_kind[kinds], return_index=True)
+        run, kind = (
+            ragged.ranges(first_runs, vertex_stencils.run_counts[kinds]),
+            np.repeat(kinds, vertex_stencils.run_counts[kinds]),
+        )
+        number, counts = vertex_stencils.class_of_kind[kind], vertex_stencils.counts[kind]
+        classes, used = np.unique(vertex_stencils.class_of_kind[kinds], return_index=True)
         first_control = np.zeros(len(self.classes), dtype=np.int64)
         patch_count = np.zeros(len(self.classes), dtype=np.int64)
         first_control[classes] = [self.classes[index].first_control for index in classes]
         patch_count[classes] = [len(self.classes[index].controls) for index in classes]
         at = np.multiply.outer(np.arange(self.classes[classes[0]].controls.shape[1]), patch_count[number])
-        at += first_control[number] + runs.patch[run]
-        sample_starts = ragged.starts(runs.counts[kinds])
-        samples = runs.samples[ragged.ranges(runs.starts[kinds], runs.counts[kinds])]
+        at += first_control[number] + vertex_stencils.patch[run]
+        sample_starts = ragged.starts(vertex_stencils.counts[kinds])
+        samples = vertex_stencils.samples[ragged.ranges(vertex_stencils.starts[kinds], vertex_stencils.counts[kinds])]
         of_classes = np.split(samples, sample_starts[used[1:]])
         weights = [self.classes[index].weights[:, own] for index, own in zip(classes, of_classes, strict=True)]
-        sample = ragged.ranges(np.repeat(sample_starts, runs.run_counts[kinds]), counts)
-        vertices = ragged.ranges(runs.first_vertex[run].astype(np.int64), counts)
+        sample = ragged.ranges(np.repeat(sample_starts, vertex_stencils.run_counts[kinds]), counts)
+        vertices = ragged.ranges(vertex_stencils.first_vertex[run].astype(np.int64), counts)
         controls = np.repeat(self.controls.take(at), counts, axis=1)
         return _Block(vertices, np.concatenate(weights, axis=1).transpose(0, 2, 1), controls, sample)
 

@@ -1,4 +1,4 @@
-"""Sides of tiles along which the surface ends, or folds, and that hold to the limit by themselves."""
+"""Feature edges: along which the surface ends, or folds, so that curves hold to the limit by themselves."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
+from .cones import cross, dot
 from .criterion import Criterion, Measure
 from .patch_frames import PatchFrames
 
@@ -15,7 +16,7 @@ from .patch_frames import PatchFrames
 FOLDED = -0.1
 
 
-def watched_edges(
+def feature_edges(
     patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
 ) -> NDArray[np.bool_]:
     """``(n_h,)`` the half-edges along which curves hold to the limit by themselves.
@@ -32,22 +33,22 @@ def watched_edges(
     if criterion.measure is Measure.EDGE:
         return np.zeros(t.half_edge_count, dtype=bool)
     # Of the elements beside each edge.
-    sums = np.stack([np.bincount(names, x) for x in _normals(patches, points)[t.face_of(np.arange(len(names)))].T])
+    sums = np.stack([np.bincount(names, x) for x in _normals(patches, points).take(t.face, axis=1)])
     is_fold = (np.bincount(names) != 2) | (np.square(sums).sum(axis=0) < 2 + 2 * FOLDED)
     return is_fold[names] | ((t.twin < 0) & (criterion.outline is not None))
 
 
 def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
-    """``(n_e, 3)`` about which way elements face: unit vectors, or zero."""
+    """``(3, n_e)`` about which way elements face: unit vectors, or zero."""
     t = patches.topology
-    along = np.cross(points[t.face_vertices], points[t.face_vertices[t.next]])
-    found = np.stack([np.bincount(t.face_of(np.arange(len(along))), x, len(t.face_sizes)) for x in along.T], axis=1)
+    start = np.ascontiguousarray(points.T).take(t.face_vertices, axis=1)
+    found: FloatArray = np.stack(
+        [np.bincount(t.face, x, t.face_count) for x in cross(start, start.take(t.next, axis=1))]
+    )
     if patches.scheme.element == "vertex":
-        of_corner = found[t.face_of(patches.half_edge_of_corner)]
-        elements = patches.elements
-        faces = elements.face_of(np.arange(elements.half_edge_count))
-        found = np.stack([np.bincount(faces, x, len(elements.face_sizes)) for x in of_corner.T], axis=1)
-    length = np.linalg.norm(found, axis=1, keepdims=True)
+        of_corner, t = found[:, t.face_of(patches.half_edge_of_corner)], patches.elements
+        found = np.stack([np.bincount(t.face, x, t.face_count) for x in of_corner])
+    length: FloatArray = np.sqrt(dot(found, found))
     return found / np.where(length > 0, length, 1)
 
 

@@ -62,7 +62,7 @@ class ClassStencils:
 
 
 @dataclass(frozen=True, eq=False)
-class Runs:
+class VertexStencils:
     """The sample and patch of each vertex of a tessellation.
 
     A run has successive vertices: some samples of one patch. All runs of a kind have the same samples, on different
@@ -108,13 +108,13 @@ class Runs:
         start = int(self.starts[kind])
         return self.samples[start : start + int(self.counts[kind])]
 
-    def of_kinds(self, first: int, last: int) -> Runs:
-        """Runs of the kinds from the first one to before the last one, of the same classes."""
+    def of_kinds(self, first: int, last: int) -> VertexStencils:
+        """VertexStencils of the kinds from the first one to before the last one, of the same classes."""
         kinds = slice(first, last)
         sample, run = int(self.counts[:first].sum()), int(self.run_counts[:first].sum())
         samples = slice(sample, sample + int(self.counts[kinds].sum()))
         runs = slice(run, run + int(self.run_counts[kinds].sum()))
-        return Runs(
+        return VertexStencils(
             self.classes,
             self.class_of_kind[kinds],
             self.counts[kinds],
@@ -124,10 +124,10 @@ class Runs:
             self.first_vertex[runs],
         )
 
-    def of_classes(self, first: int, last: int) -> Runs:
-        """Runs of the classes from the first one to before the last one."""
+    def of_classes(self, first: int, last: int) -> VertexStencils:
+        """VertexStencils of the classes from the first one to before the last one."""
         found = self.of_kinds(*np.searchsorted(self.class_of_kind, [first, last]).tolist())
-        return Runs(
+        return VertexStencils(
             self.classes[first:last],
             found.class_of_kind - first,
             found.counts,
@@ -137,7 +137,7 @@ class Runs:
             found.first_vertex,
         )
 
-    def along_patches(self) -> Runs:
+    def along_patches(self) -> VertexStencils:
         """If all runs have one vertex: the same vertices, with consecutive ones on a patch merged into longer runs.
 
         Kernels have a lane for each run, and read the control points of a patch once for all of them.
@@ -156,7 +156,7 @@ class Runs:
         begins, counts = begins[by_class], counts[by_class]
         vertices = ragged.ranges(begins, counts)
         first = self.first_vertex[by_vertex[begins]]
-        return Runs(
+        return VertexStencils(
             self.classes,
             number[begins],
             counts,
