@@ -264,7 +264,8 @@ class OccupiedPieces:
     def piece(self, part: int) -> Piece:
         """A part that is a piece."""
         group = self.groups[self.parts["group"][part]]
-        return Piece(self._domain(part), group.stencils[self.parts["index"][part]], group.patch, group.control_count)
+        stencils = group.stencils[self.parts["index"][part]]
+        return Piece(self._domain(part), stencils, group.patch, stencils.shape[1])
 
     def locate(self, part: IntArray, uv: FloatArray, corner: IntArray) -> IntArray:
         """Find the piece ``(s,)`` that each sample lies in.
