@@ -29,6 +29,9 @@ from .signature import (
     fan_half_edges,
 )
 
+# Elements up to which walks around one after the other take less time than steps of all together.
+FEW_ELEMENTS = 4
+
 
 @dataclass(frozen=True, eq=False)
 class OneRing:
@@ -91,10 +94,11 @@ class OneRing:
         # of the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        if len(half_edges) == 1:
-            # Around vertices of high valence every face may be the only one of its signature.
+        if len(half_edges) <= FEW_ELEMENTS:
+            # Around vertices of high valence few faces have the same signature.
             kind: ElementKind = "face" if any(corner for corner, _ in self.faces) else "vertex"
-            columns[:, 0] = self.vertices_around(topology, fan_half_edges(topology, int(half_edges[0]), kind))
+            for number, half_edge in enumerate(half_edges.tolist()):
+                columns[:, number] = self.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
         else:
             for chunk in chunks_of(len(half_edges)):
                 self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
