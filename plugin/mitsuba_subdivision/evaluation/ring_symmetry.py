@@ -197,7 +197,8 @@ class _RingMatrix:
 
     def __init__(self, matrix: FloatArray) -> None:
         self.matrix = matrix
-        self._digits = matrix.round(SAME_DIGITS).tobytes()
+        at = np.flatnonzero(matrix)
+        self._digits = at.tobytes(), matrix.ravel()[at].round(SAME_DIGITS).tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _RingMatrix) and self._digits == other._digits
