@@ -271,11 +271,12 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     is_span = np.ones(len(begin), dtype=bool)
     np.less_equal(begin[:-1] + size[:-1], begin[1:], out=is_span[:-1])
     # The spans of each group: itself, or all of those that follow up to its end.
-    before = ragged.starts(is_span).astype(np.int32)
+    offsets: IntArray = ragged.offsets(is_span, np.int32)
+    before = offsets[:-1]
     count = np.ones(len(begin), dtype=np.int32)
     cut = np.flatnonzero(~is_span)
     ends = np.searchsorted(begin, begin[cut] + size[cut])
-    count[cut] = np.append(before, np.count_nonzero(is_span))[ends] - before[cut]
+    count[cut] = offsets[ends] - before[cut]
     spans, of_span = ragged.ranges(before[cut], count[cut]), np.repeat(cut, count[cut])
     span_rate, span_size, span_begin = rate[is_span], size[is_span], begin[is_span]
     # Lengths are powers of two: a side that is cut has its rate in parts of it, too.
