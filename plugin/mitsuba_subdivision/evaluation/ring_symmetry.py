@@ -54,6 +54,8 @@ PROBES = 8
 PROBES_OF_FACE = 2
 # Digits of weights by which rings are recognised as equal.
 SAME_DIGITS = 12
+# Rows of large matrices that are sorted at once.
+ROWS_AT_ONCE = 64
 # Rounding errors of what waves make of points that depend on their sum only.
 NEGLIGIBLE = 1e-15
 
@@ -173,7 +175,7 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     if not len(outside) or matrix[np.ix_(ring, outside)].any():
         return None
     of_ring = _ring_basis(_RingMatrix(matrix[np.ix_(ring, ring)]))
-    waves = _Waves(np.zeros((len(matrix), len(ring))), np.zeros((len(ring), len(matrix))), of_ring.eigenvalues.copy())
+    waves = _Waves(np.zeros((2, *matrix.shape)), of_ring.eigenvalues.copy())
     waves.vectors[ring], waves.dual[:, ring] = of_ring.vectors, of_ring.inverse
     rest = np.eye(len(matrix))[:, outside]
     of_outside = np.linalg.eigvals(matrix[np.ix_(outside, outside)])
@@ -195,7 +197,8 @@ class _RingMatrix:
 
     def __init__(self, matrix: FloatArray) -> None:
         self.matrix = matrix
-        self._digits = matrix.round(SAME_DIGITS).tobytes()
+        at = np.flatnonzero(matrix)
+        self._digits = at.tobytes(), matrix.ravel()[at].round(SAME_DIGITS).tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _RingMatrix) and self._digits == other._digits
@@ -230,14 +233,23 @@ class _Waves:
 
     Attributes
     ----------
-    vectors : (K, w) float64
-    dual : (w, K) float64
+    matrices : (2, K, K) float64
+        The vectors as first columns of one, and ``dual`` as first rows of the other; `_joined` adds the rest in place.
     eigenvalues : (w,) float64
     """
 
-    vectors: FloatArray
-    dual: FloatArray
+    matrices: FloatArray
     eigenvalues: FloatArray
+
+    @property
+    def vectors(self) -> FloatArray:
+        """``(K, w)`` float64."""
+        return self.matrices[0, :, : len(self.eigenvalues)]
+
+    @property
+    def dual(self) -> FloatArray:
+        """``(w, K)`` float64."""
+        return self.matrices[1, : len(self.eigenvalues)]
 
 
 def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
@@ -259,7 +271,7 @@ def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
     if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min() < DEPENDENT:
         return None
     inverses = np.linalg.inv(vectors)
-    found = _Waves(np.zeros((size, kinds * (n - 1))), np.zeros((kinds * (n - 1), size)), np.empty(kinds * (n - 1)))
+    found = _Waves(np.zeros((2, size, size)), np.empty(kinds * (n - 1)))
     end = 0
     for wave in (np.cos, np.sin):
         for kind, orbit in enumerate(orbits):
@@ -345,7 +357,7 @@ def _joined(
 ) -> Eigenbasis:
     """The basis of the rest, given in coordinates over ``others``, and the separate waves with their part in the rest.
 
-    The arrays are by far the largest: each is made once, and changed in place.
+    The arrays of the waves are by far the largest: they become those of the basis, in place.
     """
     wave_values = waves.eigenvalues[separate]
     eigenvalues = np.concatenate([small.eigenvalues, wave_values])
@@ -361,7 +373,11 @@ def _joined(
     source[of_waves], added[:, of_waves] = separate, in_rest
     # Waves and the rest are orthogonal.
     lengths[of_waves] = np.sqrt(1 + (in_rest**2).sum(axis=0))
-    vectors, dual = waves.vectors.take(source, axis=1), waves.dual.take(source, axis=0)
+    vectors, dual = waves.matrices
+    for begin in range(0, len(source), ROWS_AT_ONCE):
+        chunk = slice(begin, begin + ROWS_AT_ONCE)
+        vectors[chunk] = vectors[chunk].take(source, axis=1)
+        dual[:, chunk] = dual[:, chunk].take(source, axis=0)
     for column, row in zip(rest.T, added, strict=True):
         if np.abs(row).max(initial=0) > NEGLIGIBLE:
             points = np.flatnonzero(column)
