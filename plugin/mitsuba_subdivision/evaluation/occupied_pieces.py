@@ -222,7 +222,8 @@ class OccupiedPieces:
 
     def __init__(self, scheme: Scheme, piece_levels: int = 0, column_step: int = 1) -> None:
         self.scheme, self._piece_levels, self._column_step = scheme, piece_levels, column_step
-        self._rotations = [scheme.domain.rotation(corner) for corner in range(scheme.domain.corner_count)]
+        rotations = [scheme.domain.rotation(corner) for corner in range(scheme.domain.corner_count)]
+        self._rotations = AffineMap(*(np.stack(each) for each in zip(*rotations, strict=True)))
         self.groups: list[PieceGroup] = []
         self._group_numbers: dict[tuple[IrregularPatch | None, tuple[int, int], tuple[int, ...] | None], int] = {}
         self.ranks = np.empty(0, dtype=np.int16)
@@ -233,7 +234,7 @@ class OccupiedPieces:
             kind=((), np.int8),
             turn=((), np.int8),
             children=((len(scheme.domain.children),), np.int32),
-            maps=((len(self._rotations), 6), np.float64),
+            maps=((len(rotations), 6), np.float64),
             group=((), np.int16),
             index=((), np.int32),
             level=((), np.int64),
@@ -386,7 +387,9 @@ class OccupiedPieces:
 
     def _add_piece(self, piece: Piece, level: int = 0) -> int:
         columns = piece.stencils.shape[1]
-        stencils = np.pad(piece.stencils, ((0, 0), (0, -columns % self._column_step)))
+        stencils = piece.stencils
+        if columns % self._column_step:
+            stencils = np.pad(stencils, ((0, 0), (0, -columns % self._column_step)))
         key = piece.patch, stencils.shape, _order_of(stencils) if piece.patch is None else None
         if key not in self._group_numbers:
             self._group_numbers[key] = len(self.groups)
@@ -412,12 +415,13 @@ class OccupiedPieces:
     ) -> int:
         self._divisible.append(part)
         self._divisible_bytes += 0 if part is None else part.byte_count
-        maps = [domain @ rotation for rotation in self._rotations]
+        matrices = domain.matrix @ self._rotations.matrix
+        offsets = self._rotations.offset @ domain.matrix.T + domain.offset
         return self.parts.append(
             kind=kind,
             turn=turn,
             children=NO_CHILD,
-            maps=[[*each.matrix.ravel(), *each.offset] for each in maps],
+            maps=np.concatenate([matrices.reshape(-1, 4), offsets], axis=1),
             group=group,
             index=index,
             level=level,

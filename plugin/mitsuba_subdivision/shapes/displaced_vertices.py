@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from ..patches import Channel
     from ..surface import LimitSurface
     from .displacement import ShapeDisplacement
-    from .vertices import DifferentiableVertices, Vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +91,14 @@ class VertexLocations:
         return found
 
 
-class DisplacedKernelVertices:
-    """Displaced vertices, evaluated on the device.
+class DeviceDisplacement:
+    """Displaces vertices on the device.
 
     Differentiable with respect to control points, the scale, and the texture or control values of the heights.
 
     Parameters
     ----------
-    vertices : Vertices
     locations : VertexLocations
-        Of the same vertices.
     slopes : (n,) bool
         See `VertexLocations.follow_slopes`.
     surface : SurfaceKernel
@@ -112,7 +109,6 @@ class DisplacedKernelVertices:
 
     def __init__(
         self,
-        vertices: Vertices,
         locations: VertexLocations,
         slopes: NDArray[np.bool_],
         surface: SurfaceKernel,
@@ -120,8 +116,8 @@ class DisplacedKernelVertices:
         *,
         has_normals: bool,
     ) -> None:
-        self._vertices, self._surface, self._has_normals = vertices, surface, has_normals
-        self.are_differentiable = bool(dr.is_diff_v(float_type))
+        self._surface, self._has_normals = surface, has_normals
+        self.is_differentiable = bool(dr.is_diff_v(float_type))
         self._types = types = ArrayTypes.of(float_type)
         u, v = (types.floats(column) for column in locations.uv.T)
         self._location = Location(types.indices(locations.corner), u, v)
@@ -134,7 +130,6 @@ class DisplacedKernelVertices:
         self._group = types.indices(np.maximum(locations.group, 0))
         self._has_copies = types.indices((locations.group >= 0).astype(np.uint32)) != 0
         dr.eval(self._has_copies)
-        self._found: tuple[FloatBuffer, FloatBuffer] | None = None
 
     def _read_values(self) -> None:
         """Evaluate what heights depend on, if it has changed."""
@@ -152,21 +147,13 @@ class DisplacedKernelVertices:
             raise RuntimeError("a surface without displacement; expected one that `ShapeDisplacement` was attached to")
         return found
 
-    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """See `Vertices`."""
-        found = self._vertices(points)
-        self._found = dr.detach(found[0]), dr.detach(found[1])
-        return self._moved(*found)
-
-    def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """See `Vertices`."""
-        if dr.grad_enabled(points):
-            return self._moved(*cast("DifferentiableVertices", self._vertices).attached(points))
-        if self._found is None:
-            raise RuntimeError("vertices were not evaluated; expected a call before")
-        return self._moved(*self._found)
-
-    def _moved(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+    def __call__(
+        self,
+        positions: FloatBuffer,
+        normals: FloatBuffer,
+        points: FloatBuffer,  # noqa: ARG002
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        """Displace flat positions and normals of the surface of the control points."""
         p: Vector3 = dr.unravel(self._types.vector3, positions)
         n: Vector3 = dr.unravel(self._types.vector3, normals)
         self._read_values()
@@ -189,14 +176,12 @@ class DisplacedKernelVertices:
         return dr.select(self._has_copies, mean, vectors)
 
 
-class DisplacedTableVertices:
-    """Displaced vertices in NumPy arrays.
+class HostDisplacement:
+    """Displaces vertices in NumPy arrays.
 
     Parameters
     ----------
-    vertices : Vertices
     locations : VertexLocations
-        Of the same vertices.
     slopes : (n,) bool
         See `VertexLocations.follow_slopes`.
     surface : LimitSurface
@@ -205,11 +190,10 @@ class DisplacedTableVertices:
         Whether normals are needed.
     """
 
-    are_differentiable = False
+    is_differentiable = False
 
     def __init__(
         self,
-        vertices: Vertices,
         locations: VertexLocations,
         slopes: NDArray[np.bool_],
         surface: LimitSurface,
@@ -217,14 +201,16 @@ class DisplacedTableVertices:
         *,
         has_normals: bool,
     ) -> None:
-        self._vertices, self._locations, self._slopes = vertices, locations, slopes
+        self._locations, self._slopes = locations, slopes
         self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
         self._read: Channel | None = None
 
-    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """See `Vertices`."""
+    def __call__(
+        self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        """Displace flat positions and normals of the surface of the control points."""
         self._read_values()
-        positions, normals = (np.array(flat).reshape(-1, 3) for flat in self._vertices(points))
+        positions, normals = (np.array(flat).reshape(-1, 3) for flat in (positions, normals))
         heights, scale = self._displacement.heights, self._displacement.host_scale
         height = np.array(heights.height(self._values[0])) * scale
         positions = positions + self._mean(height[:, None] * normals).astype(np.float32)

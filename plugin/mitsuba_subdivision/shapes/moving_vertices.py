@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cage.errors import warn
 from ..kernels.types import FloatBuffer, Matrix4
 from .placement import Placement, RecentredPoints
-from .vertices import DifferentiableVertices, Vertices
+from .vertices import Vertices
 
 if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
@@ -105,7 +105,7 @@ class MovingVertices:
             self._kernel.attach(points)
         found = self._found
         if found is None or dr.grad_enabled(points, *self._others()):
-            found = cast("DifferentiableVertices", self._vertices).attached(points)
+            found = self._vertices.attached(points)
         return self._placed(*found, placement, on_backward)
 
     def warn_of_lost(

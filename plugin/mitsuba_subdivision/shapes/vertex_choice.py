@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
+from ..kernels.types import FloatBuffer
 from ..llvm import llvm_problem
-from .vertices import KernelVertices, SampledVertices, SplitVertices, TableVertices, Vertices, split_weld_targets
+from ..mesh.shared import Shared
+from ..surface import LimitSurface
+from .vertices import Vertices, split_weld_targets
 
 if TYPE_CHECKING:
+    from ..kernels import EvaluatedVertices, WeightKernel
     from ..tessellation import AttributeTable, VertexTable
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
@@ -41,41 +48,82 @@ def vertices_of(
     is_exact : bool
         Whether shading is exact.
     """
-    surface, is_jit = parameters.surface, float_type is not None
     split = attributes
     if displacement is not None:
         # Copies along seams: their displacements differ, and are averaged.
-        split = surface.attribute_table(table)
-    vertices: Vertices
-    if parameters.evaluator != "stabilized" or parameters.sample_offset:
-        vertices = SampledVertices(table, parameters, float_type)
-    elif float_type is not None:
-        vertices = KernelVertices(table, float_type)
-    elif table.vertex_count > WORTH_A_KERNEL and llvm_problem() is None:
-        float_type = dr.llvm.Float
-        vertices = KernelVertices(table, float_type)
-    else:
-        vertices = TableVertices(table)
-    if split.surface_vertex is not None:
-        vertices = SplitVertices(vertices, split.surface_vertex, float_type)
+        split = parameters.surface.attribute_table(table)
+    evaluate, evaluate_tangents = _evaluators(table, parameters, float_type)
     if displacement is None:
-        return vertices
-    from .displaced_vertices import DisplacedKernelVertices, DisplacedTableVertices, VertexLocations
+        return Vertices(evaluate, evaluate_tangents, copied=split.surface_vertex)
+    from .displaced_vertices import DeviceDisplacement, HostDisplacement, VertexLocations
 
     found = split_weld_targets(table, split)
     weld_target = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
     locations = VertexLocations(*(split.locate or table.locations)(), weld_target)
-    slopes = locations.follow_slopes(surface, displacement.channel)
+    slopes = locations.follow_slopes(parameters.surface, displacement.channel)
     has_normals = not (is_exact or parameters.face_normals)
-    if displacement.kernel is not None and is_jit and float_type is not None:
-        vertices = DisplacedKernelVertices(
-            vertices, locations, slopes, displacement.kernel, float_type, has_normals=has_normals
-        )
+    displaced: DeviceDisplacement | HostDisplacement
+    if displacement.kernel is not None and float_type is not None:
+        displaced = DeviceDisplacement(locations, slopes, displacement.kernel, float_type, has_normals=has_normals)
     else:
-        vertices = DisplacedTableVertices(vertices, locations, slopes, surface, displacement, has_normals=has_normals)
-        float_type = None
+        displaced = HostDisplacement(locations, slopes, parameters.surface, displacement, has_normals=has_normals)
+    kept = None
     if is_exact and split.surface_vertex is not None:
-        # With exact shading, vertices have no copies along seams.
-        _, first = np.unique(split.surface_vertex, return_index=True)
-        vertices = SplitVertices(vertices, first, float_type)
-    return vertices
+        _, kept = np.unique(split.surface_vertex, return_index=True)
+    return Vertices(evaluate, evaluate_tangents, copied=split.surface_vertex, displacement=displaced, kept=kept)
+
+
+def _evaluators(
+    table: VertexTable, parameters: Parameters, float_type: type | None
+) -> tuple[Callable[[FloatBuffer], tuple[FloatBuffer, FloatBuffer]], Callable[[FloatBuffer], EvaluatedVertices] | None]:
+    """What evaluates the tessellation's vertices, and, where there are derivatives, also their tangents."""
+    if parameters.evaluator != "stabilized" or parameters.sample_offset:
+        return partial(_sampled, table, parameters, float_type), None
+    is_jit = float_type is not None
+    if not is_jit and (table.vertex_count <= WORTH_A_KERNEL or llvm_problem() is not None):
+        return partial(_weighted, table), None
+    from ..kernels import WeightKernel
+
+    kernel_type = float_type or dr.llvm.Float
+    kernel = _KERNELS.get((table, kernel_type), lambda: WeightKernel(table, kernel_type))
+    if not is_jit:
+        return lambda points: kernel(kernel_type(np.array(points))), None
+    return kernel, kernel.evaluated if dr.is_diff_v(kernel_type) else None
+
+
+def _weighted(table: VertexTable, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+    """Weights times control points, in NumPy."""
+    positions, normals = table.apply(_rows(points, table.control_count), np.float32)
+    return positions.ravel(), normals.ravel()
+
+
+def _sampled(
+    table: VertexTable, parameters: Parameters, float_type: type | None, points: FloatBuffer
+) -> tuple[FloatBuffer, FloatBuffer]:
+    """Vertices sample by sample in float32, by another evaluator than the weights, for comparison."""
+    cage = parameters.surface.cage
+    surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), parameters.surface.scheme)
+    positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
+    # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
+    found = positions.ravel(), np.nan_to_num(normals).ravel()
+    return found if float_type is None else (float_type(found[0]), float_type(found[1]))
+
+
+def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
+    """Flat control points as ``(count, 3)``.
+
+    Raises
+    ------
+    ValueError
+        If their number is not `count`.
+    """
+    found = np.array(points, dtype=np.float64)
+    if found.size != 3 * count:
+        from ..kernels.apply_weights import coordinates_expected
+
+        raise ValueError(coordinates_expected(found.size, count))
+    return found.reshape(-1, 3)
+
+
+# Weights on the device, shared by shapes of one table.
+_KERNELS: Shared[WeightKernel] = Shared()
