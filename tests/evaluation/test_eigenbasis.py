@@ -1,3 +1,4 @@
+import re
 from functools import cache
 
 import numpy as np
@@ -263,6 +264,34 @@ def test_a_basis_of_nearly_defective_matrices_holds_or_is_an_error(gap):
         return
     found = basis.vectors @ basis.block_matrix() @ basis.inverse
     np.testing.assert_allclose(found, matrix, rtol=0, atol=POWER)
+
+
+@pytest.mark.parametrize(("gap", "seed"), [(gap, seed) for gap in 10.0 ** -np.arange(3, 13) for seed in range(3)])
+def test_a_basis_of_a_nearly_defective_triple_holds_or_the_error_says_where(gap, seed):
+    """Rounding moves the eigenvalues by 1e-5, and inverse iteration may be shifted onto one of them."""
+    triple = np.diag(0.5 - gap * np.arange(3)) + np.eye(3, k=1)
+    matrix = similar(block_diagonal([[1]], triple, [[0.3]]), seed)
+    try:
+        basis = eigenbasis(matrix)
+    except EigenbasisError as error:
+        message = str(error)
+    else:
+        found = basis.vectors @ basis.block_matrix() @ basis.inverse
+        np.testing.assert_allclose(found, matrix, rtol=0, atol=POWER)
+        return
+    assert "eigenbasis of a 5 x 5 subdivision matrix" in message
+    if near := re.search(r"the closest eigenvalues are (\S+) and (\S+);", message):
+        assert [complex(each) for each in near.groups()] == pytest.approx([0.5, 0.5], abs=1e-3)
+
+
+def test_a_matrix_that_inverse_iteration_cannot_invert_is_an_error(monkeypatch):
+    def singular(_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    matrix = similar(HIDDEN["jordan 2"])
+    monkeypatch.setattr(np.linalg, "inv", singular)
+    with pytest.raises(EigenbasisError, match=r"6 x 6 .* closest eigenvalues are 0\.\d+\S* and 0\.\d+\S*; expected"):
+        eigenbasis(matrix)
 
 
 @pytest.mark.parametrize("second", [1, -1, 1 + 1e-3])

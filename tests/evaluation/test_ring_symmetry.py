@@ -96,6 +96,9 @@ def test_faces_of_an_open_fan_share_the_basis_of_its_ring(scheme, rule, valence)
         matrix = found.vectors @ found.block_matrix() @ found.inverse
         np.testing.assert_allclose(matrix, structure.matrix, rtol=0, atol=ROUNDED)
         np.testing.assert_allclose(found.inverse @ found.vectors, np.eye(len(matrix)), rtol=0, atol=ROUNDED)
+        sign = np.where(np.arange(len(matrix)) == 2, -1, 1)
+        np.testing.assert_array_equal(found.turned_over().vectors, found.vectors * sign)
+        np.testing.assert_array_equal(found.turned_over().inverse, found.inverse * sign[:, None])
         np.testing.assert_allclose(found.eigenvalues, expected.eigenvalues, rtol=0, atol=SAME_EIGENVALUE)
         for members in (slice(0, 1), slice(1, 2), slice(2, 3)):
             projections = [basis.vectors[:, members] @ basis.inverse[members] for basis in (found, expected)]

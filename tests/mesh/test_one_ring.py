@@ -3,7 +3,7 @@ from itertools import product
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
-from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.one_ring import FEW_ELEMENTS, one_ring
 from mitsuba_subdivision.mesh.signature import Signature, fan_half_edges, half_edges_around, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
 from reference.exact_samples import mesh_of
@@ -138,7 +138,7 @@ def test_vertices_around_fans_are_those_gathered(topology, kind):
     for half_edge in range(topology.half_edge_count):
         ring = one_ring(signature_at(topology, half_edge, kind))
         found = ring.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
-        np.testing.assert_array_equal(found, ring.gather(topology, np.array([half_edge] * 2))[0])
+        np.testing.assert_array_equal(found, ring.gather(topology, np.array([half_edge] * (FEW_ELEMENTS + 1)))[0])
 
 
 @by_name(TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology})
@@ -187,9 +187,10 @@ def test_many_elements_gather_as_each_alone(topology, kind):
         classes.setdefault(signature_at(topology, half_edge, kind), []).append(half_edge)
     for signature, members in classes.items():
         ring = one_ring(signature)
-        together = ring.gather(topology, np.array(members * 2))
-        assert together.shape == (2 * len(members), ring.vertex_count)
-        for row, member in zip(together, members * 2, strict=True):
+        many = members * (FEW_ELEMENTS + 1)
+        together = ring.gather(topology, np.array(many))
+        assert together.shape == (len(many), ring.vertex_count)
+        for row, member in zip(together, many, strict=True):
             np.testing.assert_array_equal(row, ring.gather(topology, np.array([member]))[0])
 
 

@@ -335,6 +335,19 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
         msub.usd_scene(stage(quadrilaterals), mi)
 
 
+def test_a_cage_is_warned_of_once_by_its_prim(stage):
+    book = """
+        int[] faceVertexCounts = [4, 4, 4]
+        int[] faceVertexIndices = [0, 1, 2, 3, 0, 1, 4, 5, 0, 1, 6, 7]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (1, 0, 1), (0, 0, 1), (1, -1, 0), (0, -1, 0)]
+    """
+    path = stage(mesh("book", book))
+    with pytest.warns(CageWarning) as record:
+        scene = mi.load_dict(msub.usd_scene(path, mi))
+    assert [str(each.message).partition(":")[0] for each in record] == [f'"{path}", prim /book']
+    assert scene is not None
+
+
 def test_lights_and_cameras_that_cannot_be_used(stage):
     cube = mesh("cube", CUBE)
     for bad in ("token inputs:width = 'x'", "float inputs:width = 0", "float inputs:intensity = inf"):

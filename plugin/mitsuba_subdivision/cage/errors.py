@@ -11,6 +11,7 @@ from types import FrameType
 
 _PACKAGE = __name__.partition(".")[0]
 _noted: ContextVar[list[str]] = ContextVar("noted")
+_warns: ContextVar[bool] = ContextVar("warns", default=True)
 
 
 class CageError(ValueError):
@@ -23,12 +24,14 @@ class CageWarning(UserWarning):
 
 def warn(message: str) -> None:
     """Issue a `CageWarning` that points to the line of the user's code that called this package."""
+    _noted.get([]).append(message)
+    if not _warns.get():
+        return
     level = 1
     frame: FrameType | None = sys._getframe()
     # The stack may end inside this package: Mitsuba loads shapes in threads of its own.
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
         level, frame = level + 1, frame.f_back
-    _noted.get([]).append(message)
     warnings.warn(message, CageWarning, stacklevel=level)
 
 
@@ -41,6 +44,16 @@ def noting_warnings() -> Iterator[list[str]]:
         yield noted
     finally:
         _noted.reset(token)
+
+
+@contextmanager
+def without_warnings() -> Iterator[None]:
+    """Have `warn` issue no warnings, where they were issued before."""
+    token = _warns.set(False)
+    try:
+        yield
+    finally:
+        _warns.reset(token)
 
 
 def shortened(text: str, length: int = 80) -> str:

@@ -112,31 +112,30 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
     Raises
     ------
     EigenbasisError
-        If the second eigenvalue is not below one, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not
-        hold to 1e-10.
+        If the second eigenvalue is not below one, different eigenvalues are too close to find vectors for each, or one
+        of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
     """
     size = len(matrix)
     eigenvalues, eigenvectors = np.linalg.eig(matrix)
     second = np.sort(np.abs(eigenvalues))[-2]
     if not second < 1 - CONTRACTION:
         raise EigenbasisError(f"the second eigenvalue has modulus {second:.6g}; expected below 1, or there is no limit")
-    bases, centres, moduli = [], [], []
     clusters = _clusters(eigenvalues)
-    for members, (left, singular) in zip(clusters, _spans(eigenvectors, clusters), strict=True):
-        own = eigenvalues[members]
-        centre = own.real.mean()
-        span = left[:, : len(members)]
-        if singular[len(members) - 1] < DEPENDENT:
-            others = np.delete(eigenvalues, members)
-            gap = np.abs(others[:, None] - own[None, :]).min()
-            span = _invariant_subspace(matrix, centre + 0.1 * gap, span)
-        bases.append(span)
-        centres.append(centre)
-        moduli += [np.abs(own).max()] * len(members)
-
-    vectors = np.hstack(bases)
-    vectors[:, 0] = 1 if constant is None else constant
-    inverse = np.linalg.inv(vectors)
+    try:
+        bases = [
+            _cluster_basis(matrix, eigenvalues, members, left, singular)
+            for members, (left, singular) in zip(clusters, _spans(eigenvectors, clusters), strict=True)
+        ]
+        vectors = np.hstack(bases)
+        vectors[:, 0] = 1 if constant is None else constant
+        inverse = np.linalg.inv(vectors)
+    except np.linalg.LinAlgError as error:
+        raise EigenbasisError(
+            f"eigenbasis of a {size} x {size} subdivision matrix: eigenvectors are dependent, the closest eigenvalues "
+            f"are {_closest(eigenvalues, clusters)}; expected equal ones, within {CLUSTER_WIDTH:.0e}, or distant ones"
+        ) from error
+    centres = [eigenvalues[members].real.mean() for members in clusters]
+    moduli = [np.full(len(members), np.abs(eigenvalues[members]).max()) for members in clusters]
     transformed = inverse @ matrix @ vectors
 
     means, blocks, begin = np.empty(size), [], 0
@@ -148,7 +147,7 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
             blocks.append((block_slice, block))
         begin = block_slice.stop
     means[0] = 1
-    basis = Eigenbasis(vectors, inverse, means, np.array(moduli), tuple(blocks))
+    basis = Eigenbasis(vectors, inverse, means, np.concatenate(moduli), tuple(blocks))
     require_basis(matrix, basis, np.eye(size))
     return basis
 
@@ -255,6 +254,32 @@ def _spans(
         for index, number in enumerate(alike):
             found[number] = left[index], singular[index]
     return found
+
+
+def _closest(eigenvalues: NDArray[np.complex128], clusters: list[NDArray[np.int64]]) -> str:
+    """The two closest eigenvalues of different clusters."""
+    number = np.empty(len(eigenvalues), dtype=np.int64)
+    for cluster, members in enumerate(clusters):
+        number[members] = cluster
+    gaps = np.abs(eigenvalues[:, None] - eigenvalues)
+    gaps[number[:, None] == number] = np.inf
+    first, second = eigenvalues[list(np.unravel_index(gaps.argmin(), gaps.shape))]
+    return f"{first:.9g} and {second:.9g}"
+
+
+def _cluster_basis(
+    matrix: FloatArray,
+    eigenvalues: NDArray[np.complex128],
+    members: NDArray[np.int64],
+    left: FloatArray,
+    singular: FloatArray,
+) -> FloatArray:
+    """Orthonormal basis of the invariant subspace of a cluster of eigenvalues."""
+    own, span = eigenvalues[members], left[:, : len(members)]
+    if singular[len(members) - 1] >= DEPENDENT:
+        return span
+    gap = np.abs(np.delete(eigenvalues, members)[:, None] - own).min()
+    return _invariant_subspace(matrix, own.real.mean() + 0.1 * gap, span)
 
 
 def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> FloatArray:

@@ -169,7 +169,7 @@ def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRings:
     refinement = pattern.refinement
     if signature.is_semi_sharp:
         refinement = scheme.refine(one_ring(signature).topology)
-    half_edges = np.arange(refinement.topology.half_edge_count)[None]
+    half_edges = np.arange(refinement.topology.half_edge_count, dtype=np.int32)[None]
     return RefinedRings(pattern, refinement.topology, half_edges, refinement.stencils, False)
 
 

@@ -54,6 +54,8 @@ PROBES = 8
 PROBES_OF_FACE = 2
 # Digits of weights by which rings are recognised as equal.
 SAME_DIGITS = 12
+# Rows of large matrices that are sorted at once.
+ROWS_AT_ONCE = 64
 # Rounding errors of what waves make of points that depend on their sum only.
 NEGLIGIBLE = 1e-15
 
@@ -147,7 +149,7 @@ def symmetric_eigenbasis(matrix: Matrix, orbits: IntArray) -> Eigenbasis | None:
     if np.abs(waves.dual @ (matrix @ rest)).max() > SAME_WEIGHTS:
         return None
     of_rest, to_rest = rest.T @ (matrix @ rest), (matrix.T @ rest).T @ waves.vectors
-    found = _completed(matrix, waves, rest, _separate(waves, to_rest, np.linalg.eigvals(of_rest)))
+    found, _, _ = _completed(matrix, waves, rest, _separate(waves, to_rest, np.linalg.eigvals(of_rest)))
     require_basis(matrix, found, _probes(len(rest), PROBES))
     return found
 
@@ -173,7 +175,7 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     if not len(outside) or matrix[np.ix_(ring, outside)].any():
         return None
     of_ring = _ring_basis(_RingMatrix(matrix[np.ix_(ring, ring)]))
-    waves = _Waves(np.zeros((len(matrix), len(ring))), np.zeros((len(ring), len(matrix))), of_ring.eigenvalues.copy())
+    waves = _Waves(np.zeros((2, *matrix.shape)), of_ring.eigenvalues.copy())
     waves.vectors[ring], waves.dual[:, ring] = of_ring.vectors, of_ring.inverse
     rest = np.eye(len(matrix))[:, outside]
     of_outside = np.linalg.eigvals(matrix[np.ix_(outside, outside)])
@@ -181,9 +183,66 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     is_separate[0] = False
     for rows, _ in of_ring.blocks:
         is_separate[rows] = False
-    found = _completed(matrix, waves, rest, is_separate)
+    found, places, lengths = _completed(matrix, waves, rest, is_separate)
     require_basis(matrix, found, _probes(len(matrix), PROBES_OF_FACE))
-    return found
+    return FanEigenbasis(found, ring, of_ring, np.flatnonzero(is_separate), places, lengths)
+
+
+class FanEigenbasis(Eigenbasis):
+    """An eigenbasis most of which is that of a ring, which the faces of a fan share.
+
+    The matrices are made anew each time: kept, those of all faces would take memory that grows with the cube of their
+    number.
+
+    Parameters
+    ----------
+    basis : Eigenbasis
+        The same with matrices.
+    ring : (r,) int
+        Control points of the ring.
+    of_ring : Eigenbasis
+        Of the ring.
+    shared, places : (w,) int
+        Which eigenvectors of the ring are eigenvectors of the face, and which these are there.
+    lengths : (w,) float64
+        By which those of the ring are divided.
+    """
+
+    def __init__(
+        self,
+        basis: Eigenbasis,
+        ring: IntArray,
+        of_ring: Eigenbasis,
+        shared: IntArray,
+        places: IntArray,
+        lengths: FloatArray,
+    ) -> None:
+        self._ring, self._of_ring, self._shared, self._places, self._lengths = ring, of_ring, shared, places, lengths
+        every = np.arange(len(basis.eigenvalues))
+        self._outside, self._own = np.setdiff1d(every, ring), np.setdiff1d(every, places)
+        self._own_vectors, self._own_inverse = basis.vectors[:, self._own], basis.inverse[self._own]
+        self._vectors_outside = basis.vectors[np.ix_(self._outside, places)]
+        vars(self).update(eigenvalues=basis.eigenvalues, moduli=basis.moduli, blocks=basis.blocks)
+
+    @property
+    def vectors(self) -> FloatArray:
+        found = np.empty((len(self.eigenvalues), len(self.eigenvalues)))
+        found[:, self._own] = self._own_vectors
+        found[np.ix_(self._ring, self._places)] = self._of_ring.vectors[:, self._shared] / self._lengths
+        found[np.ix_(self._outside, self._places)] = self._vectors_outside
+        return found
+
+    @property
+    def inverse(self) -> FloatArray:
+        # Vectors of the ring do not depend on other points.
+        found = np.zeros((len(self.eigenvalues), len(self.eigenvalues)))
+        found[self._own] = self._own_inverse
+        found[np.ix_(self._places, self._ring)] = self._of_ring.inverse[self._shared] * self._lengths[:, None]
+        return found
+
+    def turned_over(self) -> Eigenbasis:
+        lengths = np.where(self._places == 2, -self._lengths, self._lengths)
+        return FanEigenbasis(super().turned_over(), self._ring, self._of_ring, self._shared, self._places, lengths)
 
 
 def _probes(size: int, count: int) -> FloatArray:
@@ -195,7 +254,8 @@ class _RingMatrix:
 
     def __init__(self, matrix: FloatArray) -> None:
         self.matrix = matrix
-        self._digits = matrix.round(SAME_DIGITS).tobytes()
+        at = np.flatnonzero(matrix)
+        self._digits = at.tobytes(), matrix.ravel()[at].round(SAME_DIGITS).tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _RingMatrix) and self._digits == other._digits
@@ -210,8 +270,13 @@ def _ring_basis(ring: _RingMatrix) -> Eigenbasis:
     return eigenbasis(ring.matrix)
 
 
-def _completed(matrix: Matrix, waves: _Waves, rest: FloatArray, is_separate: NDArray[np.bool_]) -> Eigenbasis:
-    """The basis made of separate waves, which are unit vectors, and of all others together with the rest."""
+def _completed(
+    matrix: Matrix, waves: _Waves, rest: FloatArray, is_separate: NDArray[np.bool_]
+) -> tuple[Eigenbasis, IntArray, FloatArray]:
+    """The basis made of separate waves, which are unit vectors, and of all others together with the rest.
+
+    Besides, which of its vectors are separate waves, and the lengths that these were divided by.
+    """
     from_all = (matrix.T @ rest).T
     of_rest, to_rest = from_all @ rest, from_all @ waves.vectors
     # A wave and what it makes of the rest: (T - of_rest) Y = to_rest for its eigenvalue T.
@@ -230,14 +295,23 @@ class _Waves:
 
     Attributes
     ----------
-    vectors : (K, w) float64
-    dual : (w, K) float64
+    matrices : (2, K, K) float64
+        The vectors as first columns of one, and ``dual`` as first rows of the other; `_joined` adds the rest in place.
     eigenvalues : (w,) float64
     """
 
-    vectors: FloatArray
-    dual: FloatArray
+    matrices: FloatArray
     eigenvalues: FloatArray
+
+    @property
+    def vectors(self) -> FloatArray:
+        """``(K, w)`` float64."""
+        return self.matrices[0, :, : len(self.eigenvalues)]
+
+    @property
+    def dual(self) -> FloatArray:
+        """``(w, K)`` float64."""
+        return self.matrices[1, : len(self.eigenvalues)]
 
 
 def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
@@ -259,7 +333,7 @@ def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
     if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min() < DEPENDENT:
         return None
     inverses = np.linalg.inv(vectors)
-    found = _Waves(np.zeros((size, kinds * (n - 1))), np.zeros((kinds * (n - 1), size)), np.empty(kinds * (n - 1)))
+    found = _Waves(np.zeros((2, size, size)), np.empty(kinds * (n - 1)))
     end = 0
     for wave in (np.cos, np.sin):
         for kind, orbit in enumerate(orbits):
@@ -342,10 +416,10 @@ def _joined(
     separate: IntArray,
     rest: FloatArray,
     in_rest: FloatArray,
-) -> Eigenbasis:
+) -> tuple[Eigenbasis, IntArray, FloatArray]:
     """The basis of the rest, given in coordinates over ``others``, and the separate waves with their part in the rest.
 
-    The arrays are by far the largest: each is made once, and changed in place.
+    The arrays of the waves are by far the largest: they become those of the basis, in place.
     """
     wave_values = waves.eigenvalues[separate]
     eigenvalues = np.concatenate([small.eigenvalues, wave_values])
@@ -361,7 +435,11 @@ def _joined(
     source[of_waves], added[:, of_waves] = separate, in_rest
     # Waves and the rest are orthogonal.
     lengths[of_waves] = np.sqrt(1 + (in_rest**2).sum(axis=0))
-    vectors, dual = waves.vectors.take(source, axis=1), waves.dual.take(source, axis=0)
+    vectors, dual = waves.matrices
+    for begin in range(0, len(source), ROWS_AT_ONCE):
+        chunk = slice(begin, begin + ROWS_AT_ONCE)
+        vectors[chunk] = vectors[chunk].take(source, axis=1)
+        dual[:, chunk] = dual[:, chunk].take(source, axis=0)
     for column, row in zip(rest.T, added, strict=True):
         if np.abs(row).max(initial=0) > NEGLIGIBLE:
             points = np.flatnonzero(column)
@@ -373,4 +451,4 @@ def _joined(
     blocks = tuple(
         (slice(index[own.start], index[own.start] + own.stop - own.start), block) for own, block in small.blocks
     )
-    return Eigenbasis(vectors, dual, eigenvalues[order], moduli[order], blocks)
+    return Eigenbasis(vectors, dual, eigenvalues[order], moduli[order], blocks), of_waves, lengths[of_waves]

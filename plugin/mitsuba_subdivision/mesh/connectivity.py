@@ -317,14 +317,14 @@ class Topology:
         """`turn`, `turn_back` and `following`, for one half-edge at a time."""
         if self.half_edge_count > FEW_HALF_EDGES:
             return self.turn, self.turn_back, self.following
-        turn, turn_back, following = self._walk_lists
+        turn, turn_back, following = self._walk_views
         return turn.__getitem__, turn_back.__getitem__, following.__getitem__
 
     @cached_property
-    def _walk_lists(self) -> tuple[list[int], list[int], list[int]]:
-        """``(n_h,)`` where `walks` lead from each half-edge; lists are faster than arrays for one at a time."""
+    def _walk_views(self) -> tuple[memoryview, memoryview, memoryview]:
+        """``(n_h,)`` where `walks` lead from each half-edge; faster than arrays for one at a time, and as small."""
         every = np.arange(self.half_edge_count, dtype=np.int32)
-        return self.turn(every).tolist(), self.turn_back(every).tolist(), self.following(every).tolist()
+        return self.turn(every).data, self.turn_back(every).data, self.following(every).data
 
 
 def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:

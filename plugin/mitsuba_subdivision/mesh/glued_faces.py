@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
-
 import numpy as np
 
 from . import ragged
@@ -72,23 +70,11 @@ class GluedFaces:
         return [
             face
             for face, begin in enumerate(self._begins[:-1])
-            if begin < self._begins[face + 1] and _first(self._lower, begin) == begin
+            if begin < self._begins[face + 1] and self._lower[begin] == begin
         ]
 
     def half_edges(self, face: int) -> range:
         return range(self._begins[face], self._begins[face + 1])
-
-    def vertices(self, faces: list[range]) -> dict[int, int]:
-        """For each half-edge of some faces, a number that it shares with all that begin at the same vertex."""
-        lower = list(range(len(self.twin)))
-        for half_edge in chain(*faces):
-            if self.twin[half_edge] >= 0:
-                _unite(lower, half_edge, self._following(self.twin[half_edge]))
-        return {half_edge: _first(lower, half_edge) for half_edge in chain(*faces)}
-
-    def _following(self, half_edge: int) -> int:
-        own = self.half_edges(self._walk_of[half_edge])
-        return half_edge + 1 if half_edge + 1 < own.stop else own.start
 
     def _preceding(self, half_edge: int) -> int:
         own = self.half_edges(self._walk_of[half_edge])

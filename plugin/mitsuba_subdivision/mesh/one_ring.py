@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .chunks import chunks_of
-from .connectivity import Topology
+from .connectivity import IntArray, Topology
 from .glued_faces import GluedFaces
 from .semi_sharpness import SemiSharpness
 from .signature import (
@@ -28,6 +28,9 @@ from .signature import (
     fan_face_count,
     fan_half_edges,
 )
+
+# Elements up to which walks around one after the other take less time than steps of all together.
+FEW_ELEMENTS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +94,11 @@ class OneRing:
         # of the walks stay in the cache.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        if len(half_edges) == 1:
-            # Around vertices of high valence every face may be the only one of its signature.
+        if len(half_edges) <= FEW_ELEMENTS:
+            # Around vertices of high valence few faces have the same signature.
             kind: ElementKind = "face" if any(corner for corner, _ in self.faces) else "vertex"
-            columns[:, 0] = self.vertices_around(topology, fan_half_edges(topology, int(half_edges[0]), kind))
+            for number, half_edge in enumerate(half_edges.tolist()):
+                columns[:, number] = self.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
         else:
             for chunk in chunks_of(len(half_edges)):
                 self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
@@ -164,36 +168,56 @@ def one_ring(signature: Signature) -> OneRing:
         semi_sharpness = _local_sharpness(local, [(signature, 0)])
         return replace(ring, topology=local.with_rules(local.rules, semi_sharpness))
     glued = GluedFaces(signature)
-    faces = [glued.half_edges(face) for face in glued.faces]
-    vertex_of = glued.vertices(faces)
-
-    numbers: dict[int, int] = {}
-    slots = []
-    polygons = []
-    for index, half_edges in enumerate(faces):
-        polygon = []
-        for step, half_edge in enumerate(half_edges):
-            vertex = vertex_of[half_edge]
-            if vertex not in numbers:
-                numbers[vertex] = len(numbers)
-                slots.append((index, step))
-            polygon.append(numbers[vertex])
-        polygons.append(polygon)
+    half_edges = [glued.half_edges(face) for face in glued.faces]
+    sizes = np.array([len(own) for own in half_edges])
+    every = np.concatenate(half_edges)
+    index = np.arange(len(every))
+    number = np.full(len(glued.twin), -1)
+    number[every] = index
+    twin = np.array(glued.twin)[every]
+    twin = np.where(twin < 0, -1, number[twin])
+    first_vertex = _first_at_vertices(twin, sizes)
+    is_first = first_vertex == index
+    polygons = (np.cumsum(is_first) - 1)[first_vertex]
+    face = np.repeat(np.arange(len(sizes)), sizes)
+    step = index - ragged.starts(sizes)[face]
+    slots = tuple(zip(face[is_first].tolist(), step[is_first].tolist(), strict=True))
     # Edges are named by the half-edges that are glued, not by vertices: the two sides of a crease stay apart even where
     # the ring closes around the crease's end.
-    number = {half_edge: index for index, half_edge in enumerate(chain(*faces))}
-    edge_names = [min(index, number.get(glued.twin[half_edge], index)) for half_edge, index in number.items()]
-    sizes = np.array([len(half_edges) for half_edges in faces])
-    local = Topology(len(slots), sizes, np.concatenate(polygons), np.array(edge_names))
+    local = Topology(len(slots), sizes, polygons, np.where(twin < 0, index, np.minimum(index, twin)))
     tagged = {corner: fan for corner, fan in enumerate(signature.fans) if isinstance(fan, TaggedFan)}
     if tagged:
         rules = np.zeros(len(slots), dtype=np.int8)
         for corner, fan in tagged.items():
-            rules[polygons[0][corner]] = fan.rule
+            rules[polygons[corner]] = fan.rule
         local = local.with_rules(rules, None)
-    cut = [polygons[0][c] for c, fan in tagged.items() if fan.is_open and fan_face_count(fan) == NEAR_FACES]
+    cut = [int(polygons[c]) for c, fan in tagged.items() if fan.is_open and fan_face_count(fan) == NEAR_FACES]
     cut_fans = np.stack([cut, *local.border_neighbours(np.array(cut, dtype=np.int32))], axis=1).tolist()
-    return OneRing(local, tuple(glued.walks[face] for face in glued.faces), tuple(slots), cut_fans)
+    return OneRing(local, tuple(glued.walks[face] for face in glued.faces), slots, cut_fans)
+
+
+def _first_at_vertices(twin: IntArray, sizes: IntArray) -> IntArray:
+    """For each half-edge, the first of all that begin at the same vertex; ``sizes`` are those of the faces."""
+    index = np.arange(len(twin))
+    ends = ragged.starts(sizes) + sizes - 1
+    following = index + 1
+    following[ends] -= sizes
+    # One turn clockwise about the vertex, and one back; at a border, none.
+    inside = twin >= 0
+    clockwise, back = index.copy(), index.copy()
+    clockwise[inside] = following[twin[inside]]
+    back[clockwise[inside]] = index[inside]
+    return _least_ahead(_least_ahead(index, clockwise), back)
+
+
+def _least_ahead(values: IntArray, step: IntArray) -> IntArray:
+    """The least of all values that any number of steps leads to."""
+    while True:
+        least = np.minimum(values, values[step])
+        if (least == values).all():
+            return values
+        # Twice as many steps at once.
+        values, step = least, step[step]
 
 
 class JoinedRings:

@@ -39,8 +39,13 @@ class StencilTable:
     @classmethod
     def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:
         """Make a table of several (rows, columns, weights). Entries with the same row and column add up."""
-        rows = np.concatenate([rows for rows, _, _ in entries])
-        columns = np.concatenate([columns for _, columns, _ in entries])
+        # Faces of n corners have stencils of n² entries: half of the memory, and of what `matrix` would convert.
+        is_short = max(row_count, column_count) <= np.iinfo(np.int32).max
+        index_type = np.int32 if is_short else np.int64
+        rows: IntArray = np.concatenate([rows for rows, _, _ in entries], dtype=index_type, casting="same_kind")
+        columns: IntArray = np.concatenate(
+            [columns for _, columns, _ in entries], dtype=index_type, casting="same_kind"
+        )
         weights = np.concatenate([np.broadcast_to(weights, rows.shape) for rows, _, weights in entries])
         return cls(row_count, column_count, rows, columns, weights)
 
@@ -58,14 +63,14 @@ class StencilTable:
 
         shape = self.row_count, self.column_count
         is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
-        rows, columns = (each.astype(np.int32) if is_short else each for each in (self.rows, self.columns))
+        rows, columns = (each.astype(np.int32, copy=False) if is_short else each for each in (self.rows, self.columns))
         return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
 
     def chosen(self, rows: IntArray) -> StencilTable:
         """Stencils of some refined vertices, as a table of as many rows."""
         counts = np.bincount(self.rows, minlength=self.row_count)
         entries = np.argsort(self.rows, kind="stable")[ragged.ranges(ragged.offsets(counts)[rows], counts[rows])]
-        own = np.repeat(np.arange(len(rows)), counts[rows])
+        own = np.repeat(np.arange(len(rows), dtype=self.rows.dtype), counts[rows])
         return StencilTable(len(rows), self.column_count, own, self.columns[entries], self.weights[entries])
 
     def dense(self, rows: IntArray) -> FloatArray:

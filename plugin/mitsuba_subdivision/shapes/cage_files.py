@@ -14,7 +14,8 @@ import numpy as np
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
-from ..cage.errors import noting_warnings, warn
+from ..cage.errors import noting_warnings, warn, without_warnings
+from ..cage.source import CageSource
 from ..files.formats import FORMATS
 from ..mesh.shared import Shared
 
@@ -58,8 +59,15 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
     return _shared(key, lambda: ControlCage.from_file(path, **options))
 
 
-def cage_of_arrays(**arguments: Any) -> ControlCage:
+def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
     """`ControlCage.from_arrays`, returning the cage of a living shape if all arguments are equal.
+
+    Parameters
+    ----------
+    name : str or None
+        What messages call the cage. If there is one, the cage's warnings were given before, and are not repeated.
+    **arguments
+        Of `ControlCage.from_arrays`.
 
     Raises
     ------
@@ -69,9 +77,14 @@ def cage_of_arrays(**arguments: Any) -> ControlCage:
     Warns
     -----
     CageWarning
-        Likewise, for each shape.
+        Likewise, for each shape without a name.
     """
-    return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))
+    if name is None:
+        return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))
+    with without_warnings():
+        # Shapes of equal cages share one by different names: the first name is that of the cage.
+        key = "named", _digest(arguments)
+        return _shared(key, lambda: ControlCage.from_arrays(**arguments, source=CageSource(name)))
 
 
 def _digest(value: Any) -> Hashable:

@@ -41,7 +41,7 @@ class Parameters:
     surface : LimitSurface
         In object space.
     source : str
-        Name of the cage's file, or "control cage". Messages begin with it.
+        Name of the cage, of its file, or "control cage". Messages begin with it.
     to_world : (4, 4) float64
     tessellation : UniformTessellation or AdaptiveTessellation
     shading : "vertex", "exact" or "auto"
@@ -109,7 +109,9 @@ def read_parameters(props: mi.Properties) -> Parameters:
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
-    source = os.path.basename(str(props["filename"])) if "filename" in props else "control cage"
+    source = value_of(props, "cage_name") or cage.source.name
+    if "filename" in props:
+        source = os.path.basename(str(props["filename"]))
     surface = LimitSurface(cage, scheme)
     return Parameters(
         surface,
@@ -189,7 +191,7 @@ def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
 
     rules = {name: value_of(props, name) for name in RULES if name in props}
     strict = value_of(props, "strict")
-    arrays = [name for name in (*ARRAYS, *TAGS) if name in props]
+    arrays = [name for name in (*ARRAYS, *TAGS, "cage_name") if name in props]
     arrays += [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
     if "filename" in props:
         if arrays:
@@ -214,7 +216,9 @@ def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
         wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
         raise ValueError(f'no control cage: expected "filename", or {wanted}' + (" as well" if arrays else ""))
     parts = {name: _tensor(props, name, shape) for name, shape in {**ARRAYS, **TAGS}.items() if name in props}
-    return cage_of_arrays(**parts, strict=strict, **rules, **read_attributes(props, _tensor))
+    return cage_of_arrays(
+        value_of(props, "cage_name"), **parts, strict=strict, **rules, **read_attributes(props, _tensor)
+    )
 
 
 def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarray:

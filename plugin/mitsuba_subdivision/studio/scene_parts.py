@@ -95,7 +95,7 @@ class SceneParts:
         chosen = {} if suffix == ".obj" else {rule: v for rule, v in contents.rules.items() if v != RULES[rule][0]}
         contents = replace(contents, rules=contents.rules if suffix == ".obj" else {})
         beside = self._file(name, suffix, partial(write_file, contents))
-        others = (*_ARRAYS, *RULES)
+        others = (*_ARRAYS, "cage_name", *RULES)
         kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}
         return _with_name(beside, {**kept, **chosen})
 

@@ -15,9 +15,9 @@ from ..tessellation.memory import SMALL, available_memory
 # Measured at valences of 200 to 1,600 under all schemes, those below of 200 to 800; Doo-Sabin's rules are matrices
 # themselves.
 PAIR_BYTES = {"face": 65, "vertex": 300}
-# The same where every face has an eigenbasis of its own, for each of them: at the end of a crease, and on borders under
-# schemes without `has_local_borders`.
-OWN_BASIS_BYTES = 40
+# The same in all where every face has an eigenbasis of its own: at the end of a crease, and on borders under schemes
+# without `has_local_borders`. Measured: 3,300 to 4,300; more, as the time grows faster, to minutes from 500 faces on.
+OWN_BASES_BYTES = 6000
 # The same in all where edges or the vertex are semi-sharp, so that every face has stencils of its own.
 OWN_STENCIL_BYTES = 1500
 # Eigenbases that need more take minutes.
@@ -46,7 +46,7 @@ def require_moderate_valences(cage: ControlCage, scheme: Scheme) -> None:
         if optional_member(scheme, "has_local_borders"):
             is_near = is_border & (t.vertex_rules != VertexRule.DART) & ~is_semi_sharp
             face_count[is_near] = np.minimum(face_count[is_near], NEAR_FACES)
-        own_bytes = OWN_BASIS_BYTES * is_border * face_count + OWN_STENCIL_BYTES * is_semi_sharp
+        own_bytes = OWN_BASES_BYTES * is_border + OWN_STENCIL_BYTES * is_semi_sharp
     at_vertices = (pair + own_bytes) * (width * face_count) ** 2
     # The centre of a polygon becomes a vertex.
     at_faces = pair * (width * t.face_sizes.astype(np.float64)) ** 2

@@ -69,6 +69,7 @@ def _vertex_stencils(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[
     tile, parameters = grid.vertex_parameters()
     corner = grid.tiles.corner[tile]
     of_class, patch, uv = of_corner[corner], patch_of_corner[corner], parameters / UNIT
+    del tile, parameters, corner, of_corner, patch_of_corner
     order, is_new = _by_stencil(of_class, uv)
     found = order[is_new]
     own_uv, counts = np.ascontiguousarray(uv[:, found].T), np.bincount(of_class[found], minlength=len(classes))
@@ -109,5 +110,8 @@ def _by_stencil(of_class: IndexArray, uv: FloatArray) -> tuple[IntArray, NDArray
     keys = keys >> bits | of_class.astype(np.uint64) << (np.uint64(64) - bits)
     order = np.argsort(keys, kind="stable")
     is_new = np.ones(len(order), dtype=bool)
-    is_new[1:] = np.any([each[1:] != each[:-1] for each in (of_class[order], u[order], v[order])], axis=0)
+    is_new[1:] = False
+    for each in (of_class, u, v):
+        in_order = each[order]
+        is_new[1:] |= in_order[1:] != in_order[:-1]
     return order, is_new

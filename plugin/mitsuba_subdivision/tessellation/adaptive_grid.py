@@ -29,20 +29,17 @@ class AdaptiveGrid:
     frames : PatchFrames
     spans : Spans
         All sides of the tiles.
-    sample_triangles : (m, 3) int32
-        Samples of each triangle: those along the sides of all tiles come first, then those inside tiles.
-    tile : (m,) int32
-        Of each triangle, in ascending order.
     topology : Topology
         Of the elements; its edges and vertices identify the tessellation's vertices.
+    keeps_corner : (t, m) bool or None
+        As for `stitched`.
     """
 
     tiles: Tiles
     frames: PatchFrames
     spans: Spans
-    sample_triangles: IndexArray
-    tile: IndexArray
     topology: Topology
+    keeps_corner: NDArray[np.bool_] | None
 
     @classmethod
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
@@ -57,12 +54,11 @@ class AdaptiveGrid:
             has_more |= keeps.any(axis=1)
         if has_more.any():
             # Enough segments that no inner edge joins two points of the sides.
-            least = np.where(has_more, 3 if m == 3 else 2, 1)
+            least = np.where(has_more, 3 if m == 3 else 2, 1).astype(np.int32)
             tiles = replace(tiles, rates=np.maximum(tiles.rates, least[:, None]))
         else:
             keeps = None
-        spans = cut_into_spans(tiles, frames)
-        return cls(tiles, frames, spans, *_stitched(spans, keeps), t)
+        return cls(tiles, frames, cut_into_spans(tiles, frames), t, keeps)
 
     def cut(self, topology: Topology) -> AdaptiveGrid:
         """See `Grid.cut`."""
@@ -105,31 +101,68 @@ class AdaptiveGrid:
         pairs = np.stack([np.append(np.arange(len(first_point)), inside[0]), np.append(first_point, inside[1])])
         return pairs[:, pairs[0] != pairs[1]]
 
-    def _side_vertices(self) -> IndexArray:
-        """Vertices of the samples along the sides of all tiles."""
-        rate, numbers = self.spans.rate, self._numbers
-        found = np.repeat(numbers.point, rate)
-        long = np.flatnonzero(rate > 1)
-        inside = rate[long] - 1
-        first = numbers.first_inside[numbers.span[long]] + np.where(self.spans.is_backward[long], inside - 1, 0)
-        step = np.where(self.spans.is_backward[long], -1, 1)
-        found[ragged.ranges(ragged.starts(rate)[long] + 1, inside)] = np.repeat(first, inside) + (
-            np.repeat(step, inside) * ragged.index_in_row(inside)
-        )
-        return found
-
     def _sample_vertices(self) -> IndexArray:
         """Vertices of all samples, those along sides and then those inside tiles."""
-        inside = np.arange(self._numbers.vertex_count, self.vertex_count, dtype=np.int32)
-        return np.concatenate([self._side_vertices(), inside])
+        spans, numbers = self.spans, self._numbers
+        inside = np.arange(numbers.vertex_count, self.vertex_count, dtype=np.int32)
+        found, begin = np.empty(int(spans.rate.sum(dtype=np.int64)) + len(inside), dtype=np.int32), 0
+        for block in chunks_of(len(spans.rate)):
+            rate = spans.rate[block]
+            step, span = ragged.index_in_row(rate), block.start + np.repeat(np.arange(len(rate)), rate)
+            own = slice(begin, begin + len(step))
+            along = numbers.first_inside[numbers.span[span]] + np.where(
+                spans.is_backward[span], spans.rate[span] - 1 - step, step - 1
+            )
+            found[own] = np.where(step == 0, numbers.point[span], along)
+            begin += len(step)
+        found[begin:] = inside
+        return found
 
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
-        return self._sample_vertices().astype(np.uint32)[self.sample_triangles]
+        found, vertices = self._sample_triangles(), self._sample_vertices()
+        for block in chunks_of(len(found)):
+            found[block] = vertices[found[block]]
+        return found.view(np.uint32)
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` element of each triangle."""
-        return self.frames.topology.face_of(self.tiles.corner)[self.tile].astype(np.uint32)
+        return self.frames.topology.face_of(self.tiles.corner)[self._tile()].astype(np.uint32)
+
+    def _triangle_counts(self) -> IntArray:
+        """``(t,)`` triangles of each tile, by Euler's formula."""
+        begins = np.arange(0, len(self.tiles) * self._corner_count, self._corner_count, dtype=np.int32)
+        along_sides = np.add.reduceat(self.spans.rate, np.searchsorted(self.spans.side, begins), dtype=np.int32)
+        found: IntArray = along_sides + 2 * self._inner_counts - 2
+        return found
+
+    def _tile(self) -> IndexArray:
+        """``(n,)`` tile of each triangle, in ascending order."""
+        return np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._triangle_counts())
+
+    def _sample_triangles(self) -> IndexArray:
+        """``(n, 3)`` samples of each triangle: those along the sides of all tiles come first, then those inside tiles.
+
+        Made at each call: few ask for them more than once, and they would take memory as long as the grid lives.
+        """
+        spans, m = self.spans, self._corner_count
+        inner_begin, begin = ragged.offsets(self._inner_counts), ragged.offsets(self._triangle_counts())
+        found = np.empty((int(begin[-1]), 3), dtype=np.int32)
+        side_count, side_begin = int(spans.rate.sum(dtype=np.int64)), 0
+        for own in chunks_of(len(self.tiles)):
+            of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
+            span, along = spans.samples(of_tiles)
+            counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))
+            sides = SideSamples(ragged.offsets(counts), spans.first[span] + along * spans.part[span], m)
+            keeps = None if self.keeps_corner is None else self.keeps_corner[own]
+            triangles = stitched(self.tiles.rates[own], sides, keeps)
+            is_inner = triangles >= len(span)
+            triangles += np.where(is_inner, side_count - len(span) + inner_begin[own.start], side_begin).astype(
+                np.int32
+            )
+            found[begin[own.start] : begin[own.stop]] = triangles
+            side_begin += len(span)
+        return found
 
     def _inner_parameters(self) -> tuple[IndexArray, FloatArray]:
         """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in units of 1 / `UNIT`."""
@@ -156,6 +189,7 @@ class AdaptiveGrid:
         span = np.repeat(numbers.of_span, inside)
         step = ragged.index_in_row(inside) + 1
         along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
+        del inside, step
         along = np.concatenate([np.zeros(len(numbers.of_point)), along])
         of_lines = np.concatenate([numbers.of_point, span])
         tile, parameters = self._inner_parameters()
@@ -197,12 +231,12 @@ class AdaptiveGrid:
         uv : (m, 3, 2) float64
             Parameters in the element, seen from there.
         """
-        tile = self.tile
+        tile, triangles = self._tile(), self._sample_triangles()
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
         span, along = self.spans.samples()
         samples = np.concatenate([self.spans.along(span, along), self._inner_parameters()[1]], axis=1)
-        uv = [self._seen(tile, turn, samples[:, self.sample_triangles[:, i]]) for i in range(3)]
+        uv = [self._seen(tile, turn, samples[:, triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
     def locations(self) -> tuple[IntArray, FloatArray]:
@@ -210,29 +244,3 @@ class AdaptiveGrid:
         tile, parameters = self.vertex_parameters()
         turn, corner = self._nearest_corner(tile, parameters)
         return corner.astype(np.int64), self._seen(tile, turn, parameters)
-
-
-def _stitched(spans: Spans, keeps_corner: NDArray[np.bool_] | None) -> tuple[IndexArray, IndexArray]:
-    """`AdaptiveGrid.sample_triangles` and `AdaptiveGrid.tile`.
-
-    Parameters
-    ----------
-    keeps_corner : (t, m) bool or None
-        As for `stitched`.
-    """
-    tiles, m = spans.tiles, spans.frames.domain.corner_count
-    inner_begin = ragged.offsets(inner_counts(tiles.rates, m))
-    side_count, side_begin, found = int(spans.rate.sum(dtype=np.int64)), 0, []
-    for own in chunks_of(len(tiles)):
-        of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
-        span, along = spans.samples(of_tiles)
-        counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))
-        sides = SideSamples(ragged.offsets(counts), spans.first[span] + along * spans.part[span], m)
-        keeps = None if keeps_corner is None else keeps_corner[own]
-        triangles, tile = stitched(tiles.rates[own], sides, keeps)
-        is_inner = triangles >= len(span)
-        triangles += np.where(is_inner, side_count - len(span) + inner_begin[own.start], side_begin).astype(np.int32)
-        found.append((triangles, tile + own.start))
-        side_begin += len(span)
-    triangles, tile = map(np.concatenate, zip(*found, strict=True))
-    return triangles, tile

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.chunks import chunks_of
+from ..mesh.chunks import chunks_of, gathered
 from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
@@ -40,9 +40,8 @@ def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
     """
     order, in_order = _sorted(keys)
     begins = _begins(in_order)
-    number = np.empty(len(order), dtype=np.int32)
-    number[order] = np.cumsum(begins, dtype=np.int32) - 1
-    return number, order[begins]
+    del in_order
+    return _numbers(order, begins), order[begins]
 
 
 def joined(high: IntArray, low: IntArray, bits: int) -> IntArray:
@@ -64,7 +63,7 @@ def joined(high: IntArray, low: IntArray, bits: int) -> IntArray:
 def _sorted(keys: IntArray) -> tuple[IndexArray, IntArray]:
     """Stable sorting permutation of integers, and the sorted integers."""
     order = np.argsort(keys, kind="stable").astype(np.int32)
-    return order, keys[order]
+    return order, gathered(keys, order)
 
 
 def _begins(in_order: IntArray) -> NDArray[np.bool_]:
@@ -72,6 +71,16 @@ def _begins(in_order: IntArray) -> NDArray[np.bool_]:
     begins = np.ones(len(in_order), dtype=bool)
     np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
     return begins
+
+
+def _numbers(order: IndexArray, begins: NDArray[np.bool_]) -> IndexArray:
+    """Numbers of integers whose sorting permutation is `order`, and which of them, sorted, are new."""
+    in_order = np.cumsum(begins, dtype=np.int32)
+    in_order -= 1
+    number = np.empty(len(order), dtype=np.int32)
+    for chunk in chunks_of(len(order)):
+        number[order[chunk]] = in_order[chunk]
+    return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +94,10 @@ class Spans:
         Of the tiles' patches.
     side : (s,) int32
         ``m`` times the tile, plus the corner at which its side begins.
-    rate : (s,) int32
+    rate : (s,) int16
         Segments.
-    first, part : (s,) float32
+    first : (s,) float32
+    part : (s,) float16
         Beginning and length of each span, as fractions of the side: exact, as these are dyadic.
     is_backward : (s,) bool
         Whether the numbers of the vertices inside fall along the side.
@@ -98,9 +108,9 @@ class Spans:
     tiles: Tiles
     frames: PatchFrames
     side: IndexArray
-    rate: IndexArray
+    rate: NDArray[np.int16]
     first: NDArray[np.float32]
-    part: NDArray[np.float32]
+    part: NDArray[np.float16]
     is_backward: NDArray[np.bool_]
     at: IndexArray
 
@@ -112,10 +122,15 @@ class Spans:
 
     def along(self, span: IntArray, part: FloatArray) -> FloatArray:
         """``(2, n)`` parameters, in their patches, of points at given fractions of spans."""
-        side, m = self.side[span], self.frames.domain.corner_count
-        begin = self._corners(side)
-        way = (self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin).astype(np.float64)
-        return (self.first[span] + part * self.part[span]) * way + begin
+        m = self.frames.domain.corner_count
+        found = np.empty((2, len(span)))
+        for block in chunks_of(len(span)):
+            own = span[block]
+            side = self.side[own]
+            begin = self._corners(side)
+            way = self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin
+            found[:, block] = (self.first[own] + part[block] * self.part[own]) * way + begin
+        return found
 
     def _corners(self, side: IntArray) -> IndexArray:
         """``(2, n)`` parameters at which sides begin."""
@@ -149,7 +164,9 @@ class Spans:
         vertex_count, count = int(frames.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
         depth = int(self.tiles.depth.max(initial=0))
-        names, positions = (np.empty(len(self.side), dtype=np.int64) for _ in range(2))
+        bits = 2 * depth + 3
+        names = np.empty(len(self.side), dtype=np.int64)
+        positions: IntArray = np.empty(len(self.side), dtype=np.int32 if bits < 32 else np.int64)
         for block, (x, y), borders in self._blocks():
             name = at_centre + t.face_count + self._corner(block).astype(np.int64)
             for border in borders:
@@ -168,7 +185,7 @@ class Spans:
             name[on], x[on], y[on] = frames.vertex[edge], 0, 0
             names[block] = name
             positions[block] = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
-        keys = joined(names, positions, 2 * depth + 3)
+        keys = joined(names, positions, bits)
         del names, positions
         return ranked(keys)
 
@@ -205,7 +222,8 @@ class Spans:
             of_spans = np.where(half_edge >= 0, edge[half_edge], 0)
             point, of_point = ranked(joined(point, of_points, 32))
             span, of_span = ranked(joined(span, of_spans, 32))
-        first_inside = ragged.offsets(self.rate[of_span] - 1) + len(of_point)
+        first_inside = ragged.offsets(self.rate[of_span] - 1, np.int32)
+        first_inside += len(of_point)
         return SpanVertices(point, span, first_inside[:-1], of_point, of_span, int(first_inside[-1]))
 
 
@@ -219,7 +237,7 @@ class SpanVertices:
         The vertex where each span begins.
     span : (s,) int32
         0-based number shared by all equal spans.
-    first_inside : (k,) int64
+    first_inside : (k,) int32
         The vertex with the least number inside each of these.
     of_point : (p,) int32
         The first span that begins at each vertex.
@@ -230,7 +248,7 @@ class SpanVertices:
 
     point: IndexArray
     span: IndexArray
-    first_inside: IntArray
+    first_inside: IndexArray
     of_point: IndexArray
     of_span: IndexArray
     vertex_count: int
@@ -240,54 +258,62 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     """Cut the sides of tiles where others on the same lines end."""
     m = frames.domain.corner_count
     shift = DEEPEST - int(tiles.depth.max(initial=0))
-    bits = DEEPEST + 1 - shift + HALVINGS
-    found = []
-    for block in chunks_of(len(tiles)):
-        sides = side_lines(tiles[block], frames)
-        # Of those that begin at the same place, the longest first.
-        found.append((sides.line, sides.low >> shift << HALVINGS | sides.halvings, sides.is_backward))
-    line, low = (np.concatenate([each[column] for each in found]) for column in (0, 1))
-    is_backward: NDArray[np.bool_] = np.concatenate([each[2] for each in found])
-    del found
-    keys = joined(line, low, bits)
-    del line, low
+    keys, is_backward = _side_keys(tiles, frames, shift)
     order, keys = _sorted(keys)
     begins = _begins(keys)
-    first, keys = np.flatnonzero(begins), keys[begins]
-    group = np.empty(len(order), dtype=np.int32)
-    group[order] = np.cumsum(begins, dtype=np.int32) - 1
-    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int32).ravel()
-    rate = np.maximum.reduceat(wanted[order], first)
+    keys, group = keys[begins], _numbers(order, begins)
+    wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int16).ravel()
+    rate = np.maximum.reduceat(gathered(wanted, order), np.flatnonzero(begins))
     del order, begins, wanted
     # Positions along all lines, one line after the other.
-    begin, size = keys >> HALVINGS, (EDGE >> shift) >> (keys & ((1 << HALVINGS) - 1))
-    is_span = np.ones(len(first), dtype=bool)
+    begin, size = keys >> HALVINGS, (EDGE >> shift) >> (keys & ((1 << HALVINGS) - 1)).astype(np.int32)
+    del keys
+    is_span = np.ones(len(begin), dtype=bool)
     np.less_equal(begin[:-1] + size[:-1], begin[1:], out=is_span[:-1])
     # The spans of each group: itself, or all of those that follow up to its end.
-    before = np.cumsum(is_span) - is_span
-    count = np.ones(len(first), dtype=np.int64)
+    offsets: IntArray = ragged.offsets(is_span, np.int32)
+    before = offsets[:-1]
+    count = np.ones(len(begin), dtype=np.int32)
     cut = np.flatnonzero(~is_span)
     ends = np.searchsorted(begin, begin[cut] + size[cut])
-    count[cut] = np.append(before, np.count_nonzero(is_span))[ends] - before[cut]
+    count[cut] = offsets[ends] - before[cut]
     spans, of_span = ragged.ranges(before[cut], count[cut]), np.repeat(cut, count[cut])
-    span_rate, span_size = rate[is_span], size[is_span]
+    span_rate, span_size, span_begin = rate[is_span], size[is_span], begin[is_span]
     # Lengths are powers of two: a side that is cut has its rate in parts of it, too.
     np.maximum.at(span_rate, spans, -(-rate[of_span].astype(np.int64) * span_size[spans] // size[of_span]))
+    counts = gathered(count, group)
+    del rate, is_span, count
 
-    counts = count[group]
     side = np.repeat(np.arange(len(group), dtype=np.int32), counts)
-    at = before.astype(np.int32)[group][side]
-    from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float32)
-    held = np.flatnonzero(counts > 1)
-    rows, of_side = ragged.ranges(ragged.starts(counts)[held], counts[held]), np.repeat(held, counts[held])
-    place = ragged.index_in_row(counts[held])
+    at = np.repeat(gathered(before, group), counts)
+    from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float16)
+    is_held = counts > 1
+    rows = np.flatnonzero(gathered(is_held, side))
+    of_side, place = side[rows], ragged.index_in_row(counts[is_held])
     backward = is_backward[of_side]
     at[rows] += np.where(backward, counts[of_side] - 1 - place, place).astype(np.int32)
     own = group[of_side]
     part[rows] = span_size[at[rows]] / size[own]
-    passed = (begin[is_span][at[rows]] - begin[own]) / size[own]
-    from_side[rows] = np.where(backward, 1 - part[rows] - passed, passed)
-    return Spans(tiles, frames, side, span_rate[at], from_side, part, is_backward[side], at)
+    passed = (span_begin[at[rows]] - begin[own]) / size[own]
+    from_side[rows] = np.where(backward, 1 - part[rows].astype(np.float64) - passed, passed)
+    del group, begin, size, before, counts
+    return Spans(tiles, frames, side, gathered(span_rate, at), from_side, part, gathered(is_backward, side), at)
+
+
+def _side_keys(tiles: Tiles, frames: PatchFrames, shift: int) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Integers in the order of all sides along all lines, and whether these lead backwards.
+
+    Of sides that begin at the same place, the longest come first.
+    """
+    count = frames.domain.corner_count * len(tiles)
+    line, low = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int32)
+    is_backward = np.empty(count, dtype=bool)
+    for block in chunks_of(len(tiles)):
+        sides = side_lines(tiles[block], frames)
+        own = slice(frames.domain.corner_count * block.start, frames.domain.corner_count * block.stop)
+        line[own], low[own] = sides.line, sides.low >> shift << HALVINGS | sides.halvings
+        is_backward[own] = sides.is_backward
+    return joined(line, low, DEEPEST + 1 - shift + HALVINGS), is_backward
 
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:

@@ -85,9 +85,7 @@ def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
     return np.stack([at - (v * width - v * (v - 1) // 2) + 1, v + 1], axis=1)
 
 
-def stitched(
-    rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_] | None = None
-) -> tuple[IndexArray, IndexArray]:
+def stitched(rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_] | None = None) -> IndexArray:
     """Join the samples of tiles by triangles.
 
     Parameters
@@ -99,10 +97,9 @@ def stitched(
 
     Returns
     -------
-    triangles : (n, 3) int32
-        Samples: those along the sides of all tiles, then those inside, tile by tile.
-    tile : (n,) int32
-        In ascending order.
+    (n, 3) int32
+        Tile by tile, the samples of each triangle: those along the sides of all tiles are numbered first, then those
+        inside.
     """
     is_inner = has_inner(rates, sides.corner_count)
     is_plain = np.diff(sides.side_start[:: sides.corner_count]) == sides.corner_count
@@ -114,8 +111,7 @@ def stitched(
     ]
     found += _inner(rates, np.flatnonzero(is_inner), first_inner, sides.corner_count)
     triangles, tile = (np.concatenate(each, dtype=np.int32) for each in zip(*found, strict=True))
-    order = np.argsort(tile, kind="stable")
-    return triangles.take(order, axis=0), tile[order]
+    return triangles.take(np.argsort(tile, kind="stable"), axis=0)
 
 
 def _plain(sides: SideSamples, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:

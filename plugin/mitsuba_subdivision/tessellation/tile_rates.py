@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .cones import NormalCone, TangentCone, cross, dot
@@ -172,7 +172,7 @@ class TileRates:
             return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
         return np.stack([a, b, c])[None]
 
-    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> IntArray:
+    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> NDArray[np.int16]:
         """`Tiles.sides`: as many segments as keep curves along feature edges to the limit."""
         sides = np.zeros_like(tiles.sides)
         _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0].astype(np.float64)
@@ -218,19 +218,19 @@ class TileRates:
             found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
         return found
 
-    def _rates(self, forms: FloatArray, tiles: Tiles) -> IntArray:
+    def _rates(self, forms: FloatArray, tiles: Tiles) -> IndexArray:
         """``(t, 2)`` segments along u and v for forms ``(f, 3, t)`` that are to be one at most."""
         if self.domain.corner_count == 3:
-            found: IntArray = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
+            found = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
         else:
             found = least_product(forms)
-        return np.minimum(found, tiles.most[:, None])
+        return np.minimum(found, tiles.most[:, None]).astype(np.int32)
 
     def _without_pairs(self, tiles: Tiles) -> Tiles:
         """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
         is_pair = (tiles.rates[:, 0] == 2) & (self.domain.corner_count == 3)
         children = [tiles[is_pair].child(number, self.domain) for number in range(4)]
-        ones = np.ones((int(is_pair.sum()), 2), dtype=np.int64)
+        ones = np.ones((int(is_pair.sum()), 2), dtype=np.int32)
         return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
 
     def cost(self, tiles: Tiles) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import ParameterDomain
 
 # Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
@@ -24,28 +24,28 @@ class Tiles:
     ----------
     corner : (t,) int32
         Corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`.
-    depth : (t,) int64
-    origin : (t, 2) int64
+    depth : (t,) int32
+    origin : (t, 2) int32
         Where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``.
     is_flipped : (t,) bool
         Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
         at ``origin + 1``.
-    most : (t,) int64
+    most : (t,) int32
         The highest rate that a tile may have.
-    rates : (t, 2) int64
+    rates : (t, 2) int32
         Segments along u and v; over triangles both are the same.
-    sides : (t, m) int64
+    sides : (t, m) int16
         Least segments on each side: more than the rates where an outline may run along a border of the mesh, which the
         boundary of the cage and the sides of creases are. 0 inside.
     """
 
-    corner: IntArray
-    depth: IntArray
-    origin: IntArray
+    corner: IndexArray
+    depth: IndexArray
+    origin: IndexArray
     is_flipped: NDArray[np.bool_]
-    most: IntArray
-    rates: IntArray
-    sides: IntArray
+    most: IndexArray
+    rates: IndexArray
+    sides: NDArray[np.int16]
 
     def __len__(self) -> int:
         return len(self.corner)
@@ -67,7 +67,8 @@ class Tiles:
         is_middle = domain.corner_count == 3 and number == 3
         # Where the copy begins, in units of half a tile, from the tile's corner (0, 0).
         step = np.array(
-            [(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)]
+            [(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)],
+            dtype=np.int32,
         )
         step = np.where(self.is_flipped[:, None], 1 - step[number], step[number])
         # A copy at a corner shares the sides that meet there.
@@ -89,10 +90,10 @@ class Tiles:
         count = len(corners)
         return cls(
             np.asarray(corners, dtype=np.int32),
-            np.zeros(count, dtype=np.int64),
-            np.zeros((count, 2), dtype=np.int64),
+            np.zeros(count, dtype=np.int32),
+            np.zeros((count, 2), dtype=np.int32),
             np.zeros(count, dtype=bool),
-            np.full(count, most),
-            np.ones((count, 2), dtype=np.int64),
-            is_border.astype(np.int64),
+            np.full(count, most, dtype=np.int32),
+            np.ones((count, 2), dtype=np.int32),
+            is_border.astype(np.int16),
         )

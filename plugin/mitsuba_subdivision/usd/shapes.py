@@ -56,6 +56,7 @@ def subdivision(
     return {
         "type": "subdivision",
         **surfaces.properties(shape.cage),
+        "cage_name": shape.cage.source.name,
         **({} if shown is None else {"shown_faces": tensor(shown.astype(np.uint32))}),
         **parameters,
         "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
