@@ -10,6 +10,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd import materialx_layers, stage_meshes
+from mitsuba_subdivision.usd.stage_walk import read_stage
 from mitsuba_subdivision.usd.texture_image import read_texture_image
 from scipy.spatial import cKDTree
 
@@ -280,6 +281,25 @@ def test_subsets_share_the_surface_of_the_whole_mesh(stage, monkeypatch, most_fa
     assert sum(part.face_count() for part in parts) == whole.face_count()
     assert [part.face_count() for part in parts] == [whole.face_count() * 4 // 6, whole.face_count() * 2 // 6]
     assert ["Principled" in str(part.bsdf()) for part in parts] == [False, True]
+
+
+def test_a_mesh_of_several_materials_is_read_once_for_the_primvars_they_need(stage):
+    subsets = "".join(
+        f"""def GeomSubset "part_{k}" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {{
+        uniform token elementType = "face"
+        uniform token familyName = "materialBind"
+        int[] indices = [{k}]
+        rel material:binding = </paint_{k}>
+    }}\n"""
+        for k in range(2)
+    )
+    colors = (material(f"color3f inputs:diffuseColor = (1, {k}, 0)") for k in range(2))
+    paints = "".join(each.replace("paint", f"paint_{k}") for k, each in enumerate(colors))
+    shapes = read_stage(stage(paints + mesh("cube", f"{CUBE}{subsets}"))).shapes
+    plain, *painted = shapes
+    assert painted[0].cage is painted[1].cage
+    assert plain.cage is not painted[0].cage
+    assert [each.shown_faces.tolist() for each in shapes] == [[2, 3, 4, 5], [0], [1]]
 
 
 def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(stage):

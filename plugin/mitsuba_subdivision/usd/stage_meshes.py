@@ -93,11 +93,15 @@ class ShapeReader:
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
         materials, owner = self._materials_of_faces(mesh, reader)
         shapes = []
+        # Parts whose materials need the same primvars share their arrays.
+        cages: dict[PrimvarChoice, CageContents] = {}
         for number, material in enumerate(materials):
             if not (owner == number).any():
                 continue
             choice = self._choice(material)
-            cage = reader.contents(is_local=True, choice=choice)
+            if choice not in cages:
+                cages[choice] = reader.contents(is_local=True, choice=choice)
+            cage = cages[choice]
             if cage.texcoords is not None and not all(map(UsdGeom.PrimvarsAPI(prim).HasPrimvar, choice.texcoords)):
                 self._notes.add(
                     f"texture coordinates {choice.texcoords[0]} are missing; others are used", prim.GetPath()
