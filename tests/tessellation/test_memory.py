@@ -4,12 +4,14 @@ import os
 import re
 import subprocess
 import sys
+import tracemalloc
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.tessellation import Criterion, Measure
 from mitsuba_subdivision.tessellation.memory import available_memory
 
 MEGABYTE = 1 << 20
@@ -133,3 +135,28 @@ def test_a_rate_of_a_wrong_type_is_an_error():
 
 def test_a_tessellation_is_shown_by_its_sizes():
     assert repr(LimitSurface(named_cages.cube()).tessellate(2)) == "Tessellation(26 vertices, 48 triangles)"
+
+
+def test_adaptive_triangles_take_at_most_twice_the_memory_of_as_many_uniform_ones():
+    """At the peak, from a cage to points, normals and triangles."""
+    quads = named_cages.torus(100, 80)
+    faces = quads.face_vertices.reshape(-1, 4)
+    cage = ControlCage(quads.positions, np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]))
+
+    def measured(make):
+        tracemalloc.start()
+        try:
+            before = tracemalloc.get_traced_memory()[0]
+            table = make(LimitSurface(cage))
+            count = len(table.triangles)
+            table.apply(cage.positions)
+            return tracemalloc.get_traced_memory()[1] - before, count
+        finally:
+            tracemalloc.stop()
+
+    makers = (lambda s: s.sampling(2), lambda s: s.adaptive_sampling(Criterion(Measure.CHORD, 100.0)))
+    # Twice, as what surfaces share stays in memory.
+    for _ in range(2):
+        (uniform, count), (adaptive, adaptive_count) = map(measured, makers)
+    assert adaptive_count == count
+    assert adaptive <= 2 * uniform
