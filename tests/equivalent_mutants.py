@@ -85,7 +85,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     ),
     (
         "the same element, or another of the same value: all half-edges of a fan begin at its vertex, all channels have"
-        " as many pixels, a fan that begins at half-edge 0 is found either way, closed meshes have no valence of one",
+        " as many pixels, a fan that begins at half-edge 0 is found either way, closed meshes have no valence of one,"
+        " maps of coefficients are square",
         (
             (
                 "images/paired_tier.py",
@@ -112,6 +113,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 ' f"valence {least} or more")',
                 'return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[ -1]]}",'
                 ' f"valence {least} or more")',
+            ),
+            (
+                "tessellation/tile_rates.py",
+                "size, length = maps.shape[-1], max(1, PARTS_AT_ONCE // maps.shape[2])",
+                "size, length = maps.shape[+1], max(1, PARTS_AT_ONCE // maps.shape[2])",
             ),
         ),
     ),
