@@ -137,7 +137,7 @@ def test_a_tessellation_is_shown_by_its_sizes():
     assert repr(LimitSurface(named_cages.cube()).tessellate(2)) == "Tessellation(26 vertices, 48 triangles)"
 
 
-def test_adaptive_triangles_take_at_most_twice_the_memory_of_as_many_uniform_ones():
+def test_the_coarsest_triangles_of_a_dense_cage_take_at_most_twice_the_memory_of_uniform_ones():
     """At the peak, from a cage to points, normals and triangles."""
     quads = named_cages.torus(100, 80)
     faces = quads.face_vertices.reshape(-1, 4)
