@@ -151,6 +151,24 @@ def two_triangles():
     return ControlCage([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [2, 1, 0]])
 
 
+def with_a_diagonal_on_the_border():
+    """A face of which two opposite vertices are the ends of an edge on the border."""
+    points = [(0, 0, 1), (1, 0, 0), (0, 0, -1), (0, 1, 0), (-1, 0.3, -1), (-1, 1, 0), (-1, 0.3, 1)]
+    return ControlCage(points, [[1, 2, 3, 0], [3, 2, 4, 5], [0, 3, 5, 6], [4, 2, 0, 6], [5, 4, 6]])
+
+
+def test_an_edge_on_the_border_meets_a_diagonal():
+    cage = with_a_diagonal_on_the_border()
+    surface = LimitSurface(cage)
+    table = table_of(surface, 100, 1)
+    edges = directed_edges(table.triangles)
+    keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
+    assert len(np.unique(keys)) == len(keys)
+    # All edges have two triangles, but for the three that the border has at least.
+    assert 3 <= len(np.setdiff1d(keys, twins))
+    assert_elements_are_covered(surface, table)
+
+
 @pytest.mark.parametrize(("cage", "scheme"), [(with_a_diagonal_twice(), "catmull_clark"), (two_triangles(), "loop")])
 def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme):
     """The diagonals of two patches would be one edge, with four triangles; so would cuts across their corners."""
