@@ -142,18 +142,18 @@ PARAMETERS = (
         "Mitsuba's other shapes. Give either ``filename``, or ``positions``, ``face_sizes`` and ``face_vertices``",
     ),
     Parameter("positions", "tensor", "Control cage in memory: vertices, ``(n, 3)``"),
+    Parameter("face_sizes", "tensor", "Number of vertices of each face, integers"),
+    Parameter(
+        "face_vertices",
+        "tensor",
+        "Vertices of all faces, one face after the other, counter-clockwise seen from outside; 0-based integers",
+    ),
     Parameter(
         "cage_name",
         "string",
         "Name of a cage in memory, for messages. Warnings about the cage are taken as given, as `usd_scene` gives them "
         "by the same name, and are not repeated",
         default_text="``control cage``, with warnings",
-    ),
-    Parameter("face_sizes", "tensor", "Number of vertices of each face, integers"),
-    Parameter(
-        "face_vertices",
-        "tensor",
-        "Vertices of all faces, one face after the other, counter-clockwise seen from outside; 0-based integers",
     ),
     Parameter(
         "creases",
