@@ -65,7 +65,8 @@ def test_a_missing_library_leaves_one_shape(file):
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_pictures_are_upright(tmp_path):
     # White at the top left, where u is small and v large.
-    mi.util.write_bitmap(str(tmp_path / "a b.png"), mi.TensorXf(np.array([[1.0, 0.0], [0.0, 0.0]])[..., None]))
+    white = mi.TensorXf(np.array([[1.0, 0.0], [0.0, 0.0]])[..., None])
+    mi.util.write_bitmap(str(tmp_path / "a b.png"), white, write_async=False)
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n")
     (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd .\\a b.png\n")
     picture = material_bsdf(read_materials(tmp_path / "a.obj")["a"], "a")["bsdf"]["base_color"]
