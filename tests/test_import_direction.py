@@ -113,7 +113,7 @@ MAY_IMPORT = {
         "doctor",
         "commands",
     },
-    "drjit": {"llvm", "kernels", "shapes", "fit", "regression", "figures", "doctor", "commands"},
+    "drjit": {"llvm", "variants", "kernels", "shapes", "fit", "regression", "figures", "doctor", "commands"},
     "matplotlib": {"figures"},
     "plyfile": {"files"},
     "pxr": {"files", "usd"},

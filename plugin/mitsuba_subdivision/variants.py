@@ -12,6 +12,8 @@ from typing import Any, TypeAlias
 Variant: TypeAlias = Any
 # A scene or an entry of one, as `mi.load_dict` takes it.
 SceneNode = dict[str, Any]
+# Threads with which Mitsuba reads and writes OpenEXR files: one that waits, and one that works.
+OPENEXR_THREADS = 2
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
 
 
@@ -34,6 +36,19 @@ def variant_module(mi: ModuleType | str) -> ModuleType:
     if name not in mitsuba.variants():
         raise ValueError(f'unknown variant "{name}"; expected one of {", ".join(mitsuba.variants())}')
     return getattr(mitsuba, name)
+
+
+def set_variant(name: str) -> None:
+    """Set a variant of Mitsuba in a process of this package, such as a command.
+
+    On a machine with one core, Dr.Jit starts a thread more: without one, Mitsuba 3.9 waits for ever when it reads or
+    writes OpenEXR files.
+    """
+    import drjit as dr
+    import mitsuba
+
+    mitsuba.set_variant(name)
+    dr.set_thread_count(max(dr.thread_count(), OPENEXR_THREADS))
 
 
 @contextmanager

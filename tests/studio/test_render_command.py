@@ -1,5 +1,7 @@
 """The command ``render``: models, frames, options of Mitsuba's own program, and errors."""
 
+import os
+import subprocess
 import sys
 import warnings
 
@@ -74,6 +76,30 @@ def test_options_of_mitsubas_own_program(folder):
     assert (dr.thread_count(), mi.log_level(), [str(p) for p in mi.file_resolver()]) == (threads, level, paths)
     assert render("two.xml", "-o", "b.exr", "-m", "scalar_rgb", "--spp", "1") == 0
     assert pixels("b.exr").shape[:2] == (8, 8)
+
+
+ENVIRONMENT = """
+<scene version="3.0.0">
+    <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
+    <sensor type="perspective">
+        <film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>
+    </sensor>
+    <integrator type="path"/>
+</scene>
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a process cannot be kept to one core here")
+@pytest.mark.parametrize("options", [[], ["--passes", "2"]], ids=["picture", "passes"])
+def test_one_core_reads_and_writes_openexr(folder, options):
+    mi.Bitmap(np.full((16, 32, 3), 0.5, np.float32)).write(str(folder / "sky.exr"))
+    (folder / "sky.xml").write_text(ENVIRONMENT)
+    command = ["render", "sky.xml", "-o", "a.exr", "-m", "scalar_rgb", "--spp", "2", "-t", "1", *options]
+    core = min(os.sched_getaffinity(0))
+    run = f"import os; os.sched_setaffinity(0, {{{core}}}); from mitsuba_subdivision.__main__ import main; raise SystemExit(main())"
+    # Where all wait for a thread that there is not, they wait for ever.
+    subprocess.run([sys.executable, "-c", run, *command], check=True, capture_output=True, timeout=60)
+    np.testing.assert_allclose(pixels("a.exr")[..., :3], 0.5, rtol=1e-3)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

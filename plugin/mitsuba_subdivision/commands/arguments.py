@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
+from .. import variants
 from ..llvm import best_variant
 from ..schemes import SCHEME_CLASSES
 from ..shapes.parameter_table import HIGHEST_RATE
@@ -29,15 +30,13 @@ def set_variant(name: str | None) -> None:
     RegressionError
         If the variant cannot run here.
     """
-    import mitsuba as mi
-
     from ..regression import RegressionError
     from ..regression.environment import variant_problem
 
     problem = variant_problem(name) if name else None
     if problem:
         raise RegressionError(problem)
-    mi.set_variant(name or best_variant())
+    variants.set_variant(name or best_variant())
 
 
 def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:

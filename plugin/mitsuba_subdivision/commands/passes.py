@@ -11,6 +11,7 @@ from ..images.tolerances import Tolerances
 from ..messages import print_result
 from ..whole_file import require_writable
 from .arguments import positive
+from .pictures import threads
 
 if TYPE_CHECKING:
     from ..regression.scene import LoadedScene
@@ -128,13 +129,14 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
         batch = sampler(batch)["sample_count"]
     sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
     settings = {"with_probe": options.reference}
-    if options.dask:
-        variant = str(mi.variant())
-        image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
-    elif options.share:
-        image = render_pass(loaded, sampling, number, count, **settings)
-    else:
-        image = merge_passes([render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1)])
+    with threads(options.threads):
+        if options.dask:
+            variant = str(mi.variant())
+            image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
+        elif options.share:
+            image = render_pass(loaded, sampling, number, count, **settings)
+        else:
+            image = merge_passes([render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1)])
     if options.reference:
         image = as_reference(image, options.scene, options.output, sampling, tolerances)
     save_image(options.output, image)

@@ -36,16 +36,16 @@ def render_picture(
 
     count = options.shutter or 1
     total: Any = 0.0
-    with threads(options.threads):
-        for part, loaded in enumerate(scenes):
-            seed = (options.seed * count + part) % 2**32
+    for part, loaded in enumerate(scenes):
+        seed = (options.seed * count + part) % 2**32
+        with threads(options.threads):
             found = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
                 from ..studio.denoising import denoised
 
                 # Each by itself, as its albedo and normals are those of its time.
                 found = denoised(loaded, found, seed)
-            total = total + found / count
+        total = total + found / count
     return total
 
 
@@ -76,7 +76,7 @@ def as_data(options: argparse.Namespace) -> dict[str, Any]:
 
 @contextmanager
 def threads(count: int | None) -> Iterator[None]:
-    """Render with so many threads. With one, Mitsuba would wait for ever when it writes OpenEXR files."""
+    """Render with so many threads. With one, nothing may be read or written meanwhile; see `set_variant`."""
     import drjit as dr
 
     before = dr.thread_count()

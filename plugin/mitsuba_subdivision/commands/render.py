@@ -18,7 +18,7 @@ from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
 from .arguments import add_cage_options, add_variant, finite, positive, set_variant
 from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes
-from .pictures import as_data, load_still, pictures, render_picture, threads
+from .pictures import as_data, load_still, pictures, render_picture
 
 if TYPE_CHECKING:
     import numpy as np
@@ -241,8 +241,7 @@ def _render_scene(options: argparse.Namespace) -> None:
     if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
     if wants_passes(options):
-        with threads(options.threads):
-            render_by_passes(options)
+        render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
     require_writable(options.output, loaded.file_paths)
@@ -261,8 +260,7 @@ def _render_model(options: argparse.Namespace) -> None:
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         require_writable(options.output, [options.scene])
     if wants_passes(options):
-        with threads(options.threads):
-            render_by_passes(options, partial(load_still, as_data(options)))
+        render_by_passes(options, partial(load_still, as_data(options)))
         return
     if options.frames or options.turntable:
         _write_frames(options)

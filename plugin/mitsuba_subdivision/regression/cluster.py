@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from ..images.image import Image
 from ..progress import timed
+from ..variants import set_variant
 from . import RegressionError
 from .passes import Sampling, merge_passes, render_pass
 from .scene import LoadedScene
@@ -67,10 +68,8 @@ def results(client: Client, work: Callable[[int], T], variant: str, numbers: Seq
 
 def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
     """Runs on a worker."""
-    import mitsuba as mi
-
     with _lock:
-        mi.set_variant(variant)
+        set_variant(variant)
         return number, work(number)
 
 
