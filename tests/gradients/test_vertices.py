@@ -29,7 +29,7 @@ def _llvm():
 
 
 def table_of(surface, tessellation):
-    return surface.sampling(3) if tessellation == "uniform" else surface.adaptive_sampling(adaptive(surface), 8)
+    return surface.sampling(3) if tessellation == "uniform" else surface.adaptive_sampling(adaptive(surface), 16)
 
 
 def adaptive(surface):

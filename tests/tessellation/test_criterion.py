@@ -1,5 +1,8 @@
 """Adaptive tessellations hold to what they are asked for, with few triangles."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
@@ -60,9 +63,37 @@ def test_rates_stay_below_the_highest(name):
     # Around extraordinary vertices rings get smaller, but have no more segments.
     assert rates[tiles.depth == 0].max(initial=0) <= 6
     assert rates[tiles.depth > 0].max(initial=0) <= 3
-    assert (rates <= tiles.most).all()
+    assert (rates <= np.maximum(1, 6 // tiles.share)).all()
     if name == "loop mixed torus":
         assert tiles.depth.max() > 15
+
+
+@pytest.mark.parametrize("name", ["cube", "rook", "loop mixed torus", "doo_sabin mixed torus", "half disc of 6"])
+@pytest.mark.parametrize("measure", Measure)
+def test_a_warning_names_the_highest_rate_that_the_limit_needs(name, measure):
+    """Or one nearer to it: how many segments patches need that are not divided is not known."""
+    surface = surface_named(name)
+    criterion = Criterion(measure, {Measure.CHORD: 1e-3, Measure.EDGE: 0.05}[measure] * size_of(surface))
+    rates = [2]
+    while True:
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            table = surface.adaptive_sampling(criterion, rates[-1])
+        if not caught:
+            break
+        numbers = re.search(r"at (\d+) of (\d+) .* max_rate of (\d+)", str(caught[0].message)).groups()
+        count, total, rate = (int(each) for each in numbers)
+        assert len(caught) == 1
+        assert 0 < count <= total == np.count_nonzero(surface.patches.elements.face_sizes)
+        assert rate > rates[-1]
+        rates.append(rate)
+    assert 2 <= len(rates) <= 4
+    np.testing.assert_array_equal(table.triangles, surface.adaptive_sampling(criterion, 1024).triangles)
+
+
+def test_outlines_are_as_fine_as_the_highest_rate_allows_without_a_warning():
+    """Pictures by default settings ask for outlines of a tenth of a pixel, and for few triangles first."""
+    sensor = Sensor(np.array([0.0, -8, 5]), 2e-3)
+    LimitSurface(torus(8, 6)).adaptive_sampling(Criterion(Measure.CHORD, 1e-3, sensor, sensor), 2)
 
 
 def test_least_product_is_the_least(np_rng):
@@ -169,7 +200,7 @@ def test_rings_follow_a_close_look_at_an_extraordinary_vertex(valence):
     depths = []
     for away in distances:
         eye = point.p[0] + away * point.n[0]
-        table = surface.adaptive_sampling(Criterion(Measure.EDGE, 100.0, Sensor(eye, 1e-3)), 64)
+        table = surface.adaptive_sampling(Criterion(Measure.EDGE, 100.0, Sensor(eye, 1e-3)), 128)
         positions, _ = table.apply(surface.cage.positions)
         near = np.linalg.norm(positions - point.p[0], axis=1) < away
         corners = positions[table.triangles[near[table.triangles].all(axis=1)]]

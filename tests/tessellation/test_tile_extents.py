@@ -7,10 +7,20 @@ import copy
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
+from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.evaluation.divided_element import divided_elements
 from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.schemes import CatmullClark
+from mitsuba_subdivision.schemes.stencil_table import StencilTable
+from mitsuba_subdivision.surface import LimitSurface
+from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.flat_tiles import are_flat
+from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from mitsuba_subdivision.tessellation.tile_extents import TileParts, fit_within
+from mitsuba_subdivision.tessellation.tile_rates import TileRates
+from mitsuba_subdivision.tessellation.tiles import Tiles
+from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
 # of its second derivative, times the squared distance of samples, and creases are sampled where they end.
@@ -100,3 +110,42 @@ def test_surfaces_do_not_fit_where_only_their_corners_do(name, np_rng):
         limit = np.ptp(np.einsum("ck,kdt->cdt", tile.corners, values), axis=0)[0]
         found = fit_within(surface.scheme, limit, [TileParts(tile, values, np.arange(len(limit)))])
         assert not found[size > (1 + MISSED) * limit].any()
+
+
+class Raised(CatmullClark):
+    """Vertices of five faces rise by what their neighbours at edges are higher than those across faces."""
+
+    has_convex_rules = False
+
+    def refine(self, topology):
+        t, refinement = topology, super().refine(topology)
+        at = np.flatnonzero(t.vertex_face_count[t.face_vertices] == 5)
+        origin, beside, across = t.face_vertices[at], t.face_vertices[t.next[at]], t.face_vertices[t.next[t.next[at]]]
+        raised = (np.repeat([0.4, -0.4], len(at)), (np.tile(origin, 2), np.concatenate([beside, across])))
+        matrix = refinement.stencils.matrix
+        return refinement._replace(
+            stencils=StencilTable.from_matrix(matrix + sparse.csr_array(raised, shape=matrix.shape))
+        )
+
+
+def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
+    """Control points on a line: no axis is across the surface, and where rules are not convex they do not bound it."""
+    scheme, cage = Raised(), extraordinary(5)
+    faces = cage.face_vertices.reshape(-1, 4)
+    center = int(np.flatnonzero(np.bincount(cage.face_vertices) == 5)[0])
+    positions = np.ones((cage.vertex_count, 3))
+    positions[[faces[face, (corner + 2) % 4] for face, corner in np.argwhere(faces == center)]] = -1
+    surface = LimitSurface(cage.with_positions(positions), scheme)
+    rates = TileRates(
+        scheme,
+        PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex),
+        Criterion(Measure.CHORD, np.linalg.norm(np.ptp(positions, axis=0)) * (1 + ROUNDING)),
+        64,
+    )
+    larger = 0
+    for tile, values, size in tiles_of(surface, scheme, np.eye(3)):
+        tiles = Tiles.whole(np.zeros(len(size)), np.zeros((len(size), 4), dtype=bool))
+        found = are_flat(rates, tiles, [TileParts(tile, values, np.arange(len(size)))])
+        assert not found[size > rates.criterion.error].any()
+        larger += np.count_nonzero(size > rates.criterion.error)
+    assert larger

@@ -520,9 +520,17 @@ class LimitSurface:
         ------
         MemoryError
             If the tessellation would not fit into memory.
+
+        Warns
+        -----
+        CageWarning
+            If parts of the surface need more than ``max_rate`` for the criterion, and are coarser. A criterion for
+            outlines causes none.
         """
         points = self.cage.positions if control_points is None else control_points
-        return tessellation.adaptive_table(self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate)
+        return tessellation.adaptive_table(
+            self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate, self.cage.source.name
+        )
 
     def tessellate(
         self,

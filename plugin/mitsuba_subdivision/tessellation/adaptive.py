@@ -26,6 +26,7 @@ def adaptive_table(
     control_points: FloatArray,
     criterion: Criterion,
     max_rate: int,
+    cage_name: str,
 ) -> VertexTable:
     """Prepare the adaptive tessellation of a cage's patches.
 
@@ -39,14 +40,21 @@ def adaptive_table(
     criterion : Criterion
     max_rate : int
         Most segments along an edge of the cage; see `choose_tiles`.
+    cage_name : str
+        For a warning.
 
     Raises
     ------
     MemoryError
         If the tessellation would not fit into memory.
+
+    Warns
+    -----
+    CageWarning
+        As `choose_tiles`.
     """
     frames = PatchFrames.of(patches, control_of_vertex)
-    tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate)
+    tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate, cage_name)
     grid = AdaptiveGrid.of(tiles, frames)
     controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
     vertex_stencils = _vertex_stencils(patches, grid, controls)

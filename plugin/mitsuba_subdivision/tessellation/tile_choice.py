@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.errors import warn
 from ..evaluation.bernstein import times
 from ..evaluation.divided_element import divided_elements
 from ..evaluation.divided_tile import part_of_tile
@@ -27,6 +28,8 @@ from .tiles import DEEPEST, Tiles
 
 # Number of patches, or their pieces, processed together, which bounds temporary memory.
 PATCHES_AT_ONCE = 1 << 14
+# Segments along an edge above which no rate is advised.
+HIGHEST_RATE = 1024
 
 
 def choose_tiles(
@@ -36,6 +39,7 @@ def choose_tiles(
     control_of_vertex: IntArray,
     criterion: Criterion,
     max_rate: int,
+    cage_name: str,
 ) -> Tiles:
     """Divide the patches of a cage into tiles, and choose their rates.
 
@@ -50,6 +54,8 @@ def choose_tiles(
     criterion : Criterion
     max_rate : int
         Most segments along an edge of the cage; around extraordinary points, along each ring.
+    cage_name : str
+        For a warning.
 
     Returns
     -------
@@ -60,21 +66,48 @@ def choose_tiles(
     ------
     MemoryError
         If their triangles would not fit into memory.
+
+    Warns
+    -----
+    CageWarning
+        Where ``max_rate`` does not let the criterion hold; not if it is for outlines.
     """
     points = control_points[control_of_vertex]
-    rates, features = TileRates(patches.scheme, frames, criterion), feature_edges(patches, frames, points, criterion)
+    rates = TileRates(patches.scheme, frames, criterion, max_rate)
+    features = feature_edges(patches, frames, points, criterion)
     found: list[Tiles] = []
     triangle_count = 0
-    for block, groups in _blocks(patches, frames, points, features, max_rate):
+    for block, groups in _blocks(patches, frames, points, features):
         for chosen in _chosen(rates, block, groups, triangle_count):
             triangle_count += rates.cost(chosen)
             found.append(chosen)
-    tiles = Tiles.joined(found)
+    needed = Tiles.joined(found)
+    tiles = rates.clipped(needed)
+    if criterion.outline is None:
+        _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
     return tiles[_order(tiles)]
 
 
+def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: int, cage_name: str) -> None:
+    """Warn if tiles have less than the rates that they need."""
+    is_coarse = (needed.rates != tiles.rates).any(axis=1) | (needed.sides != tiles.sides).any(axis=1)
+    if not is_coarse.any():
+        return
+    coarse, t = needed[is_coarse], patches.elements
+    most = (np.maximum(coarse.rates.max(axis=1), coarse.sides.max(axis=1)) * coarse.share.astype(np.int64)).max()
+    # Tiles halve their patches.
+    rate = 1 << int(most - 1).bit_length()
+    count, total = len(np.unique(t.face_of(coarse.corner))), int(np.count_nonzero(t.face_sizes))
+    kind, larger = "faces" if patches.scheme.element == "face" else "vertices", "a larger error"
+    warn(
+        f"{cage_name}: with a max_rate of {max_rate}, the adaptive tessellation is coarser than asked for at "
+        f"{count} of {total} {kind}, which need up to about {rate} segments along an edge; expected "
+        + (f"a max_rate of {rate}, or {larger}" if rate <= HIGHEST_RATE else larger)
+    )
+
+
 def _blocks(
-    patches: PatchTable, frames: PatchFrames, points: FloatArray, features: NDArray[np.bool_], max_rate: int
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, features: NDArray[np.bool_]
 ) -> Iterator[tuple[Tiles, list[PatchGroup]]]:
     """All patches, each as one tile, class by class, in blocks that bound temporary memory.
 
@@ -102,15 +135,15 @@ def _blocks(
             groups.append(PatchGroup(patch_class.signature, np.arange(count, count + len(corners[-1])), controls))
             count += len(corners[-1])
             if count >= PATCHES_AT_ONCE:
-                yield _whole(frames, corners, max_rate, features), groups
+                yield _whole(frames, corners, features), groups
                 groups, corners, count = [], [], 0
     if groups:
-        yield _whole(frames, corners, max_rate, features), groups
+        yield _whole(frames, corners, features), groups
 
 
-def _whole(frames: PatchFrames, corners: list[IntArray], max_rate: int, features: NDArray[np.bool_]) -> Tiles:
+def _whole(frames: PatchFrames, corners: list[IntArray], features: NDArray[np.bool_]) -> Tiles:
     every = np.concatenate(corners)
-    return Tiles.whole(every, max_rate, sides_on(features, frames, every))
+    return Tiles.whole(every, sides_on(features, frames, every))
 
 
 def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_count: int) -> Iterator[Tiles]:
@@ -168,13 +201,18 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
         tiles, waiting = _numbered(tiles, alike(waiting))
         # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
         is_done = are_flat(rates, tiles, waiting) | (tiles.depth >= DEEPEST - 1)
-        for group in waiting:
-            if not group.tile.is_self_similar:
-                is_done[group.owner] |= tiles.most[group.owner] == 1
         flat.append(tiles[is_done])
+        is_last = rates.most(tiles) == 1
+        for group in waiting:
+            if group.tile.is_self_similar:
+                is_last[group.owner] = False
+        coarse = tiles[is_last & ~is_done]
+        # More than one, and how many more is not known.
+        flat.append(replace(coarse, rates=2 * coarse.rates))
+        is_done |= is_last
         index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
         children = [tiles.child(number, scheme.domain) for number in range(4)]
-        most = np.concatenate([each.most for each in children])
+        share = np.concatenate([each.share for each in children])
         divided, waiting = waiting, []
         of_pieces, coefficients = [], []
         for group in divided:
@@ -190,9 +228,9 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
                     continue
                 if tile is group.tile:
                     # Each ring around an extraordinary point may have as many segments as the one around it.
-                    most[at] = tiles.most[parents]
+                    share[at] = tiles.share[parents]
                 waiting.append(TileParts(tile, points, at))
-        tiles = replace(Tiles.joined(children), most=most)
+        tiles = replace(Tiles.joined(children), share=share)
         if of_pieces:
             pieces.append((tiles[np.concatenate(of_pieces)], np.concatenate(coefficients, axis=2)))
     in_pieces = Tiles.joined([each for each, _ in pieces])

@@ -42,11 +42,14 @@ class TileRates:
     frames : PatchFrames
         Of the patches that the tiles are parts of.
     criterion : Criterion
+    max_rate : int
+        Most segments along an edge of the cage.
     """
 
     scheme: Scheme
     frames: PatchFrames
     criterion: Criterion
+    max_rate: int
 
     @property
     def basis(self) -> BernsteinBasis:
@@ -87,6 +90,8 @@ class TileRates:
     def rated(self, tiles: Tiles, coefficients: FloatArray, triangle_count: int) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
 
+        Rates are those that the limit needs, and may exceed the highest; see `clipped`.
+
         Parameters
         ----------
         tiles : Tiles
@@ -106,27 +111,27 @@ class TileRates:
         found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
         tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
         forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
-        rates = self._rates(forms, tiles)
+        rates = self._rates(forms)
         # Divided tiles have fewer triangles.
-        require_memory_for_triangles(triangle_count + int(self._costs(rates).sum()))
+        require_memory_for_triangles(triangle_count + int(self._costs(tiles, rates).sum()))
         # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
         # half as many segments: its form is a quarter.
-        is_small = (rates.prod(axis=1) > 1) & (rates.prod(axis=1) < FEWEST_DIVIDED)
+        is_small = (rates.max(axis=1) > 1) & (self._cells(tiles, rates) < FEWEST_DIVIDED)
         small = tiles[is_small], coefficients[..., is_small]
         rates[is_small] = self._rates(
-            4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_displacement(*small), tiles[is_small]
+            4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_displacement(*small)
         )
         while len(tiles):
-            tried = np.flatnonzero(rates.prod(axis=1) >= FEWEST_DIVIDED)
+            tried = np.flatnonzero(self._cells(tiles, rates) >= FEWEST_DIVIDED)
             of_parts = self._forms(coefficients[..., tried], _parts(self.basis, 2))
             of_parts += self._form_of_displacement(tiles[tried], coefficients[..., tried]) / 16
-            rates[tried] = self._rates(16 * of_parts, tiles[tried])
+            rates[tried] = self._rates(16 * of_parts)
             of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
             # All first children, all second ones and so on.
             children = Tiles.joined([tiles[tried].child(number, self.domain) for number in range(4)])
-            child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1), children)
-            cost = self._costs(child_rates).reshape(4, -1).sum(axis=0)
-            is_better = (cost < self._costs(rates[tried])) & (tiles.most[tried] > 1)
+            child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1))
+            cost = self._costs(children, child_rates).reshape(4, -1).sum(axis=0)
+            is_better = (cost < self._costs(tiles[tried], rates[tried])) & (self.most(tiles[tried]) > 1)
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
             kept = replace(tiles[keeps], rates=rates[keeps])
@@ -138,10 +143,22 @@ class TileRates:
             if self.criterion.displacement is not None:
                 # Parts show more of a displacement than the whole did.
                 rates = self._rates(
-                    self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients),
-                    tiles,
+                    self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
                 )
         return found
+
+    def most(self, tiles: Tiles) -> IntArray:
+        """``(t,)`` the highest rates that tiles may have."""
+        return np.maximum(1, self.max_rate // tiles.share)
+
+    def clipped(self, tiles: Tiles) -> Tiles:
+        """The tiles, with no higher rates than these."""
+        most = self.most(tiles)[:, None]
+        return replace(
+            tiles,
+            rates=np.minimum(tiles.rates, most).astype(np.int32),
+            sides=np.minimum(tiles.sides, most).astype(np.int16),
+        )
 
     def _heights(self, tiles: Tiles) -> FloatArray:
         """``(n, n, t)`` heights of the displacement over tiles, by v and by u."""
@@ -182,7 +199,7 @@ class TileRates:
             of_tile = coefficients[..., on]
             limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), NormalCone.of_any(len(on)))
             needed = self.criterion.segments(times(second[own], of_tile), limit)
-            sides[on, side] = np.minimum(needed, tiles.most[on])
+            sides[on, side] = np.minimum(needed, np.iinfo(sides.dtype).max)
         return sides
 
     def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
@@ -218,28 +235,32 @@ class TileRates:
             found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
         return found
 
-    def _rates(self, forms: FloatArray, tiles: Tiles) -> IndexArray:
+    def _rates(self, forms: FloatArray) -> IndexArray:
         """``(t, 2)`` segments along u and v for forms ``(f, 3, t)`` that are to be one at most."""
         if self.domain.corner_count == 3:
             found = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
         else:
             found = least_product(forms)
-        return np.minimum(found, tiles.most[:, None]).astype(np.int32)
+        return found.astype(np.int32)
 
     def _without_pairs(self, tiles: Tiles) -> Tiles:
         """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
-        is_pair = (tiles.rates[:, 0] == 2) & (self.domain.corner_count == 3)
+        is_pair = (np.minimum(tiles.rates[:, 0], self.most(tiles)) == 2) & (self.domain.corner_count == 3)
         children = [tiles[is_pair].child(number, self.domain) for number in range(4)]
-        ones = np.ones((int(is_pair.sum()), 2), dtype=np.int32)
-        return Tiles.joined([tiles[~is_pair], *(replace(each, rates=ones) for each in children)])
+        return Tiles.joined([tiles[~is_pair], *(replace(each, rates=-(-each.rates // 2)) for each in children)])
 
     def cost(self, tiles: Tiles) -> int:
         """Triangles of some tiles, but for those of other rates next door."""
-        return int(self._costs(tiles.rates).sum())
+        return int(self._costs(tiles, tiles.rates).sum())
 
-    def _costs(self, rates: IntArray) -> IntArray:
+    def _costs(self, tiles: Tiles, rates: IntArray) -> IntArray:
         """Likewise of each tile with these rates."""
-        return rates[:, 0] * rates[:, 1] * (1 if self.domain.corner_count == 3 else 2)
+        return self._cells(tiles, rates) * (1 if self.domain.corner_count == 3 else 2)
+
+    def _cells(self, tiles: Tiles, rates: IntArray) -> IntArray:
+        """``(t,)`` cells of tiles with these rates, clipped."""
+        cells: IntArray = np.minimum(rates, self.most(tiles)[:, None]).astype(np.int64).prod(axis=1)
+        return cells
 
 
 def axis_across(corners: FloatArray) -> FloatArray:

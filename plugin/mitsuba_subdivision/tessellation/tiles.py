@@ -30,8 +30,8 @@ class Tiles:
     is_flipped : (t,) bool
         Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
         at ``origin + 1``.
-    most : (t,) int32
-        The highest rate that a tile may have.
+    share : (t,) int32
+        How many tiles of this size there are along an edge of the cage; around extraordinary points, along a ring.
     rates : (t, 2) int32
         Segments along u and v; over triangles both are the same.
     sides : (t, m) int16
@@ -43,7 +43,7 @@ class Tiles:
     depth: IndexArray
     origin: IndexArray
     is_flipped: NDArray[np.bool_]
-    most: IndexArray
+    share: IndexArray
     rates: IndexArray
     sides: NDArray[np.int16]
 
@@ -55,7 +55,7 @@ class Tiles:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.corner, self.depth, self.origin, self.is_flipped, self.most, self.rates, self.sides
+        return self.corner, self.depth, self.origin, self.is_flipped, self.share, self.rates, self.sides
 
     @classmethod
     def joined(cls, parts: list[Tiles]) -> Tiles:
@@ -79,21 +79,21 @@ class Tiles:
             self.depth + 1,
             2 * self.origin + step,
             self.is_flipped ^ is_middle,
-            np.maximum(1, self.most // 2),
+            2 * self.share,
             self.rates,
             np.where(own_sides, -(-self.sides // 2), 0),
         )
 
     @classmethod
-    def whole(cls, corners: IntArray, most: int, is_border: NDArray[np.bool_]) -> Tiles:
-        """One tile for each patch that begins at these corners, with a highest rate; and which sides are borders."""
+    def whole(cls, corners: IntArray, is_border: NDArray[np.bool_]) -> Tiles:
+        """One tile for each patch that begins at these corners; and which sides are borders."""
         count = len(corners)
         return cls(
             np.asarray(corners, dtype=np.int32),
             np.zeros(count, dtype=np.int32),
             np.zeros((count, 2), dtype=np.int32),
             np.zeros(count, dtype=bool),
-            np.full(count, most, dtype=np.int32),
+            np.ones(count, dtype=np.int32),
             np.ones((count, 2), dtype=np.int32),
             is_border.astype(np.int16),
         )
