@@ -14,11 +14,6 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "vertex_stencils.counts * vertex_stencils.run_counts,",
                 "vertex_stencils.counts / vertex_stencils.run_counts,",
             ),
-            (
-                "kernels/nearest_location.py",
-                "length = dr.maximum(dr.abs(part * du), dr.abs(part * dv))",
-                "length = dr.maximum(dr.abs(part + du), dr.abs(part * dv))",
-            ),
             ("mesh/connectivity.py", "FEW_HALF_EDGES = 1 << 13", "FEW_HALF_EDGES = 1 << 12"),
             ("patches/energies.py", "CHUNK = 1 << 21", "CHUNK = 1 << 22"),
             ("patches/nearest_in_piece.py", "STEPS = 60", "STEPS = 61"),
