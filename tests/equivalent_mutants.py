@@ -9,6 +9,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         (
             ("evaluation/divided_element.py", "for _ in range(MOST_DEPTH + 1):", "for _ in range(MOST_DEPTH + 2):"),
             ("evaluation/piece_tree.py", "SHARED_PIECES = 64", "SHARED_PIECES = 65"),
+            (
+                "kernels/apply_weights.py",
+                "vertex_stencils.counts * vertex_stencils.run_counts,",
+                "vertex_stencils.counts / vertex_stencils.run_counts,",
+            ),
             ("mesh/connectivity.py", "FEW_HALF_EDGES = 1 << 13", "FEW_HALF_EDGES = 1 << 12"),
             ("patches/energies.py", "CHUNK = 1 << 21", "CHUNK = 1 << 22"),
             ("patches/nearest_in_piece.py", "STEPS = 60", "STEPS = 61"),

@@ -80,6 +80,8 @@ def test_operations_take_arrays_of_points():
     ):
         given = dict.fromkeys(("in1", "in2", "bg", "fg", "mix", "value1", "value2"), np.array([0.3]))
         assert operation(category, "color3", {**given, name: wide}).shape == (2, 3, 3)
+    grey = wide[..., :1]
+    np.testing.assert_array_equal(operation("convert", "color3", {"in": grey}), np.repeat(grey, 3, axis=-1))
 
 
 @pytest.mark.core

@@ -249,6 +249,13 @@ def test_coats_dim_what_lies_below():
         notes.warn("file")
 
 
+def test_bodies_without_a_distance_absorb_nothing():
+    """Whatever their colour: by glTF's extension for volumes, the distance is infinite unless it is given."""
+    body = {"transmission": 1.0, "thickness": 1.0, "attenuation_color": COLOR}
+    assert "depth" not in look("gltf_pbr", **body).inputs
+    assert look("gltf_pbr", **body, attenuation_distance=2.0).inputs["depth"] == 2.0
+
+
 def test_emission_and_presence():
     assert look("standard_surface", emission=2.0, emission_color=COLOR).inputs["emission"] == pytest.approx(
         [0.4, 0.8, 1.6]
