@@ -14,8 +14,9 @@ from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turnt
 from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.scene_file import save_scene
-from mitsuba_subdivision.usd import loaded_shapes
+from mitsuba_subdivision.usd import loaded_shapes, stage_scenes
 from mitsuba_subdivision.usd.limit_surfaces import Surfaces
+from mitsuba_subdivision.usd.scene_entries import SceneEntries
 from mitsuba_subdivision.usd.stage_reader import StageReader
 from mitsuba_subdivision.usd.stage_scenes import StageScenes
 from usd.moving_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
@@ -159,6 +160,54 @@ def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys)
     capsys.readouterr()
     assert main(["render", "g_%d.usda", "-o", "g.png", "--frames", "1:3", *small]) == 1
     assert '"g_3.usda": there is no such file; expected one for each frame' in capsys.readouterr().err
+
+
+TEXTURE_SIDE = 64
+# The camera moves from afar to near; the nearest frame is neither the first nor the last.
+APPROACH = """def Camera "camera" {
+    float horizontalAperture = 24
+    float focalLength = 35
+    float verticalAperture = 18
+    double3 xformOp:translate.timeSamples = {1: (0, 0, 90), 2: (0, 0, 40), 3: (0, 0, 70)}
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize("shown", ["frames", "turntable"])
+def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_path, monkeypatch, shown):
+    """Alike in all frames, so that nothing changes from one to the next, and no finer than that."""
+    path = write(tmp_path, FLOOR + LAMP + APPROACH)
+    mi.Bitmap(np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), 200, np.uint8)).write(str(tmp_path / "tiles.png"))
+    asked = []
+    monkeypatch.setattr(
+        stage_scenes, "SceneEntries", lambda *given, **more: asked.append((given, more)) or SceneEntries(*given, **more)
+    )
+
+    def side(entries):
+        """Of the floor's texture, by entries that are made again of what the scene is made of."""
+        given, more = entries
+        made = SceneEntries(*given, **{**more, "loaded": None})
+        paint = made.scene["paint"]
+        return paint.get("bsdf", paint)["base_color"]["bitmap"].size()[0]
+
+    sides = []
+    for time in (1, 2, 3):
+        asked.clear()
+        StillPicture(StageScenes(path, LOOK, RATE, time=time))
+        sides.append(side(asked[0]))
+    asked.clear()
+    if shown == "frames":
+        assert [*frame_range(path, range(1, 4)).frames([3, 1], "box")]
+        assert max(sides) > sides[0]
+        assert [side(each) for each in asked] == [max(sides)] * 2
+        assert max(sides) < TEXTURE_SIDE
+    else:
+        Turntable(StageScenes(path, LOOK, RATE), 4)
+        assert side(asked[0]) == sides[0]
+        Turntable(StageScenes(path, LOOK, RATE), 4, follows_sensor=False)
+        assert side(asked[1]) == TEXTURE_SIDE
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -8,8 +8,9 @@ import pytest
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.usd import surface_models
 from mitsuba_subdivision.usd.bsdfs import Bsdfs
-from mitsuba_subdivision.usd.contents import ShapeContents
+from mitsuba_subdivision.usd.contents import ShapeContents, TextureContents
 from mitsuba_subdivision.usd.materialx_library import library, numbers
+from mitsuba_subdivision.usd.materialx_nodes import node
 from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 from mitsuba_subdivision.usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
 from mitsuba_subdivision.usd.textures import Textures
@@ -22,6 +23,8 @@ IDS = {
     "gltf_pbr": "ND_gltf_pbr_surfaceshader",
 }
 COLOR = [0.2, 0.4, 0.8]
+# Of means of 65,536 samples whose lobes are chosen by other odds.
+SAMPLED = 0.02
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +60,7 @@ def albedo(bsdf, degrees, count=1 << 16):
     si.n = mi.Normal3f(0, 0, 1)
     si.t = mi.Float(1)
     si.p = mi.Point3f(0)
+    si.uv = mi.Point2f(0.5)
     sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
     weights = np.broadcast_to(np.array(weight), (3, count))
     up = np.broadcast_to(np.array(sample.wo.z) > 0, (count,))
@@ -96,6 +100,24 @@ METALS = [
 def test_metals_reflect_their_colour_head_on_and_all_at_grazing_angles(model, given):
     np.testing.assert_allclose(both(model, 0, **given)[0], COLOR, rtol=1e-3)
     assert (both(model, 89.9, **given)[0] > 0.97).all()
+
+
+def test_metals_below_a_coat_reflect_their_colour_whatever_the_specular_weight():
+    """It only sets the colour of edges, so that a copper with a weight of 0 is not black."""
+    given = {"metalness": 1.0, "base_color": COLOR, "coat": 1.0, "specular_roughness": 0.3}
+    with_weight, without = (both("standard_surface", specular=weight, **given)[0] for weight in (1.0, 0.0))
+    np.testing.assert_allclose(without, with_weight, rtol=SAMPLED)
+    np.testing.assert_allclose(np.diff(without), np.diff(0.96 * np.array(COLOR)), atol=0.1)
+
+
+def test_roughness_beyond_1_is_1():
+    """Networks of nodes divide by masks, and a roughness of 80,000 shines like a lamp."""
+    mask = TextureContents("none.png", "r", "raw", "repeat", [1] * 4, [0] * 4, np.eye(3), "st", [0.00001] * 4)
+    for beyond in (5.0, node("divide", "float", in1=0.8, in2=mask)):
+        expected, found = (
+            both("standard_surface", 30, base_color=COLOR, specular_roughness=each) for each in (1.0, beyond)
+        )
+        np.testing.assert_allclose(found, expected, rtol=SAMPLED)
 
 
 def test_edges_of_metals_have_the_colour_that_the_models_say():

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.studio.picture import outline_for
 from mitsuba_subdivision.usd.contents import (
     InstanceContents,
     MaterialContents,
@@ -17,7 +16,7 @@ from mitsuba_subdivision.usd.contents import (
     TextureContents,
 )
 from mitsuba_subdivision.usd.image_reduction import halvings, reduced
-from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, texels_for_picture
+from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_subdivision.usd.texture_image import read_texture_image
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
@@ -68,8 +67,7 @@ def sensor(distance=DISTANCE):
 
 
 def needed_for(contents):
-    entry = sensor()
-    return texels_for_picture(contents, outline_for(entry), entry["near_clip"])
+    return texels_for_pictures(contents, [sensor()])
 
 
 def pixels_of_unit(distance=DISTANCE):

@@ -128,7 +128,7 @@ def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture
     if options.frames or options.shutter:
         return FrameRange(source, options.frames or range(1, 2))
     if options.turntable:
-        return Turntable(source, options.turntable)
+        return Turntable(source, options.turntable, follows_sensor=not options.save_scene)
     return StillPicture(source, follows_sensor=not options.save_scene)
 
 

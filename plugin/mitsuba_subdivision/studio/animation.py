@@ -50,7 +50,12 @@ class SceneSource(Protocol[C]):
         """Whether the camera or the lights are those of the studio, which depend on the points."""
 
     def scene(
-        self, contents: C, points: NDArray[np.float64] | None = None, *, follows_sensor: bool = False
+        self,
+        contents: C,
+        points: NDArray[np.float64] | None = None,
+        *,
+        follows_sensor: bool = False,
+        turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene.
 
@@ -61,6 +66,8 @@ class SceneSource(Protocol[C]):
             Points that the camera must see in all frames; by default, the points of the contents.
         follows_sensor : bool
             Whether only the scene's own sensor renders it, so that triangles may depend on the sensor.
+        turns : list of (4, 4) float64
+            Transforms of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it.
         """
 
     def frames(
@@ -105,9 +112,11 @@ class Turntable:
     source : SceneSource
     count : int
         Number of frames.
+    follows_sensor : bool
+        Whether the scene is rendered by its own sensor only, which turns.
     """
 
-    def __init__(self, source: SceneSource[C], count: int) -> None:
+    def __init__(self, source: SceneSource[C], count: int, *, follows_sensor: bool = True) -> None:
         self.numbers, self._count = range(1, count + 1), count
         contents = source.at()
         points, framing = source.points(contents), source.framing(contents)
@@ -118,7 +127,8 @@ class Turntable:
         if len(points):
             turned_points = (points_at(points, self.matrix(number)) for number in self.numbers)
             points = np.concatenate([outermost(each, *framing) for each in turned_points])
-        self.scene = source.scene(contents, points)
+        turns = [self.matrix(2 - number) for number in self.numbers] if follows_sensor else []
+        self.scene = source.scene(contents, points, turns=turns)
 
     def matrix(self, number: float) -> NDArray[np.float64]:
         """Transform ``(4, 4)`` of the contents in frame ``number``."""

@@ -121,7 +121,12 @@ class CageScenes:
         return True
 
     def scene(
-        self, contents: PosedModel, points: NDArray[np.float64] | None = None, *, follows_sensor: bool = False
+        self,
+        contents: PosedModel,
+        points: NDArray[np.float64] | None = None,
+        *,
+        follows_sensor: bool = False,
+        turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
     ) -> SceneNode:
         """Entries of a scene: "surface", "cage" if it is drawn, and those of the studio.
 

@@ -26,10 +26,14 @@ class FrameFiles:
         If the name has no number in it.
     FileNotFoundError
         If there is no file for a frame.
+
+    Attributes
+    ----------
+    numbers : range
     """
 
     def __init__(self, path: Path, numbers: range) -> None:
-        self._path = path
+        self._path, self.numbers = path, numbers
         self.are_many = bool(PATTERN.search(path.name))
         if not self.are_many and not path.suffix.lower().startswith(".usd"):
             raise CageError(

@@ -24,6 +24,10 @@ _MOST_ETA = 1000.0
 _COAT = 0.04
 # Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
 _MIRROR = 0.001
+# With an index of 1, `principled` leaves out metal as well.
+_LEAST_ETA = 1.001
+# Numbers beyond 0 to 1 break Mitsuba's BSDFs.
+_FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -165,6 +169,7 @@ class _Surface:
         self._material, self._values, self._notes = material, values, values.notes
         inputs = {name: values.for_shape(value) for name, value in material.inputs.items()}
         self._inputs: dict[str, Input] = {**NEUTRAL, **inputs}
+        self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 
     def _is(self, name: str, value: float) -> bool:
         """Whether an input has a value everywhere."""
@@ -224,7 +229,7 @@ class _Surface:
             "type": "principled",
             "base_color": values.color(inputs["base_color"]),
             "roughness": values.number(inputs["roughness"]),
-            "eta": self._eta(),
+            "eta": max(self._eta(), _LEAST_ETA),
             "metallic": values.number(inputs["metalness"]),
         }
         if not self._is("metalness", 0) and not self._is("edge_color", 1):
@@ -344,6 +349,16 @@ class _Surface:
         u = node("min", "float", in1=node("divide", "float", in1=width, in2=root), in2=1.0)
         v = node("min", "float", in1=node("multiply", "float", in1=width, in2=root), in2=1.0)
         return {"alpha_u": self._values.number(u), "alpha_v": self._values.number(v)}
+
+
+def _clamped(given: Input) -> Input:
+    """A number from 0 to 1; plain pictures and attributes stay what they are."""
+    is_plain = (
+        isinstance(given, TextureContents) and np.all(np.equal(given.scale, 1)) and np.all(np.equal(given.bias, 0))
+    )
+    if is_plain or isinstance(given, PrimvarContents):
+        return given
+    return node("clamp", "float", in_=given, low=0.0, high=1.0)
 
 
 def _attribute(given: PrimvarContents) -> SceneNode:

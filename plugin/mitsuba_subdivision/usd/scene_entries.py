@@ -41,7 +41,7 @@ class SceneEntries:
     triangles : dict of dict by shape, optional
         Parameters of the tessellations of some limit surfaces, instead of the rate of all.
     needed : dict of float by file, optional
-        Pixels along the sides of textures; see `texels_for_picture`.
+        Pixels along the sides of textures; see `texels_for_pictures`.
     texture_size : int, optional
         Pixels along the sides of textures of materials at most.
     loaded : LoadedShapes, optional

@@ -33,7 +33,7 @@ from .sensors import NO_BLUR, sensor
 from .stage_reader import StageReader
 from .stage_warnings import StageWarnings
 from .studio_defaults import angles_for, size_for, with_studio_defaults
-from .texture_detail import texels_for_picture
+from .texture_detail import texels_for_pictures
 
 
 class StageScenes:
@@ -139,7 +139,12 @@ class StageScenes:
 
     @timed("Choosing triangles and textures")
     def scene(
-        self, contents: SceneContents, points: NDArray[np.float64] | None = None, *, follows_sensor: bool = False
+        self,
+        contents: SceneContents,
+        points: NDArray[np.float64] | None = None,
+        *,
+        follows_sensor: bool = False,
+        turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene, with polygon meshes for `with_meshes`.
 
@@ -155,10 +160,14 @@ class StageScenes:
         points = self.points(contents) if points is None else points
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes)
+        if rest is not None and (turns or follows_sensor):
+            needed = texels_for_pictures(
+                contents, [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
+            )
         if rest is None or not is_one_picture:
             contents, parameters = self._with_copies(contents, notes)
         else:
-            contents, triangles, needed = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
+            contents, triangles = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
         size = self._look.texture_size
         made = SceneEntries(contents, notes, parameters, self._surfaces, triangles, needed, size)
         notes.warn(self.name, self._warned)
@@ -168,12 +177,11 @@ class StageScenes:
 
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, notes: StageWarnings, follows_sensor: bool
-    ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]], dict[str, float]]:
-        """Contents with copies, and the triangles and the texels that a picture needs."""
-        seen = outline_for(sensor), sensor["near_clip"]
-        needed = texels_for_picture(contents, *seen) if follows_sensor else {}
+    ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]]]:
+        """Contents with copies, and the triangles that a picture needs."""
         if not self._has_free_rates or not contents.has_surfaces:
-            return self._with_copies(contents, notes)[0], {}, needed
+            return self._with_copies(contents, notes)[0], {}
+        seen = outline_for(sensor), sensor["near_clip"]
         shading = self._parameters["shading"]
         segments = segments_of(contents, self._surfaces, *seen, shading)
         rates: dict[ShapeContents, int] = {}
@@ -181,7 +189,7 @@ class StageScenes:
             most = {shape: np.minimum(each, MOST_SEGMENTS) for shape, each in segments.items()}
             contents, rates = with_copies(contents, most, shading, notes)
         triangles = triangles_for_picture(contents, segments, seen[0], self._parameters, follows_sensor=follows_sensor)
-        return contents, triangles | {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}, needed
+        return contents, triangles | {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}
 
     def _with_copies(self, contents: SceneContents, notes: StageWarnings) -> tuple[SceneContents, dict[str, Any]]:
         """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
@@ -209,6 +217,7 @@ class StageScenes:
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes = LoadedShapes(self._with_copies(first, StageWarnings())[1])
+        needed = self._texels_for_frames(first, points)
         for number, delay in product(numbers, self._delays(first)):
             notes = StageWarnings()
             contents, _ = self._with_copies(self._read(number, delay) if delay else self.at(number), notes)
@@ -218,11 +227,37 @@ class StageScenes:
                 notes,
                 self._parameters,
                 shapes.surfaces,
+                needed=needed,
                 texture_size=self._look.texture_size,
                 loaded=shapes,
             )
-            rest = with_studio_defaults(first, points, self._is_lit, self._look, notes)
-            if contents.camera is not None:
-                rest["sensor"] = sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
+            rest = self._with_camera(contents, first, points, notes)
             notes.warn(self.name, self._warned)
             yield load_quietly({**made.scene, **rest}, filter_name)
+
+    def _with_camera(
+        self, contents: SceneContents, first: SceneContents, points: NDArray[np.float64], notes: StageWarnings
+    ) -> SceneNode:
+        """The camera of a frame, and what of a studio the first frame lacks."""
+        rest = with_studio_defaults(first, points, self._is_lit, self._look, notes)
+        if contents.camera is not None:
+            rest["sensor"] = sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
+        return rest
+
+    def _texels_for_frames(self, first: SceneContents, points: NDArray[np.float64]) -> dict[str, float]:
+        """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
+        needed: dict[str, float] = {}
+        if not any(each.textures() for each in first.materials):
+            return needed
+        numbers = (None,) if self._files is None else self._files.numbers
+        for number, delay in product(numbers, self._delays(first)):
+            contents = self._read(number, delay) if delay else self.at(number)
+            seen = self._with_camera(contents, first, points, StageWarnings())["sensor"]
+            for file, texels in texels_for_pictures(contents, [seen]).items():
+                needed[file] = max(texels, needed.get(file, 0.0))
+        return needed
+
+
+def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
+    """A sensor, moved by a transform ``(4, 4)``."""
+    return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}

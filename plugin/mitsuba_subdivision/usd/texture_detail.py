@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
 from ..mesh import ragged
-from ..studio.picture import pixels_of_boxes
+from ..studio.picture import outline_for, pixels_of_boxes
 from ..studio.placed_points import box_corners
 from ..variants import SceneNode
 from .baking import samples_elsewhere
@@ -21,26 +23,25 @@ MOST_EDGES = 0.95
 MOST_SAMPLES = 20_000
 
 
-def texels_for_picture(contents: SceneContents, outline: SceneNode, near_clip: float) -> dict[str, float]:
-    """Pixels along the sides of textures that a picture shows, by file; of tiles, along those of each.
+def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
+    """Pixels along the sides of textures that pictures show at most, by file; of tiles, along those of each.
 
     Files of which the detail is unknown are missing, or have no bound.
 
     Parameters
     ----------
     contents : SceneContents
-    outline : dict
-        Of the sensor; see `outline_for`.
-    near_clip : float
-        Of the sensor.
+    sensors : list of dict
+        Entries of a scene.
     """
+    seen = [(outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
     matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}
     for shape, to_world in contents.placed_shapes:
         if shape.material is not None:
             matrices.setdefault(shape, []).append(to_world)
     found: dict[str, float] = {}
     for shape, copies in matrices.items():
-        texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape.cage, np.stack(copies), outline, near_clip)
+        texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape.cage, np.stack(copies), seen)
         for texture in _textures(contents.materials[shape.material or 0]):
             # Pictures along a unit of texture coordinates.
             repeats = np.linalg.norm(texture.to_uv[:2, :2], axis=0).max()
@@ -61,7 +62,7 @@ def _textures(material: MaterialContents) -> list[TextureContents]:
 
 
 def _pixels_of_texcoords(
-    cage: CageContents, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float
+    cage: CageContents, to_world: NDArray[np.float64], seen: Sequence[tuple[SceneNode, float]]
 ) -> float:
     """Pixels that a unit of texture coordinates takes at most, for most edges of copies of a mesh; else no bound.
 
@@ -86,6 +87,7 @@ def _pixels_of_texcoords(
         return np.inf
     linear, shifts = to_world[:, :3, :3], to_world[:, None, :3, 3]
     box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
-    pixels = pixels_of_boxes(box_corners(box) @ linear.transpose(0, 2, 1) + shifts, outline, near_clip)
+    corners_of_copies = box_corners(box) @ linear.transpose(0, 2, 1) + shifts
+    pixels = np.max([pixels_of_boxes(corners_of_copies, *each) for each in seen], axis=0)
     ratio = float(np.quantile(lengths[there] / in_texture[there], MOST_EDGES))
     return ratio * float((np.linalg.norm(linear, 2, axis=(1, 2)) * pixels).max())

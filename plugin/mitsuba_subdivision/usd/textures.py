@@ -31,7 +31,7 @@ class Textures:
     ----------
     notes : StageWarnings
     needed : dict of float by file, optional
-        Pixels along the sides of textures of materials that a picture shows; see `texels_for_picture`.
+        Pixels along the sides of textures of materials that pictures show; see `texels_for_pictures`.
     most : int, optional
         Pixels along their sides at most.
     """
