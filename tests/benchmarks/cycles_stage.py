@@ -19,7 +19,7 @@ STAGES = ("read", "load", "first picture", "next picture")
 
 
 def main(stage, camera):
-    """Render a stage twice by a camera of Mitsuba's, with adaptive subdivision at one pixel."""
+    """Render a stage twice by a camera of Mitsuba's; Catmull-Clark meshes at one pixel, by adaptive subdivision."""
     with open(camera) as file:
         camera = json.load(file)
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -32,7 +32,6 @@ def main(stage, camera):
         filepath=stage,
         import_subdivision=True,
         import_cameras=False,
-        import_lights=False,
         apply_unit_conversion_scale=False,
     )
     lap()
@@ -53,19 +52,30 @@ def main(stage, camera):
 
 def _subdivide(meshes):
     for each in meshes:
-        # Materials that it could not read would be black: paths would end there, and its pictures cost less.
-        if not any(material and material.node_tree and material.node_tree.nodes for material in each.data.materials):
+        # Materials that it could not read would be black, where paths end, or magenta, which may emit light.
+        if not all(_is_read(material) for material in each.data.materials):
             each.data.materials.clear()
-        found = [modifier for modifier in each.modifiers if modifier.type == "SUBSURF"]
-        for modifier in found or [each.modifiers.new("subdivision", "SUBSURF")]:
-            modifier.use_adaptive_subdivision = True
-            modifier.adaptive_space, modifier.adaptive_pixel_size = "PIXEL", 1.0
+        # The importer adds a modifier where the scheme is catmullClark. Polygons at one pixel would be other work.
+        for modifier in each.modifiers:
+            if modifier.type == "SUBSURF":
+                modifier.use_adaptive_subdivision = True
+                modifier.adaptive_space, modifier.adaptive_pixel_size = "PIXEL", 1.0
+
+
+def _is_read(material):
+    if not (material and material.node_tree and material.node_tree.nodes):
+        return False
+    images = [node.image for node in material.node_tree.nodes if node.type == "TEX_IMAGE"]
+    return all(image and image.size[0] for image in images)
 
 
 def _set_up(scene, camera):
     scene.render.engine = "CYCLES"
     cycles, render = scene.cycles, scene.render
-    cycles.device, cycles.samples, cycles.max_bounces = "CPU", camera["spp"], 6
+    cycles.device, cycles.samples = "CPU", camera["spp"]
+    # Of all kinds. Mitsuba counts the vertices of a path and the light; Cycles what is between camera and light.
+    for kind in ("max", "diffuse", "glossy", "transmission", "transparent_max"):
+        setattr(cycles, f"{kind}_bounces", max(camera["max_depth"] - 2, 0))
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     render.threads_mode, render.threads = "FIXED", max(2, os.cpu_count() or 2)
     render.resolution_x, render.resolution_y = camera["size"]
@@ -79,6 +89,8 @@ def _set_up(scene, camera):
     # Blender has z upwards, where the importer turns a stage that has y; cameras look along -z, Mitsuba's along z.
     turn = mathutils.Matrix.Rotation(math.radians(90), 4, "X") if camera["up"] == "y" else mathutils.Matrix.Identity(4)
     placed.matrix_world = turn @ mathutils.Matrix(camera["to_world"]) @ mathutils.Matrix.Diagonal((-1, 1, -1, 1))
+    if not camera["is_open"]:
+        return
     world = bpy.data.worlds.new("sky")
     scene.world = world
     world.use_nodes = True

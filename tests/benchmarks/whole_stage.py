@@ -4,9 +4,10 @@ python tests/benchmarks/whole_stage.py STAGE.usda [--cycles PYTHON] [--size 640 
 
 The stage that the page of speed has is the Open Chess Set of https://github.com/usd-wg/assets, which is not loaded from
 there by itself. PYTHON is one that has Blender as a module, `pip install bpy==5.0.1`; without it Cycles is left out.
-Both sides have the same camera, all processors and no denoiser. Cycles has triangles of a pixel, and a sky in place of
-the studio; materials that it cannot read are plain. All run in processes of their own that take turns. Their imports do
-not count, but for what reads USD here. Compiled kernels are in Dr.Jit's cache. Times are the best of the repeats.
+Both sides have the same camera, all processors, paths as long, the stage's lights and no denoiser, and subdivide the
+same meshes: those of Catmull-Clark. Cycles has triangles of a pixel, and a sky in place of the studio or a dome;
+materials that it cannot read are plain. All run in processes of their own that take turns. Their imports do not count,
+but for what reads USD here. Compiled kernels are in Dr.Jit's cache. Times are the best of the repeats.
 """
 
 from __future__ import annotations
@@ -145,6 +146,7 @@ def _own(options):
         lap()
         loaded = mi.load_dict(scene)
     lap()
+    max_depth = scene["integrator"]["max_depth"]
     del scene
     for seed in range(2):
         np.array(mi.render(loaded, seed=seed))
@@ -162,6 +164,8 @@ def _own(options):
             "to_world": np.array(sensor.world_transform().matrix).reshape(4, 4).tolist(),
             "fov": float(np.array(mi.traverse(sensor)["x_fov"]).ravel()[0]),
             "size": list(options.size),
+            "is_open": loaded.environment() is not None,
+            "max_depth": max_depth,
             "up": str(UsdGeom.GetStageUpAxis(Usd.Stage.Open(str(options.stage)))).lower(),
         },
     }

@@ -1,6 +1,7 @@
 """Models of surfaces: their energy and colour against closed forms, and against each other."""
 
 import math
+import warnings
 
 import mitsuba as mi
 import numpy as np
@@ -133,6 +134,31 @@ def test_edges_of_metals_have_the_colour_that_the_models_say():
     expected = factor * (base + (1 - base) * (6 / 7) ** 5)
     found = both("open_pbr_surface", angle, specular_color=factor.tolist(), **given)[0]
     np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+COPPER = [0.955, 0.638, 0.538]
+SCHLICK = [
+    ("UsdPreviewSurface", {"metallic": 1.0, "diffuseColor": COPPER, "roughness": 0.0}),
+    ("gltf_pbr", {"metallic": 1.0, "base_color": COPPER, "roughness": 0.0}),
+]
+
+
+@pytest.mark.parametrize(("model", "given"), SCHLICK)
+def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, given):
+    """A conductor of Gulbrandsen's with a white edge is 0.13 too pale at 75 degrees."""
+    for degrees in (0, 45, 60, 75, 82):
+        expected = np.array(COPPER) + (1 - np.array(COPPER)) * (1 - np.cos(np.radians(degrees))) ** 5
+        np.testing.assert_allclose(both(model, degrees, **given)[0], expected, atol=0.025)
+
+
+def test_edge_colours_below_a_coat_are_only_missed_where_they_are_not_white():
+    given = {"base_metalness": 1.0, "base_color": COPPER, "coat_weight": 1.0}
+    for color, is_missed in (([1.0, 1.0, 1.0], False), ([0.6, 0.6, 0.6], True)):
+        _, notes = entry(look("open_pbr_surface", specular_color=color, **given))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            notes.warn("stage")
+        assert any("edge colours" in str(each.message) for each in said) == is_missed
 
 
 def test_fresnel_equations_of_conductors_are_those_of_dielectrics_without_absorption():

@@ -11,7 +11,14 @@ from ..variants import SceneNode
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .materialx_nodes import constant, is_constant, node
 from .stage_warnings import StageWarnings
-from .surface_models import NEUTRAL, conductor, with_shape
+from .surface_models import (
+    COSINE_82,
+    NEUTRAL,
+    conductor,
+    conductor_reflectance,
+    schlick_reflectance,
+    with_shape,
+)
 from .textures import Textures
 
 # USD's colour of meshes without one.
@@ -30,6 +37,8 @@ _LEAST_ETA = 1.001
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
+# Difference of reflectances that nobody sees at an edge.
+_VISIBLE = 0.05
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
@@ -232,7 +241,7 @@ class _Surface:
             "eta": max(self._eta(), _LEAST_ETA),
             "metallic": values.number(inputs["metalness"]),
         }
-        if not self._is("metalness", 0) and not self._is("edge_color", 1):
+        if not (self._is("metalness", 0) or self._has_white_edges()):
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
@@ -252,6 +261,15 @@ class _Surface:
             if np.ptp(np.broadcast_to(color, (3,))) > 0:
                 self._leave("colours of sheen only set its brightness; it is white")
         return found
+
+    def _has_white_edges(self) -> bool:
+        """Whether a metal turns to white towards its edges as Schlick has it, and `principled`."""
+        base, edge = self._inputs["base_color"], self._inputs["edge_color"]
+        if self._is("edge_color", 1) or not (is_constant(base) and is_constant(edge)):
+            return self._is("edge_color", 1)
+        color = constant(base, 3)
+        found = conductor_reflectance(*conductor(color, constant(edge, 3)), COSINE_82)
+        return bool(np.abs(found - schlick_reflectance(color, COSINE_82)).max() < _VISIBLE)
 
     def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""

@@ -104,7 +104,8 @@ class ShapeReader:
             cage = cages[choice]
             if cage.texcoords is not None and not all(map(UsdGeom.PrimvarsAPI(prim).HasPrimvar, choice.texcoords)):
                 self._notes.add(
-                    f"texture coordinates {choice.texcoords[0]} are missing; others are used", prim.GetPath()
+                    f'texture coordinates "{choice.texcoords[0]}" are missing; the first others of the mesh are used',
+                    prim.GetPath(),
                 )
             normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
             shown = None

@@ -18,6 +18,8 @@ from .materialx_nodes import constant, is_constant, node
 
 Given = Callable[[str], Input]
 WHITE, BLACK = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
+# Of OpenPBR's 82 degrees, where colours of metals differ most.
+COSINE_82 = 1 / 7
 
 # What a surface has, and the value of what it does not say. Widths of GGX lobes are the square of roughness.
 NEUTRAL: dict[str, Input] = {
@@ -153,7 +155,7 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
     return {
         "base_color": times(base, below),
         "metalness": metalness,
-        "edge_color": edge_color(metal, i("specular_color")),
+        "edge_color": edge_color(times(base, below), i("specular_color")),
         "specular": i("specular_weight"),
         "specular_color": i("specular_color"),
         "ior": i("specular_ior"),
@@ -188,9 +190,11 @@ def preview_surface(i: Given) -> dict[str, Input]:
         presence = node("ifgreatereq", "float", value1=opacity, value2=threshold, in1=1.0, in2=0.0)
     elif mode == "transparent" or (mode in ("", 0.0) and is_constant(opacity)):
         presence, transmission = 1.0, node("invert", "float", in_=opacity, amount=1.0)
+    base = times(i("diffuseColor"), _below_coat(i("clearcoat"), 1.5))
     return {
-        "base_color": times(i("diffuseColor"), _below_coat(i("clearcoat"), 1.5)),
+        "base_color": base,
         "metalness": 0.0 if is_specular else i("metallic"),
+        "edge_color": edge_color(base, WHITE),
         "specular_color": _over(i("specularColor"), 0.04) if is_specular else WHITE,
         "ior": 1.5 if is_specular else i("ior"),
         "roughness": i("roughness"),
@@ -216,9 +220,11 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     anisotropy = plus(1.0, number("multiply", -1.0, number("divide", narrow, number("max", wide, 1e-6))))
     colors = [node("extract", "float", in_=i("sheen_color"), index=float(k)) for k in range(3)]
     sheen = number("max", number("max", colors[0], colors[1]), colors[2])
+    base = times(i("base_color"), below)
     return {
-        "base_color": times(i("base_color"), below),
+        "base_color": base,
         "metalness": i("metallic"),
+        "edge_color": edge_color(base, WHITE),
         "specular": i("specular"),
         "specular_color": i("specular_color"),
         "ior": i("ior"),
@@ -311,15 +317,20 @@ def conductor_reflectance(n: ArrayLike, k: ArrayLike, cosine: float) -> NDArray[
     return (across + along) / 2
 
 
+def schlick_reflectance(reflectivity: ArrayLike, cosine: float) -> NDArray[np.float64]:
+    """Reflectance of a metal that turns to white as Schlick has it."""
+    r = np.asarray(reflectivity, dtype=np.float64)
+    return r + (1 - r) * (1 - cosine) ** 5
+
+
 def edge_color(reflectivity: Input, at_82_degrees: Input) -> Input:
-    """Edge colour of Gulbrandsen for a metal of OpenPBR, whose colour at 82 degrees is a factor of Schlick's."""
+    """Edge colour of Gulbrandsen for a metal whose colour at 82 degrees, as in OpenPBR, is a factor of Schlick's."""
     if not (is_constant(reflectivity) and is_constant(at_82_degrees)):
         return WHITE
     r = constant(reflectivity, 3)
-    cosine = 1 / 7  # Of OpenPBR's 82 degrees.
-    target = constant(at_82_degrees) * (r + (1 - r) * (1 - cosine) ** 5)
+    target = constant(at_82_degrees) * schlick_reflectance(r, COSINE_82)
     edges = np.linspace(0, 1, 257)[:, None]
-    found = conductor_reflectance(*conductor(r, edges), cosine)
+    found = conductor_reflectance(*conductor(r, edges), COSINE_82)
     return edges[np.abs(found - target).argmin(axis=0), 0].tolist()
 
 

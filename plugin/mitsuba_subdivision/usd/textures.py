@@ -172,7 +172,9 @@ class Textures:
 
     def _keep(self, path: str, found: TextureImage | Exception) -> None:
         if isinstance(found, Exception):
-            reason = str(found).strip().splitlines()[-1] if str(found).strip() else type(found).__name__
+            # Python's own text of a missing file repeats its path, with a number.
+            said = (isinstance(found, OSError) and found.strerror) or str(found).strip()
+            reason = said.splitlines()[-1] if said else type(found).__name__
             self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
         self._pictures[path] = None if isinstance(found, Exception) else found
 
