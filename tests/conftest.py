@@ -20,7 +20,20 @@ from mitsuba_subdivision.cage import ControlCage, named_cages
 from mitsuba_subdivision.llvm import llvm_problem
 
 
+ALL_THREADS = dr.thread_count()
+# Folders of tests that compute with Dr.Jit, but for those marked `threads`. Its threads wait for work in a loop, for 20
+# ms each time, while the other processes of pytest have tests for all cores.
+IN_ONE_THREAD = {"evaluation", "fit", "gradients", "kernels", "patches", "shapes", "surface", "tessellation"}
+
+
+def pytest_collection_finish():
+    # Otherwise a tenth of the time of tests is that of the garbage collector, which visits all tests again and again.
+    gc.freeze()
+
+
 def pytest_runtest_setup(item):
+    is_alone = item.path.parent.name in IN_ONE_THREAD and not item.get_closest_marker("threads")
+    dr.set_thread_count(1 if is_alone else ALL_THREADS)
     if os.name != "posix" and item.get_closest_marker("posix"):
         pytest.skip("there are no programs of the shell, signals, pipes or links as on POSIX")
 

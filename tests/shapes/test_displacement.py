@@ -725,6 +725,7 @@ def test_a_texture_needs_texture_coordinates():
         make(named_cages.cube(), bitmap())
 
 
+@pytest.mark.threads
 @every_variant
 def test_scenes_in_xml_have_displacement_too(tmp_path):
     cage = CAGES["islands"]()

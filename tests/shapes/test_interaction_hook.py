@@ -17,6 +17,8 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import exact_shading
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook import hook_trial, interaction_hook, machine_code
 
+pytestmark = pytest.mark.threads
+
 if interaction_hook.hook_problem():
     pytest.skip(str(interaction_hook.hook_problem()), allow_module_level=True)
 

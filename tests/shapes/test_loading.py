@@ -17,6 +17,8 @@ from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.shapes import nesting
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
+pytestmark = pytest.mark.threads
+
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))

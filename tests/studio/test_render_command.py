@@ -96,9 +96,10 @@ def test_one_core_reads_and_writes_openexr(folder, options):
     (folder / "sky.xml").write_text(ENVIRONMENT)
     command = ["render", "sky.xml", "-o", "a.exr", "-m", "scalar_rgb", "--spp", "2", "-t", "1", *options]
     core = min(os.sched_getaffinity(0))
-    run = f"import os; os.sched_setaffinity(0, {{{core}}})\nfrom mitsuba_subdivision.__main__ import main\nraise SystemExit(main())"
+    start = "from mitsuba_subdivision.__main__ import main; raise SystemExit(main())"
+    run = [sys.executable, "-c", f"import os; os.sched_setaffinity(0, {{{core}}}); {start}", *command]
     # Where all wait for a thread that there is not, they wait for ever.
-    subprocess.run([sys.executable, "-c", run, *command], check=True, capture_output=True, timeout=60)
+    subprocess.run(run, check=True, capture_output=True, timeout=60)
     np.testing.assert_allclose(pixels("a.exr")[..., :3], 0.5, rtol=1e-3)
 
 
