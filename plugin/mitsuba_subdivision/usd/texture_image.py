@@ -161,7 +161,7 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
     else:
         # Mitsuba's own message about a missing file is several lines long.
         content = Path(path).read_bytes()
-    pixels = _scaled_jpeg(content, needed, most) if content.startswith(_JPEG) else None
+    pixels = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
     if pixels is None:
         stream = mi.MemoryStream()
         stream.write(content)
@@ -171,17 +171,18 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
     return reduced(pixels, needed, most, is_srgb=is_srgb_image(pixels, color_space))
 
 
-def _scaled_jpeg(content: bytes, needed: float, most: int | None) -> NDArray[np.uint8] | None:
+def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | None) -> NDArray[np.uint8] | None:
     """A JPEG file decoded at a scale, which takes a third of the time; None if all of it is needed.
 
-    The last halving is left to `reduced`, as scales are means of encoded values.
+    Scales are means of encoded values. Of colours in sRGB, the last halving is left to `reduced`.
     """
     try:
         from PIL import Image
     except ImportError:
         return None
     with Image.open(io.BytesIO(content)) as image:
-        scale = min(1 << max(halvings(image.size, needed, most) - 1, 0), _MOST_SCALE)
+        is_srgb = color_space == "sRGB" or (color_space == "auto" and image.mode == "RGB")
+        scale = min(1 << max(halvings(image.size, needed, most) - is_srgb, 0), _MOST_SCALE)
         if scale == 1 or image.mode not in ("L", "RGB") or any(side % scale for side in image.size):
             return None
         image.draft(image.mode, (image.width // scale, image.height // scale))
