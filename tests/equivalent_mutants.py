@@ -90,8 +90,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     ),
     (
         "the same element, or another of the same value: all half-edges of a fan begin at its vertex, all channels have"
-        " as many pixels, a fan that begins at half-edge 0 is found either way, closed meshes have no valence of one,"
-        " maps of coefficients are square",
+        " as many pixels, a field of view is one number, a fan that begins at half-edge 0 is found either way,"
+        " closed meshes have no valence of one, maps of coefficients are square",
         (
             (
                 "images/paired_tier.py",
@@ -118,6 +118,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 ' f"valence {least} or more")',
                 'return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[ -1]]}",'
                 ' f"valence {least} or more")',
+            ),
+            (
+                "shapes/tessellation_parameters.py",
+                'fov = float(np.ravel(np.array(parameters["x_fov"]))[0])',
+                'fov = float(np.ravel(np.array(parameters["x_fov"]))[ -1])',
             ),
             (
                 "tessellation/tile_rates.py",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.kernels import line_intersection
 from mitsuba_subdivision.kernels.affine_map import AffineMap
 from mitsuba_subdivision.kernels.line_intersection import ON_LINE
@@ -103,9 +103,10 @@ def test_searches_for_nearest_points_end_soon(name, monkeypatch, np_rng):
         assert len(pieces) <= MOST_PIECES
 
 
-def test_scalar_variants_find_locations_beside_holes():
+@pytest.mark.parametrize(("scheme", "cage"), [("catmull_clark", cube()), ("loop", extraordinary_triangles(5))])
+def test_scalar_variants_find_locations_beside_holes(scheme, cage):
     """Faces are whole or holes here: none has corners of its own, and nothing is divided by their number."""
-    surface = LimitSurface(tagged(cube(), holes=[1]))
+    surface = LimitSurface(tagged(cage, holes=[1]), scheme)
     kernel, table = surface.on_device("scalar_rgb"), surface.sampling(2)
     locations = UniformLocations(table.grid, kernel.walk, kernel.types)
     expected = table.apply(surface.cage.positions)[0]

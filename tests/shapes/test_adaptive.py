@@ -7,6 +7,7 @@ import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface, pixel_error_for
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
@@ -50,6 +51,38 @@ def test_errors_are_in_the_world():
     """A shape that is ten times as large has the same triangles at ten times the error."""
     large = make(chord_error=1e-1, to_world=mi.ScalarTransform4f().scale(10))
     np.testing.assert_array_equal(buffer(large, "faces"), buffer(make(chord_error=1e-2), "faces"))
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_pixels_of_displaced_shapes_are_those_of_the_world():
+    """The cage and the heights may be four times as large, or the shape: it has the same triangles."""
+    height = Attribute(np.linspace(0, 1, 8)[:, None], "vertex")
+    cage = tagged(named_cages.cube(), attributes={"height": height})
+    view = mi.ScalarTransform4f().look_at(origin=[8, -12, 8], target=[0, 0, 0], up=[0, 0, 1])
+    film = {"sensor_to_world": view, "sensor_fov": 40.0, "film_width": 64, "film_height": 48}
+
+    def faces(cage, displacement_scale, scale):
+        heights = {"displacement": "vertex_height", "displacement_scale": displacement_scale}
+        to_world = mi.ScalarTransform4f().scale(scale)
+        return buffer(make(cage, to_world=to_world, pixel_error=0.25, **film, **heights), "faces")
+
+    np.testing.assert_array_equal(faces(cage, 0.5, 4), faces(cage.with_positions(4 * cage.positions), 2.0, 1))
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_an_orthographic_sensor_sees_the_outline_that_one_from_far_away_sees():
+    cage = bumpy(named_cages.extraordinary(5))
+    film = {"film_width": 64, "film_height": 48}
+
+    def faces(fov, distance, **outline):
+        eye = distance * np.array([4.0, -6, 3])
+        to_world = mi.ScalarTransform4f().look_at(origin=eye.tolist(), target=[0, 0, 0], up=[0, 0, 1])
+        sensor = {"sensor_to_world": to_world, "sensor_fov": fov, **film} if outline else {}
+        return buffer(make(cage, chord_error=1e-2, **sensor, **outline), "faces")
+
+    found = faces(0.0, 1, outline="sensor")
+    np.testing.assert_array_equal(found, faces(1e-3, 1e5, outline="sensor"))
+    assert len(found) < len(faces(0.0, 1))
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

@@ -487,6 +487,21 @@ def test_a_plane_is_met_without_a_step():
         np.testing.assert_allclose([*si.p, *si.n], [x, y, 0, 0, 0, 1], atol=SINGLE)
 
 
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_all_hits_are_counted_for_the_log(monkeypatch):
+    """With the level Debug, by where they were found; the shape logs those before the latest."""
+    plane = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="edge_and_corner")
+    scene, logged = mi.load_dict({"type": "scene", "shape": make(plane, tessellation_rate=1)}), []
+    monkeypatch.setattr(mi, "Log", lambda _level, text: logged.append(text))
+    monkeypatch.setattr(mi, "log_level", lambda: mi.LogLevel.Debug)
+    count = 5 if dr.is_jit_v(mi.Float) else 1
+    for _ in range(2):
+        ray = mi.Ray3f(mi.Point3f(mi.Float([0.3] * count) if count > 1 else 0.3, 0.6, 3), mi.Vector3f(0, 0, -1))
+        dr.eval(scene.ray_intersect(ray).n)
+    (text,) = logged
+    assert f"of {count} hits, 100.00% are on the ray, 0.00% are along" in text
+
+
 @pytest.mark.parametrize("inside_of", ["glass", "fog"])
 @llvm
 def test_light_passes_through(inside_of):

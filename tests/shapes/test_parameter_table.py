@@ -77,6 +77,7 @@ def test_a_stated_default_is_the_value_as_scene_files_have_it(row):
         stated = stated[1] or stated[2]
         kinds = {bool: {"true": True, "false": False}.get, str: str}
         assert kinds.get(type(row.default), float)(stated) == row.default
+    assert row.checked(row.default) == row.default
 
 
 def test_names_with_placeholders_are_those_of_attributes():

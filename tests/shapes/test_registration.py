@@ -61,6 +61,17 @@ def test_every_variant(variants_all):
     assert isinstance(shape, register_variant(variants_all))
 
 
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_a_missing_llvm_matters_to_its_own_variants_only(monkeypatch):
+    monkeypatch.setattr("mitsuba_subdivision.shapes.subdivision_shape.llvm_problem", lambda: "no LLVM here")
+    shape = {"type": "subdivision", **named_cages.cube().as_properties(mi), "tessellation_rate": 1}
+    if mi.variant().startswith("llvm"):
+        with pytest.raises(RuntimeError, match="no LLVM here"):
+            mi.load_dict(shape)
+    else:
+        assert mi.load_dict(shape).face_count() == 12
+
+
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_registers_once():
     before = register_variant("scalar_rgb")

@@ -286,3 +286,18 @@ def test_rates_follow_a_displacement(name):
         away = np.abs(np.einsum("ij,ij->i", weights @ corners - point, normal))
         # At the same parameters: where the displacement is steep, what points are off along the surface counts as well.
         assert away.max() <= 1.5 * error * size
+
+
+def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():
+    """The criterion samples heights, also there: a face that is flat elsewhere is divided."""
+    plane = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="edge_and_corner")
+    surface = LimitSurface(plane)
+
+    def triangles(height):
+        def heights(_, uv):
+            return np.where(np.abs(uv - 0.5).max(axis=1) < 1e-3, height, 0.0)
+
+        criterion = Criterion(Measure.CHORD, 0.05, displacement=DisplacementBound(heights, 1.0))
+        return len(surface.adaptive_sampling(criterion, 64).triangles)
+
+    assert triangles(1.0) > 2 * triangles(0.0)

@@ -113,9 +113,7 @@ class Lanes:
         if is_turned:
             u = v = dr.maximum(u, v)
         extent = reduce(dr.maximum, map(dr.abs, relative))
-        if self._rounding:
-            extent = dr.maximum(extent, dr.abs(origin) * self._rounding)
-        return RoundingBound(u, v, extent)
+        return RoundingBound(u, v, dr.maximum(extent, dr.abs(origin) * self._rounding))
 
     def one_rings(self, patch: Index, kind: Index) -> Callable[[Index], Index]:
         """Function that finds the control points of some patches by their column in `ClassStencils.controls`.

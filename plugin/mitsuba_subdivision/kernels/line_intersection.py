@@ -67,7 +67,7 @@ class Lines:
 
     o: Vector3
     d: Vector3
-    hold: Mask = True
+    hold: Mask
 
     def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton's step at given values of the surface, with derivatives that follow the line."""

@@ -115,15 +115,11 @@ class NearestLocation:
             now = dr.squared_norm(away)
             size = dr.norm(p) + dr.norm(values.value)
             improves = now <= squared + rounded * size * (dr.sqrt(now) + rounded * size)
-            # Distance moved: less than the step if the point has reached a border.
-            stays = here.half_edge == half_edge
-            length = dr.maximum(dr.abs(part * du), dr.abs(part * dv))
-            moved = dr.select(stays, dr.maximum(dr.abs(here.u - u), dr.abs(here.v - v)), length)
-            moved = dr.minimum(moved, length) * piece.magnification
+            length = dr.maximum(dr.abs(part * du), dr.abs(part * dv)) * piece.magnification
             is_first = dr.isinf(squared)
             new_u, new_v, along_u, along_v, is_free = self._step(here, values, away)
-            ends = (improves & (is_first == False) & (moved < last_step)) | (  # noqa: E712 - an array
-                (improves == False) & (length * piece.magnification < given_up)  # noqa: E712
+            ends = (improves & (is_first == False) & (length < last_step)) | (  # noqa: E712 - an array
+                (improves == False) & (length < given_up)  # noqa: E712
             )
             best = Location(half_edge, u, v).chosen(improves, here)
             return (
