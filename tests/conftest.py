@@ -26,6 +26,11 @@ ALL_THREADS = dr.thread_count()
 IN_ONE_THREAD = {"evaluation", "fit", "gradients", "kernels", "patches", "shapes", "surface", "tessellation"}
 
 
+def pytest_collection_finish():
+    # Otherwise a tenth of the time of tests is that of the garbage collector, which visits all tests again and again.
+    gc.freeze()
+
+
 def pytest_runtest_setup(item):
     is_alone = item.path.parent.name in IN_ONE_THREAD and not item.get_closest_marker("threads")
     dr.set_thread_count(1 if is_alone else ALL_THREADS)
