@@ -213,3 +213,40 @@ def test_any_cage_has_an_adaptive_tessellation(seed):
     if (surface.patches.elements.twin >= 0).all():
         edges = directed_edges(table.triangles)[:, ::-1]
         np.testing.assert_array_equal(keys[0], np.sort(numbered(edges, table.vertex_count)))
+
+
+def faces_back_to_back(points, size):
+    """A polygon twice, in opposite directions, which meet along the middle; flat, as a sheet of paper folded once."""
+    return ControlCage(np.insert(np.array(points, dtype=float), 2, 0, axis=1), [range(size), range(size)[::-1]])
+
+
+FOLDED = {
+    "convex": faces_back_to_back([(0, 0), (1, 0), (1.4, 1), (0, 1)], 4),
+    "concave": faces_back_to_back([(0, 0), (1, 0.8), (2, 0), (1, 2)], 4),
+    "foldover": ControlCage(
+        np.array([(-2, -4, 0), (2, -4, 0), (4, 0, 0), (2, 4, 0), (-2, 4, 0), (-4, 0, 0)]) / 4,
+        [(0, 1, 2, 3, 4, 5), (5, 4, 3), (5, 1, 0)],
+    ),
+}
+
+
+def distance_to_triangles(points, corners):
+    """``(s,)`` distances in a plane of points ``(s, 2)`` from the nearest of triangles ``(t, 3, 2)``."""
+    origin, along = corners[None], (np.roll(corners, -1, axis=1) - corners)[None]
+    offset = points[:, None, None] - origin
+    part = (offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), np.finfo(float).tiny)
+    from_sides = np.linalg.norm(offset - np.clip(part, 0, 1)[..., None] * along, axis=-1).min(axis=2)
+    side = along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
+    is_inside = (side > 0).all(axis=2) | (side < 0).all(axis=2)
+    return np.where(is_inside, 0, from_sides).min(axis=1)
+
+
+@pytest.mark.parametrize("name", FOLDED)
+def test_a_surface_folded_in_its_plane_is_covered(name):
+    """All heights are equal, and still the surface's points are as near to the triangles as the limit says."""
+    surface, error = LimitSurface(FOLDED[name]), 1e-3
+    table, dense = table_of(surface, error, 1024), surface.sampling(12)
+    corners = table.apply(surface.cage.positions)[0][table.triangles][..., :2]
+    reached = distance_to_triangles(dense.apply(surface.cage.positions)[0][:, :2], corners).max()
+    size = np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
+    assert reached <= error * size * (1 + ROUNDING)

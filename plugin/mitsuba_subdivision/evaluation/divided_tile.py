@@ -15,6 +15,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from ..mesh.connectivity import IntArray
+from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .bernstein import regular_bernstein, times
@@ -48,6 +50,16 @@ class DividedTile:
         if isinstance(self._source, IrregularPatch):
             return len(self._source.basis.eigenvalues)
         return self._source.control_count
+
+    @property
+    def signature(self) -> Signature:
+        """Of the one-ring that the control points are of."""
+        return self._source.structure.signature if isinstance(self._source, IrregularPatch) else self._source.signature
+
+    @property
+    def slots(self) -> IntArray | None:
+        """The vertices of the one-ring that are control points; None if all are."""
+        return self._source.structure.slots if isinstance(self._source, IrregularPatch) else None
 
     @property
     def is_self_similar(self) -> bool:

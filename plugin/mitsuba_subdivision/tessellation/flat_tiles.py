@@ -57,34 +57,41 @@ def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) ->
         topology = one_ring(each.signature.smoothed).topology
         size = int(topology.face_sizes[0])
         corners[..., each.at] = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
-    axis, extent = axis_across(corners), np.empty(count)
+    axis, extent, folded = axis_across(corners), np.empty(count), np.empty(count, dtype=bool)
     for each in groups:
         extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
+        folded[each.at] = _are_folded(each.signature, each.points, axis[:, each.at])
     limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
     fits = np.linalg.norm(upper - lower, axis=0) <= limit
     if rates.criterion.measure is Measure.EDGE:
         return fits
-    return fits | (axis.any(axis=0) & (extent <= limit) & ~tiles.sides.any(axis=1))
+    return fits | (axis.any(axis=0) & ~folded & (extent <= limit) & ~tiles.sides.any(axis=1))
 
 
 def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray[np.bool_]:
     """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along feature edges."""
     count, m = len(tiles), rates.domain.corner_count
     lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((m, 3, count))
+    axis, folded = np.empty((3, count)), np.empty(count, dtype=bool)
     for each in groups:
-        ring = each.tile.one_ring_points(each.values)
+        ring, own = each.tile.one_ring_points(each.values), times(each.tile.corners, each.values)
         lower[:, each.owner], upper[:, each.owner] = ring.min(axis=0), ring.max(axis=0)
-        corners[..., each.owner] = times(each.tile.corners, each.values)
-    limit, axis = rates.limit(tiles, lower, upper, NormalCone.of_any(count)), axis_across(corners)
+        corners[..., each.owner], axis[:, each.owner] = own, axis_across(own)
+        folded[each.owner] = _are_folded(each.tile.signature, ring, axis[:, each.owner], each.tile.slots)
+    limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
     if rates.criterion.measure is Measure.EDGE:
         return fit_within(rates.scheme, limit, groups)
     parts = [TileParts(each.tile, dot(each.values, axis[:, each.owner])[:, None], each.owner) for each in groups]
-    # A tile without a normal, or folded across it, is tested by its size only.
+    # A tile without a normal, or that may be folded, is tested by its size only.
     fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & bool(optional_member(rates.scheme, "has_convex_rules"))
-    has_normal = axis.any(axis=0) & ~_are_folded(corners, axis) if m > 3 else axis.any(axis=0)
+    has_normal = axis.any(axis=0)
     found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
+    folded &= found & ~fits
+    if folded.any():
+        found &= ~folded | (_normal_sines(rates, groups, axis, folded) < 1)
     if rates.criterion.outline is not None:
-        cone = NormalCone(axis, _normal_sines(rates, tiles, groups, axis))
+        # A border may be a silhouette for any normals.
+        cone = NormalCone(axis, _normal_sines(rates, groups, axis, np.logical_not(tiles.sides.any(axis=1))))
         higher = np.where(~found & (cone.sine < 1), rates.limit(tiles, lower, upper, cone), -1.0)
         found |= fit_within(rates.scheme, higher, parts)
     may_curve = found & ~fits & tiles.sides.any(axis=1)
@@ -93,29 +100,43 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray
     return found
 
 
-def _are_folded(corners: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
-    """``(t,)`` whether the triangles of tiles with corners ``(m, 3, t)`` face opposite ways, seen along axes.
+def _are_folded(
+    signature: Signature, points: FloatArray, axis: FloatArray, slots: IntArray | None = None
+) -> NDArray[np.bool_]:
+    """``(t,)`` whether control faces of one-rings ``(K, 3, t)`` face opposite ways, seen along axes ``(3, t)``.
 
-    Such a surface has silhouettes along its folds, and not only along edges of the cage.
+    Such a surface has silhouettes along its folds, and not only along edges of the cage. At a dart, where one vertex of
+    the ring is left out as it equals another, so are its faces.
     """
-    back, along = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
-    areas = dot(cross(back, along), axis)
+    t, (first, second) = one_ring(signature.smoothed).topology, _normals_to(axis)
+    # The diagonals of each face; of triangles, two sides.
+    quarters = t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4
+    vertices = t.face_vertices[quarters]
+    if slots is not None:
+        number = np.full(t.vertex_count, -1)
+        number[slots] = np.arange(len(slots))
+        vertices = number[vertices]
+    a, b, c, d = vertices[:, (vertices >= 0).all(axis=0)]
+    x, y = dot(points, first), dot(points, second)
+    areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
     folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
     return folded
 
 
-def _normal_sines(rates: TileRates, tiles: Tiles, groups: list[TileParts], axis: FloatArray) -> FloatArray:
-    """``(t,)`` sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles.
+def _normal_sines(
+    rates: TileRates, groups: list[TileParts], axis: FloatArray, are_asked: NDArray[np.bool_]
+) -> FloatArray:
+    """``(t,)`` sines of half the angles of cones about axes ``(3, t)`` that contain all normals of some tiles.
 
-    One where normals are unknown, and along a border, which may be a silhouette for any normals. Nearer to an
-    extraordinary point than the pieces, normals turn less than on these.
+    One where normals are unknown, and for other tiles. Nearer to an extraordinary point than the pieces, normals turn
+    less than on these.
     """
-    found, basis = np.ones(len(tiles)), rates.basis
+    found, basis = np.ones(axis.shape[1]), rates.basis
     for each in groups:
-        inside = np.logical_not(tiles.sides[each.owner].any(axis=1))
-        if each.tile.pieces is None or not inside.any():
+        on = are_asked[each.owner]
+        if not on.any() or each.tile.pieces is None:
             continue
-        own, pieces = each.chosen(inside), each.tile.pieces
+        own, pieces = each.chosen(on), each.tile.pieces
         coefficients = times(pieces.reshape(-1, pieces.shape[2]), own.values)
         by_coefficient = coefficients.reshape(-1, len(basis.indices), *coefficients.shape[1:]).swapaxes(0, 1)
         by_coefficient = np.ascontiguousarray(by_coefficient)

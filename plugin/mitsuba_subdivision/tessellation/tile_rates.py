@@ -108,6 +108,8 @@ class TileRates:
         axis = axis_across(coefficients[self.basis.corners])
         extent = np.ptp(dot(coefficients, axis), axis=0)
         is_flat = self.are_within(tiles, coefficients.min(axis=0), coefficients.max(axis=0), axis, extent)
+        if self.criterion.measure is Measure.CHORD:
+            is_flat[is_flat] = self._face_one_way(coefficients[..., is_flat], axis[:, is_flat])
         found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
         tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
         forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
@@ -146,6 +148,14 @@ class TileRates:
                     self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
                 )
         return found
+
+    def _face_one_way(self, coefficients: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+        """``(t,)`` whether normals of tiles in pieces are known to lead to one side of the planes across axes.
+
+        A tile that is folded in its plane reaches beyond its corners, and no triangle covers that.
+        """
+        tangents = [TangentCone.of(times(derivative, coefficients)) for derivative in self.basis.derivatives]
+        return NormalCone.of(*tangents).around(axis).sine < 1
 
     def most(self, tiles: Tiles) -> IntArray:
         """``(t,)`` the highest rates that tiles may have."""
