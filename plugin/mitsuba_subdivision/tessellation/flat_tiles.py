@@ -57,15 +57,17 @@ def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) ->
         topology = one_ring(each.signature.smoothed).topology
         size = int(topology.face_sizes[0])
         corners[..., each.at] = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
-    axis, extent, folded = axis_across(corners), np.empty(count), np.empty(count, dtype=bool)
-    for each in groups:
-        extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
-        folded[each.at] = _are_folded(each.signature, each.points, axis[:, each.at])
     limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
     fits = np.linalg.norm(upper - lower, axis=0) <= limit
     if rates.criterion.measure is Measure.EDGE:
         return fits
-    return fits | (axis.any(axis=0) & ~folded & (extent <= limit) & ~tiles.sides.any(axis=1))
+    axis = axis_across(corners)
+    may_be_flat = axis.any(axis=0) & ~fits & ~tiles.sides.any(axis=1)
+    for each in groups:
+        extent = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
+        flat = each.chosen(may_be_flat[each.at] & (extent <= limit[each.at]))
+        fits[flat.at] = ~_are_folded(flat.signature, flat.points, axis[:, flat.at])
+    return fits
 
 
 def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray[np.bool_]:
