@@ -13,7 +13,7 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme_members import optional_member
-from .cones import NormalCone, TangentCone, cross, dot
+from .cones import NormalCone, cross, dot
 from .criterion import Measure
 from .tile_extents import TileParts, fit_within
 from .tile_rates import TileRates, axis_across
@@ -133,17 +133,16 @@ def _normal_sines(
     One where normals are unknown, and for other tiles. Nearer to an extraordinary point than the pieces, normals turn
     less than on these.
     """
-    found, basis = np.ones(axis.shape[1]), rates.basis
+    found = np.ones(axis.shape[1])
     for each in groups:
         on = are_asked[each.owner]
         if not on.any() or each.tile.pieces is None:
             continue
         own, pieces = each.chosen(on), each.tile.pieces
         coefficients = times(pieces.reshape(-1, pieces.shape[2]), own.values)
-        by_coefficient = coefficients.reshape(-1, len(basis.indices), *coefficients.shape[1:]).swapaxes(0, 1)
+        by_coefficient = coefficients.reshape(-1, len(rates.basis.indices), *coefficients.shape[1:]).swapaxes(0, 1)
         by_coefficient = np.ascontiguousarray(by_coefficient)
-        tangents = [TangentCone.of(times(derivative, by_coefficient)) for derivative in basis.derivatives]
-        found[own.owner] = NormalCone.of(*tangents).around(axis[:, own.owner]).sine.max(axis=0)
+        found[own.owner] = rates.normal_sines(by_coefficient, axis[:, own.owner]).max(axis=0)
     return found
 
 

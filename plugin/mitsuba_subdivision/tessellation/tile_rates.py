@@ -109,7 +109,8 @@ class TileRates:
         extent = np.ptp(dot(coefficients, axis), axis=0)
         is_flat = self.are_within(tiles, coefficients.min(axis=0), coefficients.max(axis=0), axis, extent)
         if self.criterion.measure is Measure.CHORD:
-            is_flat[is_flat] = self._face_one_way(coefficients[..., is_flat], axis[:, is_flat])
+            # A tile that is folded in its plane reaches beyond its corners, and no triangle covers that.
+            is_flat[is_flat] = self.normal_sines(coefficients[..., is_flat], axis[:, is_flat]) < 1
         found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
         tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
         forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
@@ -149,13 +150,13 @@ class TileRates:
                 )
         return found
 
-    def _face_one_way(self, coefficients: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
-        """``(t,)`` whether normals of tiles in pieces are known to lead to one side of the planes across axes.
+    def normal_sines(self, coefficients: FloatArray, axis: FloatArray) -> FloatArray:
+        """Sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles or their pieces.
 
-        A tile that is folded in its plane reaches beyond its corners, and no triangle covers that.
+        One where normals are not known to lead to one side of the planes across the axes.
         """
         tangents = [TangentCone.of(times(derivative, coefficients)) for derivative in self.basis.derivatives]
-        return NormalCone.of(*tangents).around(axis).sine < 1
+        return NormalCone.of(*tangents).around(axis).sine
 
     def most(self, tiles: Tiles) -> IntArray:
         """``(t,)`` the highest rates that tiles may have."""

@@ -265,8 +265,10 @@ class _Surface:
     def _has_white_edges(self) -> bool:
         """Whether a metal turns to white towards its edges as Schlick has it, and `principled`."""
         base, edge = self._inputs["base_color"], self._inputs["edge_color"]
-        if self._is("edge_color", 1) or not (is_constant(base) and is_constant(edge)):
-            return self._is("edge_color", 1)
+        if self._is("edge_color", 1):
+            return True
+        if not (is_constant(base) and is_constant(edge)):
+            return False
         color = constant(base, 3)
         found = conductor_reflectance(*conductor(color, constant(edge, 3)), COSINE_82)
         return bool(np.abs(found - schlick_reflectance(color, COSINE_82)).max() < _VISIBLE)

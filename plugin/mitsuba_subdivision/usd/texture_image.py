@@ -150,7 +150,11 @@ def _full(dtype: np.dtype) -> int:
 
 def is_srgb_image(pixels: NDArray, color_space: str) -> bool:
     """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
-    return color_space == "sRGB" or (color_space == "auto" and pixels.dtype == np.uint8 and pixels.shape[2] >= 3)
+    return _is_srgb(color_space, pixels.dtype, pixels.shape[2])
+
+
+def _is_srgb(color_space: str, dtype: np.dtype, channels: int) -> bool:
+    return color_space == "sRGB" or (color_space == "auto" and dtype == np.uint8 and channels >= 3)
 
 
 def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDArray:
@@ -181,7 +185,7 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
     except ImportError:
         return None
     with Image.open(io.BytesIO(content)) as image:
-        is_srgb = color_space == "sRGB" or (color_space == "auto" and image.mode == "RGB")
+        is_srgb = _is_srgb(color_space, np.dtype(np.uint8), len(image.getbands()))
         scale = min(1 << max(halvings(image.size, needed, most) - is_srgb, 0), _MOST_SCALE)
         if scale == 1 or image.mode not in ("L", "RGB") or any(side % scale for side in image.size):
             return None
