@@ -105,19 +105,6 @@ def slow_mesh(scheme, cage):
     )
 
 
-@EVERY_CAGE
-def test_refinement_is_that_of_the_rules_vertex_by_vertex(scheme, cage):
-    cage = with_bumps(cage)
-    surface, slow = LimitSurface(cage, scheme), slow_mesh(scheme, cage)
-    sharpness = np.concatenate([cage.tags.edges, cage.tags.vertices])
-    # A third time where something stops to be sharp in it.
-    for _ in range(3 if ((sharpness > 2) & (sharpness < 3)).any() else 2):
-        surface, slow = refined(surface), slow.refined()
-        found = surface.cage.positions[surface.cage.face_vertices]
-        expected = slow.points[np.concatenate(slow.faces)]
-        assert np.abs(found - expected).max() <= POSITION * 10
-
-
 @pytest.mark.core
 @EVERY_CAGE
 def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
