@@ -12,7 +12,16 @@ from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
-from reference.refined_cages import differences_to_refined, half_disc, refined, sheet, spokes, tagged, with_bumps
+from reference.refined_cages import (
+    differences_to_refined,
+    half_disc,
+    refined,
+    sheet,
+    spokes,
+    tagged,
+    upper_half,
+    with_bumps,
+)
 
 pytestmark = pytest.mark.core
 
@@ -42,8 +51,11 @@ CAGES = {
 }
 for n in (3, 4, 5, 6, 8):
     for kind, chosen in (("dart", [0]), ("crease", [0, n // 2]), ("corner", [0, 1, 2])):
-        CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n), n, chosen))
-        CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(extraordinary_triangles(n), n, chosen))
+        CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(extraordinary(n, closed=False), n, chosen))
+        CAGES[f"loop {kind} at valence {n}"] = (
+            "loop",
+            star_of_creases(upper_half(extraordinary_triangles(n)), n, chosen),
+        )
 # The faces around one end of a crease are those around the other, and close around it.
 TETRAHEDRON = ControlCage(
     [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]],

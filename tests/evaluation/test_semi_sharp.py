@@ -23,7 +23,7 @@ from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
-from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, with_bumps
+from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, upper_half, with_bumps
 from reference.sharp_refinement import SharpMesh
 
 # Of cages of size about 2, in float64.
@@ -62,7 +62,7 @@ CAGES = {
     "sharp vertex on a border": ("catmull_clark", sheet(3, 3, corners=[(1, 1.4), (5, 0.6)])),
     "along a border and from it": ("catmull_clark", sheet(3, 3, creases=[(1, 2, 0.7), (2, 3, 2.5), (2, 6, 1.5)])),
     "crease into a border": ("catmull_clark", sheet(3, 3, creases=[(1, 5, 1.5), (5, 9, 0.5)])),
-    "pentagon": ("catmull_clark", tagged(extraordinary_face(5), creases=[(0, 1, 1.5), (1, 2, 0.7)])),
+    "pentagon": ("catmull_clark", tagged(upper_half(extraordinary_face(5)), creases=[(0, 1, 1.5), (1, 2, 0.7)])),
     "triangle sheet": ("loop", sheet(3, 3, triangles=True, creases=[(5, 6, 1.5), (6, 10, 0.7)], corners=[(9, 1.2)])),
 }
 for kind, sharpness in {
@@ -78,8 +78,8 @@ for kind, sharpness in {
     "into a corner": (10, 10, 10, 1.5),
     "into a corner from several sides": (10, 1.5, 10, 10, 2.5),
 }.items():
-    CAGES[kind] = ("catmull_clark", spokes(extraordinary(5), 5, sharpness))
-    CAGES[f"loop {kind}"] = ("loop", spokes(extraordinary_triangles(5), 5, sharpness))
+    CAGES[kind] = ("catmull_clark", spokes(extraordinary(5, closed=False), 5, sharpness))
+    CAGES[f"loop {kind}"] = ("loop", spokes(upper_half(extraordinary_triangles(5)), 5, sharpness))
 for name, (scheme, cage) in list(CAGES.items()):
     if len(cage.tags.creases(cage.topology)) > 1 and "ring of" not in name:
         creases = cage.tags.creases(cage.topology)

@@ -195,13 +195,13 @@ def test_values_stay_when_triangles_are_chosen_anew(shading):
     parameters = mi.traverse(shape)
     count = shape.vertex_count()
     assign(parameters, cube(1))
-    parameters["chord_error"] = ADAPTIVE["chord_error"] / 8
+    parameters["chord_error"] = ADAPTIVE["chord_error"] / 3
     parameters.update()
     assert shape.vertex_count() > count
-    assert_alike(shape, make(cube(1), shading=shading, **{**ADAPTIVE, "chord_error": ADAPTIVE["chord_error"] / 8}))
+    assert_alike(shape, make(cube(1), shading=shading, **{**ADAPTIVE, "chord_error": ADAPTIVE["chord_error"] / 3}))
     assign(parameters, cube(2))
     shape.retessellate()
-    assert_alike(shape, make(cube(2), shading=shading, **{**ADAPTIVE, "chord_error": ADAPTIVE["chord_error"] / 8}))
+    assert_alike(shape, make(cube(2), shading=shading, **{**ADAPTIVE, "chord_error": ADAPTIVE["chord_error"] / 3}))
 
 
 @every_variant

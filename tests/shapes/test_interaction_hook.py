@@ -393,9 +393,10 @@ def test_groups_side_by_side_are_as_each_alone():
         parameters.update()
         si = scene.ray_intersect(ray)
         dr.backward(dr.sum(dr.select(si.is_valid(), dr.dot(si.p + si.sh_frame.n, mi.Vector3f(1, 2, 3)), 0)))
-        values = (*si.p, *si.sh_frame.n, *si.dp_du, si.is_valid())
-        dr.eval(values)
-        return np.array([np.array(each) for each in values]), np.array(dr.grad(parameters[key]))
+        values, gradient = (*si.p, *si.sh_frame.n, *si.dp_du, si.is_valid()), dr.grad(parameters[key])
+        # In one kernel.
+        dr.eval(values, gradient)
+        return np.array([np.array(each) for each in values]), np.array(gradient)
 
     both = scene_of(0, 1)
     normals = np.array(dr.freeze(lambda scene, ray: scene.ray_intersect(ray).sh_frame.n)(both, ray))
