@@ -369,7 +369,7 @@ def derivatives(assign, loss):
 
 # Where weights make what hits look up: of linear interpolation over polygons, and of cages that are refined once.
 RENDERS = [
-    *(("cube", "vertex", name) for name in NAMES),
+    *(("cube", "vertex", name) for name in ("texcoords", "weight")),
     ("adaptive", "vertex", "label"),
     ("loop", "vertex", "colour"),
     *(("mixed", "exact", name) for name in NAMES),
