@@ -119,7 +119,7 @@ def over_own_points(part):
     return part.pieces if part.stencils is None else part.pieces @ part.stencils
 
 
-def places(scheme, rng, count=24):
+def places(scheme, rng, count=12):
     """All over the domain, and down to 2^-22 at every corner."""
     domain = scheme.domain
     uv = rng.dirichlet(np.ones(domain.corner_count), count) @ domain.corners

@@ -367,7 +367,7 @@ def together_and_alone(scheme, signatures):
     """Every part of elements that are refined together, twice in the same mesh, and of those that are alone."""
     mesh = RingMesh(scheme, Counter(signature.smoothed for signature in signatures))
     # Those that have the same place in the mesh come in another order, and some are left out.
-    for chosen in (signatures, signatures[::-1], signatures[::2]):
+    for chosen in (signatures, signatures[::-2]):
         for signature, (rings, ring) in zip(chosen, mesh.refined(chosen), strict=True):
             for number, (_, child, stencils) in enumerate(refined_children(scheme, signature)):
                 yield (child, stencils), rings.child(ring, number)
