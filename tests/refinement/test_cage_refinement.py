@@ -47,7 +47,7 @@ def some_samples(surface, rng):
     """Half of them near the elements' first corners."""
     sizes = surface.patches.elements.face_sizes
     element = rng.choice(np.flatnonzero(sizes), SAMPLES)
-    uv = rng.uniform(0.01, 1, (SAMPLES, 2)) * 2.0 ** -rng.integers(0, 6, (SAMPLES, 1))
+    uv = rng.uniform(0.01, 1, (SAMPLES, 2)) * 2.0 ** -rng.integers(0, 3, (SAMPLES, 1))
     if surface.scheme.domain.corner_count == 3:
         uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
     return element, uv
