@@ -82,9 +82,9 @@ def crease_masks(topology: Topology) -> CreaseMasks:
         t, centre, infinite, infinite | (refined > 0), semi.vertices_refined > 0, across[across_refined > 0]
     )
 
-    # The mean sharpness of all that becomes smooth: at most 1, though single edges are sharper by Chaikin's method. Where
-    # it makes all n edges smooth, sum over 3 s_i + (T - s_i) / (n - 1) <= 4, T the total, to 4 T <= 4 n; where some stay
-    # sharp, these are the sharper ones.
+    # The mean sharpness of all that becomes smooth: at most 1, though single edges are sharper by Chaikin's method.
+    # Where it makes all n edges smooth, the sum over 3 s_i + (T - s_i) / (n - 1) <= 4, with T their total, is
+    # 4 T <= 4 n; where some stay sharp, these are the sharper ones.
     at = np.concatenate([centre, np.arange(t.vertex_count), across])
     was = np.concatenate([sharpness, semi.vertices, was_across])
     becomes_smooth = (was > 0) & (np.concatenate([refined, semi.vertices_refined, across_refined]) == 0)
