@@ -90,7 +90,7 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     becomes_smooth = (was > 0) & (np.concatenate([refined, semi.vertices_refined, across_refined]) == 0)
     count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
     total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
-    share_before = total / np.maximum(count, 1)
+    share_before: FloatArray = total / np.maximum(count, 1)
     share_before[(before[0] == after[0]) | (before[0] < 2)] = 1
 
     twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]
