@@ -134,8 +134,13 @@ def test_equal_values_share_their_memory_until_those_of_one_shape_change():
     np.testing.assert_array_equal(np.array(second["cage_texcoords"]), before)
 
 
+# Under exact shading, vertices that no seam asks for hold no values; hits are those of test_hits_follow.
 @every_variant
-@shadings
+@pytest.mark.parametrize(
+    ("cage", "shading"),
+    [*((name, "vertex") for name in CAGES), *(pytest.param(name, "exact", marks=exact) for name in ("cube", "mixed"))],
+    indirect=["cage"],
+)
 def test_an_update_equals_a_new_shape(cage, shading):
     made, parameters = cage
     shape = make(made(), shading=shading, **parameters)
