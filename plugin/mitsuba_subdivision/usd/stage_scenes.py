@@ -25,7 +25,7 @@ from ..studio.studio_entries import variant_in_use
 from ..studio.view import View
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
-from .copies import with_copies
+from .copies import with_copies, with_large_copies
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
@@ -118,6 +118,8 @@ class StageScenes:
         if self._reader is None or (self._files is not None and self._files.are_many):
             self._reader = StageReader(path, self._camera, warned=self._warned)
         contents = self._reader.at(None if time is None else time + delay)
+        if mi.Float is not float:
+            contents = with_large_copies(contents)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
             self._parameters = {**self._parameters, "shading": shading_for(variant_in_use(), self._parameters)}
