@@ -86,6 +86,10 @@ def _set_up(scene, camera):
     scene.camera = placed
     lens.sensor_fit, lens.angle = "HORIZONTAL", math.radians(camera["fov"])
     lens.clip_start, lens.clip_end = 1e-4, 1e4
+    if camera["lens"]:
+        radius, lens.dof.focus_distance = camera["lens"]
+        # The focal length is in millimetres.
+        lens.dof.use_dof, lens.dof.aperture_fstop = True, lens.lens / (2000 * radius)
     # Blender has z upwards, where the importer turns a stage that has y; cameras look along -z, Mitsuba's along z.
     turn = mathutils.Matrix.Rotation(math.radians(90), 4, "X") if camera["up"] == "y" else mathutils.Matrix.Identity(4)
     placed.matrix_world = turn @ mathutils.Matrix(camera["to_world"]) @ mathutils.Matrix.Diagonal((-1, 1, -1, 1))
@@ -94,7 +98,18 @@ def _set_up(scene, camera):
     world = bpy.data.worlds.new("sky")
     scene.world = world
     world.use_nodes = True
-    world.node_tree.nodes["Background"].inputs[0].default_value = (0.8, 0.8, 0.8, 1)
+    background = world.node_tree.nodes["Background"]
+    background.inputs[0].default_value = (0.8, 0.8, 0.8, 1)
+    if camera["dome"]:
+        coordinates, turned, picture = (
+            world.node_tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "Mapping", "TexEnvironment")
+        )
+        picture.image = bpy.data.images.load(camera["dome"])
+        # The middle of USD's pictures is +z, where y is up.
+        turned.inputs["Rotation"].default_value[2] = math.radians(-90)
+        world.node_tree.links.new(turned.inputs[0], coordinates.outputs["Generated"])
+        world.node_tree.links.new(picture.inputs[0], turned.outputs[0])
+        world.node_tree.links.new(background.inputs[0], picture.outputs[0])
 
 
 if __name__ == "__main__":

@@ -3,6 +3,9 @@
 import subprocess
 import sys
 
+import mitsuba as mi
+import pytest
+from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
 
 SCRIPT = """
@@ -30,3 +33,20 @@ def test_rendering_works_after_errors_that_are_kept(variant_llvm_ad_rgb):  # noq
     command = [sys.executable, "-c", SCRIPT, str(SCENES / "valence3.xml")]
     found = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
     assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_instances_load_in_order(monkeypatch):
+    """At once, they have kernels of their own in every process."""
+    instantiate, is_parallel = mi.parser.instantiate, []
+    monkeypatch.setattr(
+        mi.parser,
+        "instantiate",
+        lambda config, state: is_parallel.append(config.parallel) or instantiate(config, state),
+    )
+    group = {"type": "shapegroup", "ball": {"type": "sphere"}}
+    placed = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    scene = {"type": "scene", "sensor": {"type": "perspective"}, "group": group}
+    load_scene(scene)
+    load_scene({**scene, "placed": placed})
+    assert is_parallel == [True, False]

@@ -6,7 +6,7 @@ from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.usd import copies
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
-from mitsuba_subdivision.usd.copies import LEAST_INSTANCES, with_copies
+from mitsuba_subdivision.usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
 from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 
 FACES = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
@@ -107,3 +107,29 @@ def test_copies_that_are_no_instances_are_one_shape_too():
     vertices = joined.cage.face_vertices[second] - 8
     values = paint.values[paint.indices[second], 0]
     assert [at_vertices[each] for each in zip(np.arange(24) // 4, vertices, strict=True)] == values.tolist()
+
+
+def strip(faces):
+    """Quadrilaterals in a row."""
+    points = np.array([[k // 2, k % 2, 0.0] for k in range(2 * faces + 2)])
+    corners = np.add.outer(2 * np.arange(faces), [0, 2, 3, 1])
+    return CageContents(points, np.full(faces, 4), corners.ravel(), scheme="catmull_clark")
+
+
+def test_large_copies_are_shapes_of_their_own_that_share_a_cage(monkeypatch):
+    shape = ShapeContents("/strip", strip(LARGE), 2 * np.eye(4))
+    contents = scene(group=[shape])
+    found = with_large_copies(contents)
+    assert (found.groups, found.instances) == ([[]], [])
+    assert [each.name for each in found.shapes[:2]] == ["/i0/strip", "/i1/strip"]
+    assert all(each.cage is shape.cage for each in found.shapes)
+    np.testing.assert_array_equal([each.to_world for each in found.shapes], [2 * placed(k) for k in range(COUNT)])
+    assert with_copies(found, {}, "exact", StageWarnings()) == (found, {})
+    monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 2 * LARGE * COUNT - 1)
+    assert with_large_copies(contents) is contents
+
+
+def test_small_or_few_copies_are_no_shapes_of_their_own():
+    large, small = (ShapeContents("/strip", strip(count), np.eye(4)) for count in (LARGE, LARGE - 1))
+    for contents in (scene(group=[small]), scene(group=[large], count=LEAST_INSTANCES - 1)):
+        assert [*with_large_copies(contents).instances] == contents.instances

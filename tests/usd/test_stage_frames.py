@@ -14,17 +14,39 @@ from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turnt
 from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.scene_file import save_scene
-from mitsuba_subdivision.usd import loaded_shapes, stage_scenes
+from mitsuba_subdivision.usd import loaded_shapes, stage_reader, stage_scenes
 from mitsuba_subdivision.usd.limit_surfaces import Surfaces
 from mitsuba_subdivision.usd.scene_entries import SceneEntries
 from mitsuba_subdivision.usd.stage_reader import StageReader
 from mitsuba_subdivision.usd.stage_scenes import StageScenes
-from usd.moving_stages import BARE, CAMERA, CORNERS, CUBE, FLOOR, LAMP, MOVING, STILL, WHOLE, mesh, write
+from mitsuba_subdivision.usd.stage_walk import is_still, open_checked
+from usd.moving_stages import (
+    BARE,
+    CAMERA,
+    CORNERS,
+    CUBE,
+    FLOOR,
+    INSTANCES,
+    LAMP,
+    MOVING,
+    STILL,
+    WHOLE,
+    mesh,
+    placed,
+    write,
+)
 
 pytest.importorskip("pxr")
 
 LOOK = Look(size=(24, 18), spp=4)
 RATE = {"tessellation_rate": 3}
+FLYING = """def PointInstancer "flying" {
+    rel prototypes = </still>
+    int[] protoIndices.timeSamples = {1: [0]}
+    point3f[] positions.timeSamples = {1: [(0, 0, 5)]}
+    vector3f[] velocities.timeSamples = {1: [(1, 0, 0)]}
+}
+"""
 
 
 def frame_range(path, numbers):
@@ -99,6 +121,39 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
     for time, picture in zip(times, found, strict=True):
         np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
     assert np.abs(found[0] - found[1]).mean() > 0.01
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, monkeypatch):
+    """On a rig, with its focal length and its focus."""
+    made = Counter()
+    for module, name in ((stage_scenes, "SceneEntries"), (stage_reader, "read_open_stage")):
+        call = getattr(module, name)
+        monkeypatch.setattr(
+            module,
+            name,
+            lambda *given, name=name, call=call, **more: made.update([name]) or call(*given, **more),
+        )
+    focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
+    lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"
+    rig = f'def Xform "rig" {{\n{placed((0, 0, 0), (1, 0, 0))}{CAMERA.replace("float focalLength = 35", lens)}}}\n'
+    path = write(
+        tmp_path, STILL + FLOOR + LAMP.replace(".timeSamples = {1: (-4, -3, 5), 5: (4, -3, 5)}", " = (4, -3, 5)") + rig
+    )
+    times = (1, 3, 5)
+    found = [pixels(loaded) for loaded in frame_range(path, range(1, 6, 2)).frames(times, "box")]
+    assert made == {"SceneEntries": 1, "read_open_stage": 1}
+    for time, picture in zip(times, found, strict=True):
+        np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
+    assert np.abs(found[0] - found[2]).mean() > 0.01
+
+
+@pytest.mark.parametrize(
+    "moving", [MOVING, LAMP, INSTANCES, FLYING, f'def Xform "rig" {{\n{placed((0, 0, 0), (1, 0, 0))}{STILL}}}']
+)
+def test_a_stage_is_still_only_if_nothing_but_cameras_moves(tmp_path, moving):
+    assert is_still(open_checked(write(tmp_path, STILL + CAMERA)))
+    assert not is_still(open_checked(write(tmp_path, STILL + CAMERA + moving)))
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -158,6 +158,9 @@ def _instantiate(
         # Where meshes are merged, the order of the area lights depends on addresses in memory, and with the order the
         # random numbers.
         config.merge_meshes = False
+        # Loaded at once, shapes are numbered in any order, and with it the kernels of instances differ: they would be
+        # compiled again in most processes.
+        config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
         mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
     finally:

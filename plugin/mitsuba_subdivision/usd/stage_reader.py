@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cage.errors import CageWarning, warn
 from ..files.usd_process import call_in_process, seconds_in_process
 from .contents import TYPES, SceneContents
-from .stage_walk import open_checked, read_open_stage, read_stage
+from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage, read_stage
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 class StageReader:
     """Reads a stage in this process, or at each time in a process of its own; see `files.usd_process`.
 
-    Each warning is given once, however many times it applies to.
+    Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
 
     Parameters
     ----------
@@ -41,6 +42,9 @@ class StageReader:
         self._path, self._camera = path, camera
         self._seconds = seconds_in_process()
         self._stage: Usd.Stage | None = None
+        # The first contents, and, from the second time on, whether they stay but for the camera.
+        self._first: SceneContents | None = None
+        self._is_still: bool | None = None
         self._warned = set() if warned is None else warned
 
     def at(self, time: float | None = None) -> SceneContents:
@@ -68,7 +72,18 @@ class StageReader:
 
     def _read(self, time: float | None) -> SceneContents:
         if self._seconds is None:
-            self._stage = self._stage or open_checked(self._path)
-            return read_open_stage(self._stage, f'"{self._path}"', time, self._camera)
+            return self._contents(f'"{self._path}"', time)
         arguments: dict[str, Any] = {"time": time, "camera": self._camera}
         return call_in_process(read_stage, self._path, arguments, self._seconds, TYPES)
+
+    def _contents(self, name: str, time: float | None) -> SceneContents:
+        self._stage = self._stage or open_checked(self._path)
+        if self._first is not None and self._is_still is None:
+            self._is_still = is_still(self._stage)
+        if self._first is None or not self._is_still:
+            contents = read_open_stage(self._stage, name, time, self._camera)
+            # Kept only where it may serve.
+            self._first = contents if self._is_still is None else None
+            return contents
+        camera, resolution = read_open_camera(self._stage, name, time, self._camera)
+        return replace(self._first, camera=camera, resolution=resolution)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.equality import same
 from ..cage.errors import CageError
 from ..progress import timed
 from ..regression.scene import LoadedScene
-from ..studio.animation import load_quietly
+from ..studio.animation import load_quietly, set_parameters
 from ..studio.frame_files import FrameFiles
 from ..studio.look import Look
 from ..studio.picture import MOST_SEGMENTS, outline_for, shading_for
@@ -24,7 +25,7 @@ from ..studio.studio_entries import variant_in_use
 from ..studio.view import View
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
-from .copies import with_copies
+from .copies import with_copies, with_large_copies
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
@@ -35,12 +36,18 @@ from .stage_warnings import StageWarnings
 from .studio_defaults import angles_for, size_for, with_studio_defaults
 from .texture_detail import texels_for_pictures
 
+# What differs between contents where only the camera does.
+_OF_CAMERA = frozenset({"camera", "resolution"})
+# Names of parameters of sensors that `mi.traverse` has others for; the field of view is along x.
+_TRAVERSED = {"fov": "x_fov"}
+
 
 class StageScenes:
     """A `SceneSource` of a whole stage, with the camera and the lights of the studio where it has none.
 
     Everything may move: shapes, their control points, instances, lights and the stage's camera. Limit surfaces whose
-    topology stays keep their patches and weights. The studio's lights are there if no frame has lights.
+    topology stays keep their patches and weights. Where only the camera moves, the scene stays loaded. The studio's
+    lights are there if no frame has lights.
 
     Parameters
     ----------
@@ -85,6 +92,8 @@ class StageScenes:
         self._surfaces = Surfaces()
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
+        # Of the textures of all frames.
+        self._needed: dict[str, float] | None = None
 
     def at(self, number: int | None = None) -> SceneContents:
         """Visible contents of a frame; by default, at the given time.
@@ -109,6 +118,8 @@ class StageScenes:
         if self._reader is None or (self._files is not None and self._files.are_many):
             self._reader = StageReader(path, self._camera, warned=self._warned)
         contents = self._reader.at(None if time is None else time + delay)
+        if mi.Float is not float:
+            contents = with_large_copies(contents)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
             self._parameters = {**self._parameters, "shading": shading_for(variant_in_use(), self._parameters)}
@@ -207,7 +218,7 @@ class StageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames and sub-frames; limit surfaces of which only the points move stay loaded.
+        """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded.
 
         Raises
         ------
@@ -217,45 +228,77 @@ class StageScenes:
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes = LoadedShapes(self._with_copies(first, StageWarnings())[1])
-        needed = self._texels_for_frames(first, points)
+        rest = self._rest(first, points)
+        if self._needed is None:
+            self._needed = self._texels_for_frames(first, rest)
+        before: tuple[SceneContents, SceneNode, LoadedScene] | None = None
         for number, delay in product(numbers, self._delays(first)):
             notes = StageWarnings()
-            contents, _ = self._with_copies(self._read(number, delay) if delay else self.at(number), notes)
+            given = self._read(number, delay) if delay else self.at(number)
+            seen = self._sensor(given, first, rest, notes)
+            if before and same(before[0], given, _OF_CAMERA) and _moved_sensor(before[2], before[1], seen):
+                before = given, seen, before[2]
+                notes.warn(self.name, self._warned)
+                yield before[2]
+                continue
+            contents, _ = self._with_copies(given, notes)
             shapes.begin_frame()
             made = SceneEntries(
                 contents,
                 notes,
                 self._parameters,
                 shapes.surfaces,
-                needed=needed,
+                needed=self._needed,
                 texture_size=self._look.texture_size,
                 loaded=shapes,
             )
-            rest = self._with_camera(contents, first, points, notes)
             notes.warn(self.name, self._warned)
-            yield load_quietly({**made.scene, **rest}, filter_name)
+            before = given, seen, load_quietly({**made.scene, **rest, "sensor": seen}, filter_name)
+            yield before[2]
 
-    def _with_camera(
-        self, contents: SceneContents, first: SceneContents, points: NDArray[np.float64], notes: StageWarnings
+    def _rest(self, first: SceneContents, points: NDArray[np.float64]) -> SceneNode:
+        """What of a studio the first frame lacks; its camera has notes in `_sensor`."""
+        return with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings())
+
+    def _sensor(
+        self, contents: SceneContents, first: SceneContents, rest: SceneNode, notes: StageWarnings
     ) -> SceneNode:
-        """The camera of a frame, and what of a studio the first frame lacks."""
-        rest = with_studio_defaults(first, points, self._is_lit, self._look, notes)
-        if contents.camera is not None:
-            rest["sensor"] = sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
-        return rest
+        """The camera of a frame."""
+        if contents.camera is None:
+            return dict(rest["sensor"])
+        return sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
 
-    def _texels_for_frames(self, first: SceneContents, points: NDArray[np.float64]) -> dict[str, float]:
+    def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
         """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
         needed: dict[str, float] = {}
         if not any(each.textures() for each in first.materials):
             return needed
         numbers = (None,) if self._files is None else self._files.numbers
-        for number, delay in product(numbers, self._delays(first)):
-            contents = self._read(number, delay) if delay else self.at(number)
-            seen = self._with_camera(contents, first, points, StageWarnings())["sensor"]
-            for file, texels in texels_for_pictures(contents, [seen]).items():
+        at = (self._read(number, d) if d else self.at(number) for number, d in product(numbers, self._delays(first)))
+        # Lists of shapes are the same object as long as only the camera moves.
+        for _, alike in groupby(at, lambda contents: contents.shapes):
+            frames = list(alike)
+            seen = [self._sensor(each, first, rest, StageWarnings()) for each in frames]
+            for file, texels in texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed
+
+
+def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
+    """Change the sensor of a scene from one entry to another; False, without any change, if that cannot be."""
+    parameters = mi.traverse(loaded.sensor)
+    changed = {name: value for name, value in seen.items() if not _is_equal(value, before.get(name))}
+    named = {_TRAVERSED.get(name, name): value for name, value in changed.items()}
+    if before.keys() != seen.keys() or not all(name in parameters for name in named):
+        return False
+    set_parameters(loaded.sensor, named)
+    return True
+
+
+def _is_equal(a: Any, b: Any) -> bool:
+    return (
+        bool(np.array_equal(np.array(a.matrix), np.array(b.matrix))) if isinstance(a, mi.ScalarTransform4f) else a == b
+    )
 
 
 def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:

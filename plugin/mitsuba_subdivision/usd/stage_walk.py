@@ -39,6 +39,9 @@ _SILENT = (
     "SkelRoot", "Skeleton",
 )  # fmt: skip
 
+# Prims of which a camera's rig is built.
+_OF_RIGS = ("", "Camera", "Scope", "Xform")
+
 _SINGULAR = "instances with singular transforms are ignored"
 
 
@@ -118,6 +121,37 @@ def read_open_stage(stage: Usd.Stage, name: str, time: float | None, camera: str
     return contents
 
 
+def read_open_camera(
+    stage: Usd.Stage, name: str, time: float | None, camera: str | None
+) -> tuple[CameraContents | None, list[int] | None]:
+    """The camera of a stage that is open, and the resolution of its render settings; see `read_stage`."""
+    notes = StageWarnings()
+    with usd_errors_at(name), usd_messages_of(name):
+        found = _StageWalk(stage, name, time, notes, lambda _: None).camera(camera)
+    notes.warn(name)
+    return found
+
+
+def is_still(stage: Usd.Stage) -> bool:
+    """Whether nothing but cameras, with the transforms above them alone, may differ between times."""
+    from pxr import Usd
+
+    roots = [stage.GetPseudoRoot(), *stage.GetPrototypes()]
+    return not any(_may_move(prim) for root in roots for prim in Usd.PrimRange.AllPrims(root))
+
+
+def _may_move(prim: Usd.Prim) -> bool:
+    from pxr import Usd, UsdGeom
+
+    attributes = prim.GetAuthoredAttributes()
+    # Instances go on with their velocities where positions have one time.
+    has_velocities = prim.IsA(UsdGeom.PointInstancer) and any("elocities" in each.GetName() for each in attributes)
+    if not has_velocities and not any(each.ValueMightBeTimeVarying() for each in attributes):
+        return False
+    below = Usd.PrimRange.AllPrims(prim)
+    return not all(str(each.GetTypeName()) in _OF_RIGS and not each.IsInstance() for each in below)
+
+
 class _StageWalk:
     def __init__(
         self, stage: Usd.Stage, name: str, time: float | None, notes: StageWarnings, at: Callable[[str], None]
@@ -157,7 +191,7 @@ class _StageWalk:
                 group_of[each.group] = len(groups)
                 groups.append(prototype.shapes)
             instances.append(replace(each, group=group_of[each.group]))
-        chosen, resolution = self._camera(camera)
+        chosen, resolution = self.camera(camera)
         return SceneContents(
             up,
             found.shapes,
@@ -165,9 +199,14 @@ class _StageWalk:
             instances,
             self._materials.materials,
             found.lights,
-            None if chosen is None else self._camera_contents(chosen),
+            chosen,
             resolution,
         )
+
+    def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:
+        """The camera, and the resolution of the stage's render settings; each None if there is none."""
+        chosen, resolution = self._camera(path)
+        return None if chosen is None else self._camera_contents(chosen), resolution
 
     def _below(self, root: Usd.Prim) -> _Subtree:
         """Visible contents of a prim and its descendants."""
