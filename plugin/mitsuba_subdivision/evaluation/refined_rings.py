@@ -166,11 +166,13 @@ class RefinedRings:
 def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRings:
     """The one-ring of a signature, refined alone."""
     pattern = ring_pattern(scheme, signature.smoothed)
-    refinement = pattern.refinement
+    topology, stencils = pattern.refinement.topology, pattern.refinement.stencils
     if signature.is_semi_sharp:
-        refinement = scheme.refine(one_ring(signature).topology)
-    half_edges = np.arange(refinement.topology.half_edge_count, dtype=np.int32)[None]
-    return RefinedRings(pattern, refinement.topology, half_edges, refinement.stencils, False)
+        refined, stencils = scheme.refine(one_ring(signature).topology)
+        # Connectivity is computed once for all that differ in semi-sharp features only.
+        topology = topology.with_rules(refined.rules, refined.semi_sharpness)
+    half_edges = np.arange(topology.half_edge_count, dtype=np.int32)[None]
+    return RefinedRings(pattern, topology, half_edges, stencils, False)
 
 
 def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
