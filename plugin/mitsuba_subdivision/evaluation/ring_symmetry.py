@@ -174,7 +174,10 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     outside = np.setdiff1d(np.arange(len(matrix)), ring)
     if not len(outside) or matrix[np.ix_(ring, outside)].any():
         return None
-    of_ring = _ring_basis(_RingMatrix(matrix[np.ix_(ring, ring)]))
+    # A first picture needs no SciPy.
+    from scipy import sparse
+
+    of_ring = _ring_basis(_RingMatrix(sparse.csr_array(matrix[np.ix_(ring, ring)])))
     waves = _Waves(np.zeros((2, *matrix.shape)), of_ring.eigenvalues.copy())
     waves.vectors[ring], waves.dual[:, ring] = of_ring.vectors, of_ring.inverse
     rest = np.eye(len(matrix))[:, outside]
@@ -186,6 +189,45 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     found, places, lengths = _completed(matrix, waves, rest, is_separate)
     require_basis(matrix, found, _probes(len(matrix), PROBES_OF_FACE))
     return FanEigenbasis(found, ring, of_ring, np.flatnonzero(is_separate), places, lengths)
+
+
+def leading_eigenbasis(matrix: sparse.csr_array, ring: IntArray, count: int) -> Eigenbasis | None:
+    """The part of `fan_eigenbasis` that matters at the fan's vertex, without all that is of one face only.
+
+    None if the ring depends on other points, or its first three eigenvectors are not those of the face.
+
+    Parameters
+    ----------
+    matrix : (K, K) sparse array
+    ring : (r,) int
+        As for `fan_eigenbasis`.
+    count : int
+        Number of eigenvectors, from 3 to r.
+
+    Returns
+    -------
+    Eigenbasis or None
+        The first ones of the ring, over all control points. Beyond the ring all but three are zero.
+    """
+    size = matrix.shape[0]
+    outside = np.setdiff1d(np.arange(size), ring)
+    of_outside = matrix[outside][:, outside].toarray()
+    if not len(outside) or matrix[ring][:, outside].nnz:
+        return None
+    of_ring = _ring_basis(_RingMatrix(matrix[ring][:, ring]))
+    is_split = any(rows.start < end < rows.stop for rows, _ in of_ring.blocks for end in (3, count))
+    if is_split or of_ring.moduli[2] < np.abs(np.linalg.eigvals(of_outside)).max() + SEPARATE:
+        return None
+    # A first picture needs no SciPy.
+    from scipy.linalg import solve_sylvester
+
+    vectors, inverse = np.zeros((size, count)), np.zeros((count, size))
+    vectors[ring], inverse[:, ring] = of_ring.vectors[:, :count], of_ring.inverse[:count]
+    blocks = tuple((rows, block) for rows, block in of_ring.blocks if rows.stop <= count)
+    found = Eigenbasis(vectors, inverse, of_ring.eigenvalues[:count], of_ring.moduli[:count], blocks)
+    from_ring = matrix[outside][:, ring] @ vectors[ring, :3]
+    vectors[outside, :3] = solve_sylvester(of_outside, -found.block_matrix()[:3, :3], -from_ring)
+    return found
 
 
 class FanEigenbasis(Eigenbasis):
@@ -252,10 +294,12 @@ def _probes(size: int, count: int) -> FloatArray:
 class _RingMatrix:
     """The subdivision matrix of a ring; equal to others but for rounding."""
 
-    def __init__(self, matrix: FloatArray) -> None:
+    def __init__(self, matrix: sparse.csr_array) -> None:
         self.matrix = matrix
-        at = np.flatnonzero(matrix)
-        self._digits = at.tobytes(), matrix.ravel()[at].round(SAME_DIGITS).tobytes()
+        matrix.sort_indices()
+        matrix.eliminate_zeros()
+        digits = matrix.indptr, matrix.indices, matrix.data.round(SAME_DIGITS)
+        self._digits = tuple(each.tobytes() for each in digits)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _RingMatrix) and self._digits == other._digits
@@ -267,7 +311,7 @@ class _RingMatrix:
 # Fans of very many faces have bases of some megabytes.
 @lru_cache(maxsize=8)
 def _ring_basis(ring: _RingMatrix) -> Eigenbasis:
-    return eigenbasis(ring.matrix)
+    return eigenbasis(ring.matrix.toarray())
 
 
 def _completed(
