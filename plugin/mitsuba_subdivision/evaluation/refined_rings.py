@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -83,6 +83,11 @@ class RingPattern:
             vertices = one_ring(signature).vertices_around(topology, fans)
             self._children[number] = signature, vertices, half_edges_around(fans)
         return self._children[number]
+
+    @cached_property
+    def vertices(self) -> IndexArray:
+        """``(n,)`` control points of all children in the refined one-ring."""
+        return np.unique(np.concatenate([self.child(number)[1] for number in range(len(self.domains))]))
 
 
 @lru_cache(maxsize=1024)
@@ -171,6 +176,8 @@ def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRings:
         refined, stencils = scheme.refine(one_ring(signature).topology)
         # Connectivity is computed once for all that differ in semi-sharp features only.
         topology = topology.with_rules(refined.rules, refined.semi_sharpness)
+        # Most refined vertices lie around, in no child.
+        stencils = stencils.only(pattern.vertices)
     half_edges = np.arange(topology.half_edge_count, dtype=np.int32)[None]
     return RefinedRings(pattern, topology, half_edges, stencils, False)
 

@@ -74,6 +74,14 @@ class StencilTable:
         own = np.repeat(np.arange(len(rows), dtype=self.rows.dtype), counts)
         return StencilTable(len(rows), self.column_count, own, self.columns[entries], self.weights[entries])
 
+    def only(self, rows: IntArray) -> StencilTable:
+        """The same stencils of some refined vertices, without weights of the others."""
+        is_kept = np.zeros(self.row_count, dtype=bool)
+        is_kept[rows] = True
+        own = np.flatnonzero(is_kept[self.rows])
+        kept = self.rows[own], self.columns[own], self.weights[own]
+        return StencilTable(self.row_count, self.column_count, *kept)
+
     @cached_property
     def _by_row(self) -> tuple[IntArray, IntArray]:
         """Entries sorted by their rows, and where those of each row begin, and after them, where the last ends."""
