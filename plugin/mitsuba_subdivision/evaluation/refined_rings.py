@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -64,6 +64,15 @@ class RingPattern:
         self.domains = tuple(domain for domain, _ in children)
         self.half_edges = [half_edge for _, half_edge in children]
         self._children: dict[int, tuple[Signature, IndexArray, IndexArray]] = {}
+        if self.is_large:
+            # Most refined vertices lie around, in no child.
+            vertices = np.concatenate([self.child(number)[1] for number in range(len(self.domains))])
+            self.refinement = self.refinement._replace(stencils=self.refinement.stencils.only(vertices))
+
+    @property
+    def is_large(self) -> bool:
+        """Whether one-rings have so many control points that they are refined alone."""
+        return one_ring(self.smooth).vertex_count > MOST_CONTROLS_TOGETHER
 
     def child(self, number: int) -> tuple[Signature, IndexArray, IndexArray]:
         """Signature, control points and half-edges of a child in the refined one-ring.
@@ -83,11 +92,6 @@ class RingPattern:
             vertices = one_ring(signature).vertices_around(topology, fans)
             self._children[number] = signature, vertices, half_edges_around(fans)
         return self._children[number]
-
-    @cached_property
-    def vertices(self) -> IndexArray:
-        """``(n,)`` control points of all children in the refined one-ring."""
-        return np.unique(np.concatenate([self.child(number)[1] for number in range(len(self.domains))]))
 
 
 @lru_cache(maxsize=1024)
@@ -125,6 +129,14 @@ class RefinedRings:
         # By the numbers of the children.
         self._sharpness: dict[int, FanSharpnessRows] = {}
         self._tables: dict[int, StencilTable] = {}
+        self._signatures: dict[int, Signature] = {}
+
+    def keep_children(self) -> None:
+        """Find all children of an element that was refined alone, and drop the rest, which takes far more memory."""
+        for number in range(len(self._pattern.domains)):
+            self._signatures[number], _ = self.signature(0, number), self.table(number)
+        self._sharpness.clear()
+        del self._topology, self._half_edges, self._stencils
 
     def child(self, ring: int, number: int) -> tuple[Signature, FloatArray]:
         """`signature` and `stencils` of a child of one of the elements."""
@@ -132,6 +144,8 @@ class RefinedRings:
 
     def signature(self, ring: int, number: int) -> Signature:
         """Signature of a child of one of the elements."""
+        if number in self._signatures:
+            return self._signatures[number]
         signature, _, around = self._pattern.child(number)
         semi = self._topology.semi_sharpness
         if semi is None:
@@ -148,7 +162,7 @@ class RefinedRings:
         SchemeError
             If weights of a control point do not sum to one.
         """
-        if isinstance(self._stencils, StencilTable):
+        if number in self._tables or isinstance(self._stencils, StencilTable):
             return self.table(number).dense(np.arange(self.table(number).row_count))
         stencils = self._stencils[ring, self._pattern.child(number)[1]]
         if not self._rows_sum_to_one:
@@ -176,10 +190,11 @@ def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRings:
         refined, stencils = scheme.refine(one_ring(signature).topology)
         # Connectivity is computed once for all that differ in semi-sharp features only.
         topology = topology.with_rules(refined.rules, refined.semi_sharpness)
-        # Most refined vertices lie around, in no child.
-        stencils = stencils.only(pattern.vertices)
     half_edges = np.arange(topology.half_edge_count, dtype=np.int32)[None]
-    return RefinedRings(pattern, topology, half_edges, stencils, False)
+    found = RefinedRings(pattern, topology, half_edges, stencils, False)
+    if pattern.is_large:
+        found.keep_children()
+    return found
 
 
 def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
