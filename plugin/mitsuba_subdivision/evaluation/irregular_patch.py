@@ -30,7 +30,14 @@ from .equations import (
     stam_rows,
     times_powers,
 )
-from .ring_symmetry import fan_eigenbasis, fan_ring, leading_eigenbasis, ring_orbits, symmetric_eigenbasis
+from .ring_symmetry import (
+    fan_eigenbasis,
+    fan_ring,
+    leading_of_fan,
+    leading_of_symmetric,
+    ring_orbits,
+    symmetric_eigenbasis,
+)
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
@@ -135,23 +142,18 @@ class IrregularPatch:
         return tangents
 
     @cached_property
-    def limit_in_fan(self) -> tuple[FloatArray, FloatArray] | None:
-        """The point and the `limit_frame` as weights of control points, by the basis of a fan's ring alone.
+    def limit_in_ring(self) -> tuple[FloatArray, FloatArray] | None:
+        """The point and the `limit_frame` as weights of control points, without the `basis`.
 
         Returns
         -------
         stencils : (3, K) float64
         magnitude : (2, K) float64
             Absolute weights that the frame is a sum of.
-        None if the patch is no face of a large open fan.
+        None if the valence is small, and at corners amid faces.
         """
-        if (ring := fan_ring(self.structure.signature)) is None:
-            return None
-        fan, order = self.structure.signature.fans[0], self.structure.order_of(ring)
-        # Frames are made of three eigenvectors where a crease ends, and of all elsewhere.
-        count = 3 if isinstance(fan, TaggedFan) and fan.rule == VertexRule.DART else len(order)
         try:
-            leading = leading_eigenbasis(self.structure.table.matrix, order, count)
+            leading = _leading(self.structure)
         except EigenbasisError as error:
             raise _no_basis(self.scheme, self.structure, error) from error
         if leading is None:
@@ -242,7 +244,7 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         If the rules do not contract the one-ring to a point.
     """
     patch = IrregularPatch(scheme, structure)
-    if patch.limit_in_fan is None:
+    if patch.limit_in_ring is None:
         # Raises if there is none.
         _ = patch.basis
     return patch
@@ -276,6 +278,20 @@ def _basis(structure: IrregularStructure) -> Eigenbasis:
     elif (ring := fan_ring(structure.signature)) is not None:
         found = fan_eigenbasis(structure.matrix, structure.order_of(ring))
     return eigenbasis(structure.matrix) if found is None else found
+
+
+def _leading(structure: IrregularStructure) -> Eigenbasis | None:
+    """The part of the `_basis` that matters at the point, if the valence is high."""
+    fan = structure.signature.fans[0]
+    rule = fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC
+    if (orbits := ring_orbits(structure.signature)) is not None:
+        # At a corner, the frame is made of all eigenvectors.
+        return None if rule == VertexRule.CORNER else leading_of_symmetric(structure.table.matrix, orbits)
+    if (ring := fan_ring(structure.signature)) is None:
+        return None
+    order = structure.order_of(ring)
+    # Frames are made of three eigenvectors where a crease ends, and of all elsewhere.
+    return leading_of_fan(structure.table.matrix, order, 3 if rule == VertexRule.DART else len(order))
 
 
 @lru_cache(maxsize=4096)

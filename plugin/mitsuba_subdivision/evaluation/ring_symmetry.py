@@ -154,6 +154,39 @@ def symmetric_eigenbasis(matrix: Matrix, orbits: IntArray) -> Eigenbasis | None:
     return found
 
 
+def leading_of_symmetric(matrix: sparse.csr_array, orbits: IntArray) -> Eigenbasis | None:
+    """The first three vectors of `symmetric_eigenbasis`: the constant one, and the slowest waves.
+
+    None if the matrix has no such symmetry, or others are the first three.
+
+    Parameters
+    ----------
+    matrix : (K, K) sparse array
+    orbits : (m, n) int
+        As for `symmetric_eigenbasis`.
+
+    Returns
+    -------
+    Eigenbasis or None
+        With three vectors over all control points.
+    """
+    waves = _waves(matrix, orbits, slowest_only=True)
+    if waves is None:
+        return None
+    rest = _rest(matrix.shape[0], orbits)
+    if np.abs(waves.dual @ (matrix @ rest)).max() > SAME_WEIGHTS:
+        return None
+    # Faster waves have a part in points outside the ring only, which have none in the first three.
+    vectors, dual = np.hstack([rest, waves.vectors]), np.vstack([rest.T, waves.dual])
+    small = eigenbasis((matrix.T @ dual.T).T @ vectors, constant=dual.sum(axis=1))
+    is_slowest = np.abs(small.eigenvalues[1:3] - waves.eigenvalues.max()) < SAME_WEIGHTS
+    if not is_slowest.all() or any(rows.start < 3 for rows, _ in small.blocks):
+        return None
+    return Eigenbasis(
+        vectors @ small.vectors[:, :3], small.inverse[:3] @ dual, small.eigenvalues[:3], small.moduli[:3], ()
+    )
+
+
 def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     """Eigenbasis of a subdivision matrix of a face of a fan, by that of the fan's ring, which is found once.
 
@@ -191,7 +224,7 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     return FanEigenbasis(found, ring, of_ring, np.flatnonzero(is_separate), places, lengths)
 
 
-def leading_eigenbasis(matrix: sparse.csr_array, ring: IntArray, count: int) -> Eigenbasis | None:
+def leading_of_fan(matrix: sparse.csr_array, ring: IntArray, count: int) -> Eigenbasis | None:
     """The part of `fan_eigenbasis` that matters at the fan's vertex, without all that is of one face only.
 
     None if the ring depends on other points, or its first three eigenvectors are not those of the face.
@@ -358,8 +391,11 @@ class _Waves:
         return self.matrices[1, : len(self.eigenvalues)]
 
 
-def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
-    """The waves of a ring but for constants; None if sectors differ, or a wave has no real block."""
+def _waves(matrix: sparse.csr_array, orbits: IntArray, *, slowest_only: bool = False) -> _Waves | None:
+    """The waves of a ring but for constants; None if sectors differ, or a wave has no real block.
+
+    With ``slowest_only``, only those that go once around the ring; none if others have larger eigenvalues.
+    """
     (kinds, n), size = orbits.shape, matrix.shape[0]
     ring, next_sector = orbits.ravel(), np.roll(orbits, 1, axis=1).ravel()
     if abs(matrix[next_sector][:, next_sector] - matrix[ring][:, ring]).max() > SAME_WEIGHTS:
@@ -376,8 +412,14 @@ def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
     values, vectors = np.linalg.eig(blocks[k])
     if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min() < DEPENDENT:
         return None
+    has_signs = n % 2 == 0
+    if slowest_only:
+        faster = np.append(values[1:], blocks[n // 2].diagonal() if has_signs else ())
+        if np.abs(faster).max(initial=0) >= values[0].max():
+            return None
+        k, has_signs = k[:1], False
     inverses = np.linalg.inv(vectors)
-    found = _Waves(np.zeros((2, size, size)), np.empty(kinds * (n - 1)))
+    found = _Waves(np.zeros((2, size, size)), np.empty(kinds * (2 * len(k) + has_signs)))
     end = 0
     for wave in (np.cos, np.sin):
         for kind, orbit in enumerate(orbits):
@@ -386,11 +428,11 @@ def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
             amplitude = wave(np.pi / n * turns) * np.sqrt(2 / n)
             for column in range(kinds):
                 own = slice(end + column * len(k), end + (column + 1) * len(k))
-                found.vectors[orbit, own] = (amplitude * vectors[:, kind, column, None]).T
-                found.dual[own, orbit] = amplitude * inverses[:, column, kind, None]
-                found.eigenvalues[own] = values[:, column]
+                found.vectors[orbit, own] = (amplitude * vectors[: len(k), kind, column, None]).T
+                found.dual[own, orbit] = amplitude * inverses[: len(k), column, kind, None]
+                found.eigenvalues[own] = values[: len(k), column]
         end += kinds * len(k)
-    if n % 2 == 0:
+    if has_signs:
         # Signs that alternate: a cosine on edges, and a sine between them.
         for kind, orbit in enumerate(orbits):
             found.vectors[orbit, end + kind] = found.dual[end + kind, orbit] = (-1.0) ** np.arange(n) / np.sqrt(n)

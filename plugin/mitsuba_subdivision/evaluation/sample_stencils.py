@@ -30,7 +30,7 @@ from .refined_rings import RingMesh
 
 # Stencils of more weights than these are not kept. The others take 16 MB at most.
 KEPT_WEIGHTS = 1 << 17
-# Levels of tips in large open fans that are refined: derivatives have enough digits there without frames.
+# Levels of tips of high valence that are refined: derivatives have enough digits there without frames.
 REFINED_LEVELS = 3
 
 
@@ -208,7 +208,7 @@ def _evaluate_pieces(scheme: Scheme, depths: list[_Depth]) -> None:
         uv = [piece.domain(depth.uv[depth.first[number] + own]) for depth, number, piece, own in pieces]
         together = np.concatenate(uv)
         at_point = patch is not None and not scheme.domain.extent(together).any()
-        if patch is not None and at_point and (limit := patch.limit_in_fan) is not None:
+        if patch is not None and at_point and (limit := patch.limit_in_ring) is not None:
             weights, magnitude = (np.repeat(each[:, None], len(together), axis=1) for each in limit)
         else:
             limit = None
@@ -227,12 +227,12 @@ def _evaluate_pieces(scheme: Scheme, depths: list[_Depth]) -> None:
 
 
 def _is_beside_tip(scheme: Scheme, element: DividedElement, uv: FloatArray) -> NDArray[np.bool_] | bool:
-    """Whether samples of an element lie in the first levels of a tip that has an eigenbasis of its own for each face.
+    """Whether samples of an element lie in the first levels of a tip of high valence.
 
-    To refine such a face takes less time, and its derivatives still have enough digits there.
+    To refine its one-ring takes less time and memory than an eigenbasis, which in open fans each face has for itself.
     """
     piece = element.piece
-    if piece is None or piece.patch is None or piece.patch.limit_in_fan is None:
+    if piece is None or piece.patch is None or piece.patch.limit_in_ring is None:
         return False
     return scheme.domain.extent(piece.domain(uv)) >= 2.0**-REFINED_LEVELS
 
