@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
+from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
 from mitsuba_subdivision.evaluation.ring_symmetry import LEAST_VALENCE, fan_ring, ring_orbits, symmetric_eigenbasis
+from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
 from mitsuba_subdivision.mesh.connectivity import VertexRule
+from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
 
@@ -103,6 +106,37 @@ def test_faces_of_an_open_fan_share_the_basis_of_its_ring(scheme, rule, valence)
         for members in (slice(0, 1), slice(1, 2), slice(2, 3)):
             projections = [basis.vectors[:, members] @ basis.inverse[members] for basis in (found, expected)]
             np.testing.assert_allclose(*projections, rtol=0, atol=SAME_SPACE)
+
+
+def fan_signature(scheme, rule):
+    size, rest = scheme.regular_face_size, isolated_signature(scheme, 3).fans[1:]
+    return Signature("face", (TaggedFan((size,) * 30, (size,) * 9, rule), *rest))
+
+
+HIGH_VALENCES = [
+    *((scheme, isolated_signature(scheme, valence)) for scheme in SCHEMES for valence in (39, 40)),
+    *((scheme, fan_signature(scheme, rule)) for scheme in SCHEMES[:2] for rule in VertexRule),
+]
+
+
+@pytest.mark.parametrize(("scheme", "signature"), HIGH_VALENCES)
+def test_high_valences_are_alike_refined_and_by_their_bases(scheme, signature, np_rng):
+    ring = one_ring(signature)
+    points = np_rng.standard_normal((ring.vertex_count, 3))
+    fan = signature.fans[0]
+    if isinstance(fan, TaggedFan) and fan.rule == VertexRule.DART:
+        # The far end of the crease, which both of its sides see.
+        first, *_, last = ring.edge_neighbours()
+        points[last] = points[first]
+    assert irregular_patch(scheme, irregular_structure(scheme, signature)).limit_in_ring is not None
+    # The point itself, samples in levels that are refined, and one beyond.
+    uv = np.array([[0, 0], [0.9, 0.05], [0.5, 0], [0.2, 0.125], [0, 0.125], [0.03, 0.01]])
+    for samples in (uv, uv[:-1], uv[:1]):
+        (refined,) = stencils_by_signature(scheme, [signature], samples)
+        by_basis = element_stencils(scheme, signature, samples)
+        np.testing.assert_allclose(refined[0] @ points, by_basis[0] @ points, rtol=0, atol=ROUNDED)
+        normals = [np.cross(*(each[1:] @ points)) for each in (refined, by_basis)]
+        np.testing.assert_allclose(*(each / np.linalg.norm(each, axis=1)[:, None] for each in normals), atol=SAME_SPACE)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES[:2], ids=lambda scheme: scheme.name)

@@ -21,6 +21,8 @@ EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # In parts of the largest weight. Products are made in another order. Tangents at creases lose as many binary digits as
 # there are refinements, and around vertices of valence 50 what the eigenbasis is ill-conditioned by.
 ROUNDED = 1e-11
+# At the end of the names of surfaces: a valence at which samples are found by refinement, and not by an eigenbasis.
+HIGH_VALENCE = "50"
 
 
 def classes(surface):
@@ -36,12 +38,19 @@ def grid(scheme, rate):
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 4, 7])
-def test_stencils_of_all_signatures_are_those_of_each(name, rate):
+def test_stencils_of_all_signatures_are_those_of_each(name, rate, np_rng):
     scheme, signatures = classes(surface_named(name))
     uv = grid(scheme, rate)
     for signature, found in zip(signatures, stencils_by_signature(scheme, signatures, uv), strict=True):
         expected = element_stencils(scheme, signature, uv)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDED * np.abs(expected).max())
+        np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=ROUNDED)
+        tangents = [found[1:], expected[1:]]
+        if name.endswith(HIGH_VALENCE):
+            # Others of the same plane, beside the point and at it.
+            points = np_rng.standard_normal((found.shape[2], 3))
+            normals = [np.cross(*(each @ points)) for each in tangents]
+            tangents = [each / np.linalg.norm(each, axis=1)[:, None] for each in normals]
+        np.testing.assert_allclose(*tangents, rtol=0, atol=ROUNDED * np.abs(tangents[1]).max())
         np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
 
 

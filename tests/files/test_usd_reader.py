@@ -497,6 +497,29 @@ def test_malformed_files_name_the_file(tmp_path, suffix):
             ControlCage.from_file(path)
 
 
+def test_arrays_that_announce_more_than_they_can_hold_are_refused(tmp_path):
+    cage = cube().refined().refined()
+    cage.save(tmp_path / "cage.usdc")
+    content = (tmp_path / "cage.usdc").read_bytes()
+    # Of points and of face vertices, which are compressed.
+    for count in (cage.vertex_count, 4 * cage.face_count):
+        at = content.find(struct.pack("<Q", count))
+        assert at > 0
+        # USD would reserve 12 GB and take half a minute.
+        (tmp_path / "bad.usdc").write_bytes(content[:at] + struct.pack("<Q", 1 << 30) + content[at + 8 :])
+        with pytest.raises(CageError, match=f'bad.usdc": an array at byte {at} of .* announces 1073741824 entries'):
+            ControlCage.from_file(tmp_path / "bad.usdc")
+
+
+def test_long_arrays_of_equal_numbers_are_no_damage(tmp_path):
+    n = 400
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    quads = corner[:, None] + [0, 1, n + 1, n]
+    points = np.stack([*np.divmod(np.arange(n * n), n), np.zeros(n * n)], axis=1)
+    ControlCage.from_arrays(points, np.full(len(quads), 4), quads.ravel()).save(tmp_path / "grid.usdc")
+    assert ControlCage.from_file(tmp_path / "grid.usdc").face_count == len(quads)
+
+
 def test_sections_that_announce_more_than_they_can_hold_are_refused(tmp_path):
     cube().save(tmp_path / "cube.usdc")
     content = (tmp_path / "cube.usdc").read_bytes()

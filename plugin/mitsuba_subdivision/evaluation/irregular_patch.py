@@ -5,13 +5,13 @@ Around the point there are three regular pieces at every level, and a bound of a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.signature import Signature, TaggedFan
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
@@ -30,7 +30,14 @@ from .equations import (
     stam_rows,
     times_powers,
 )
-from .ring_symmetry import fan_eigenbasis, fan_ring, ring_orbits, symmetric_eigenbasis
+from .ring_symmetry import (
+    fan_eigenbasis,
+    fan_ring,
+    leading_of_fan,
+    leading_of_symmetric,
+    ring_orbits,
+    symmetric_eigenbasis,
+)
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
@@ -70,6 +77,11 @@ class IrregularStructure:
         """``(K, K)`` float64, A: made anew, as each face beside a border has its own, and nearly all of it is zero."""
         return self.table.dense(np.arange(self.table.row_count))
 
+    def order_of(self, ring: IntArray) -> IntArray:
+        """Control points at some vertices of the one-ring."""
+        # At a dart, one of the vertices is no control point, as it equals another.
+        return np.searchsorted(self.slots, ring[np.isin(ring, self.slots)])
+
 
 @dataclass(frozen=True, eq=False)
 class IrregularPatch:
@@ -80,22 +92,76 @@ class IrregularPatch:
     scheme : Scheme
     structure : IrregularStructure
         A and ``P_k Ā``.
-    basis : Eigenbasis
-        Of A, oriented so that the characteristic map keeps the orientation of the parameters.
-    eigen_children : (3, R, K) float64
-        ``P_k Ā V``: control points of the regular children of each eigenvector.
-    edge_tangents : (2, K) float64
-        Tangents at the extraordinary point along the edges ``v = 0`` and ``u = 0``, over the eigen-coordinates.
-    limit_frame : (2, K) float64
-        Two tangents at the extraordinary point whose cross product is along the normal, over the eigen-coordinates.
     """
 
     scheme: Scheme
     structure: IrregularStructure
-    basis: Eigenbasis
-    eigen_children: FloatArray
-    edge_tangents: FloatArray
-    limit_frame: FloatArray
+
+    @cached_property
+    def basis(self) -> Eigenbasis:
+        """Of A, oriented so that the characteristic map keeps the orientation of the parameters.
+
+        Raises
+        ------
+        SchemeError
+            If the rules do not contract the one-ring to a point.
+        """
+        try:
+            return _oriented(self.scheme, self.structure, _basis(self.structure))
+        except EigenbasisError as error:
+            raise _no_basis(self.scheme, self.structure, error) from error
+
+    @cached_property
+    def eigen_children(self) -> FloatArray:
+        """``(3, R, K)`` float64, ``P_k Ā V``: control points of the regular children of each eigenvector."""
+        return _times_sparse(self.structure.children, self.basis.vectors)
+
+    @cached_property
+    def limit_frame(self) -> FloatArray:
+        """``(2, K)`` float64, two tangents at the extraordinary point whose cross product is along the normal.
+
+        Over the eigen-coordinates.
+        """
+        return limit_frame(self.scheme, self.structure.signature, self.basis)
+
+    @cached_property
+    def edge_tangents(self) -> FloatArray:
+        """``(2, K)`` float64, tangents at the extraordinary point along the edges ``v = 0`` and ``u = 0``.
+
+        Over the eigen-coordinates.
+        """
+        # Where the characteristic map takes (1, 0) and (0, 1): the directions of the two edges.
+        scheme = self.scheme
+        _, ends = child_rows(scheme, scheme.domain.corners[[1, -1]], self.eigen_children[:, :, 1:3], 1)
+        ends = ends[0]
+        if np.linalg.det(ends) <= PARALLEL * np.abs(ends).max() ** 2:
+            # Along straight opposite edges (valence 2) the edges' tangents span no plane; the frame still does.
+            return self.limit_frame
+        tangents = np.zeros_like(self.limit_frame)
+        tangents[:, 1:3] = ends
+        return tangents
+
+    @cached_property
+    def limit_in_ring(self) -> tuple[FloatArray, FloatArray] | None:
+        """The point and the `limit_frame` as weights of control points, without the `basis`.
+
+        Returns
+        -------
+        stencils : (3, K) float64
+        magnitude : (2, K) float64
+            Absolute weights that the frame is a sum of.
+        None if the valence is small, and at corners amid faces.
+        """
+        try:
+            leading = _leading(self.structure)
+        except EigenbasisError as error:
+            raise _no_basis(self.scheme, self.structure, error) from error
+        if leading is None:
+            return None
+        leading = _oriented(self.scheme, self.structure, leading)
+        frame = limit_frame(self.scheme, self.structure.signature, leading)
+        stencils = np.concatenate([leading.inverse[:1], frame @ leading.inverse])
+        return stencils, np.abs(frame) @ np.abs(leading.inverse)
 
     @property
     def has_own_frame(self) -> bool:
@@ -177,26 +243,21 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
     SchemeError
         If the rules do not contract the one-ring to a point.
     """
-    try:
-        basis = _basis(structure)
-    except EigenbasisError as error:
-        ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
-        raise SchemeError(f"{scheme.name}: subdivision matrix of {ring}: {error}") from error
-    # Eigenvectors have an arbitrary sign. With this one, the normal of (13) is along the cross product of its tangents.
-    if characteristic_jacobian(scheme, structure.children, basis.vectors) < 0:
-        basis = basis.turned_over()
-    eigen_children = _times_sparse(structure.children, basis.vectors)
-    frame = limit_frame(scheme, structure.signature, basis)
-    patch = IrregularPatch(scheme, structure, basis, eigen_children, edge_tangents=frame, limit_frame=frame)
-    # Where the characteristic map takes (1, 0) and (0, 1): the directions of the two edges.
-    _, ends = child_rows(scheme, scheme.domain.corners[[1, -1]], eigen_children[:, :, 1:3], 1)
-    ends = ends[0]
-    if np.linalg.det(ends) <= PARALLEL * np.abs(ends).max() ** 2:
-        # Along straight opposite edges (valence 2) the edges' tangents span no plane; the frame still does.
-        return patch
-    tangents = np.zeros_like(frame)
-    tangents[:, 1:3] = ends
-    return replace(patch, edge_tangents=tangents)
+    patch = IrregularPatch(scheme, structure)
+    if patch.limit_in_ring is None:
+        # Raises if there is none.
+        _ = patch.basis
+    return patch
+
+
+def _oriented(scheme: Scheme, structure: IrregularStructure, basis: Eigenbasis) -> Eigenbasis:
+    """Give the eigenvectors the sign with which the normal of (13) is along the cross product of its tangents."""
+    return basis.turned_over() if characteristic_jacobian(scheme, structure.children, basis.vectors) < 0 else basis
+
+
+def _no_basis(scheme: Scheme, structure: IrregularStructure, error: EigenbasisError) -> SchemeError:
+    ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
+    return SchemeError(f"{scheme.name}: subdivision matrix of {ring}: {error}")
 
 
 def _times_sparse(stencils: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -215,10 +276,22 @@ def _basis(structure: IrregularStructure) -> Eigenbasis:
     if (orbits := ring_orbits(structure.signature)) is not None:
         found = symmetric_eigenbasis(structure.table.matrix, orbits)
     elif (ring := fan_ring(structure.signature)) is not None:
-        # At a dart, one of its vertices is no control point, as it equals another.
-        order = np.searchsorted(structure.slots, ring[np.isin(ring, structure.slots)])
-        found = fan_eigenbasis(structure.matrix, order)
+        found = fan_eigenbasis(structure.matrix, structure.order_of(ring))
     return eigenbasis(structure.matrix) if found is None else found
+
+
+def _leading(structure: IrregularStructure) -> Eigenbasis | None:
+    """The part of the `_basis` that matters at the point, if the valence is high."""
+    fan = structure.signature.fans[0]
+    rule = fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC
+    if (orbits := ring_orbits(structure.signature)) is not None:
+        # At a corner, the frame is made of all eigenvectors.
+        return None if rule == VertexRule.CORNER else leading_of_symmetric(structure.table.matrix, orbits)
+    if (ring := fan_ring(structure.signature)) is None:
+        return None
+    order = structure.order_of(ring)
+    # Frames are made of three eigenvectors where a crease ends, and of all elsewhere.
+    return leading_of_fan(structure.table.matrix, order, 3 if rule == VertexRule.DART else len(order))
 
 
 @lru_cache(maxsize=4096)

@@ -55,7 +55,7 @@ class Piece:
     @property
     def stencils(self) -> FloatArray:
         """``(K_piece, K)`` control points over the element's one-ring."""
-        return self.weights if self.weights.ndim == 2 else self._scattered(np.eye(len(self.weights)))
+        return self.weights if self.weights.ndim == 2 else self.scattered(np.eye(len(self.weights)))
 
     @property
     def absolute_sums(self) -> FloatArray:
@@ -65,7 +65,7 @@ class Piece:
     @property
     def coordinates(self) -> FloatArray:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
-        return self._scattered(self.irregular_patch.basis.inverse) if self.weights.ndim == 1 else self._coordinates
+        return self.scattered(self.irregular_patch.basis.inverse) if self.weights.ndim == 1 else self._coordinates
 
     @cached_property
     def _coordinates(self) -> FloatArray:
@@ -74,10 +74,13 @@ class Piece:
     def over_controls(self, rows: FloatArray) -> FloatArray:
         """Rows over the piece's eigen-coordinates, or its control points if it is regular, as weights ``(.., K)``."""
         if self.weights.ndim == 1:
-            return self._scattered(rows @ self.irregular_patch.basis.inverse)
+            return self.scattered(rows @ self.irregular_patch.basis.inverse)
         return rows @ (self.weights if self.patch is None else self._coordinates)
 
-    def _scattered(self, weights: FloatArray) -> FloatArray:
+    def scattered(self, weights: FloatArray) -> FloatArray:
+        """Weights ``(.., K_piece)`` over the piece's control points, as weights ``(.., K)``."""
+        if self.weights.ndim == 2:
+            return weights @ self.weights
         found = np.zeros((*weights.shape[:-1], self.control_count))
         found[..., self.weights] = weights
         return found

@@ -64,6 +64,15 @@ class RingPattern:
         self.domains = tuple(domain for domain, _ in children)
         self.half_edges = [half_edge for _, half_edge in children]
         self._children: dict[int, tuple[Signature, IndexArray, IndexArray]] = {}
+        if self.is_large:
+            # Most refined vertices lie around, in no child.
+            vertices = np.concatenate([self.child(number)[1] for number in range(len(self.domains))])
+            self.refinement = self.refinement._replace(stencils=self.refinement.stencils.only(vertices))
+
+    @property
+    def is_large(self) -> bool:
+        """Whether one-rings have so many control points that they are refined alone."""
+        return one_ring(self.smooth).vertex_count > MOST_CONTROLS_TOGETHER
 
     def child(self, number: int) -> tuple[Signature, IndexArray, IndexArray]:
         """Signature, control points and half-edges of a child in the refined one-ring.
@@ -120,6 +129,14 @@ class RefinedRings:
         # By the numbers of the children.
         self._sharpness: dict[int, FanSharpnessRows] = {}
         self._tables: dict[int, StencilTable] = {}
+        self._signatures: dict[int, Signature] = {}
+
+    def keep_children(self) -> None:
+        """Find all children of an element that was refined alone, and drop the rest, which takes far more memory."""
+        for number in range(len(self._pattern.domains)):
+            self._signatures[number], _ = self.signature(0, number), self.table(number)
+        self._sharpness.clear()
+        del self._topology, self._half_edges, self._stencils
 
     def child(self, ring: int, number: int) -> tuple[Signature, FloatArray]:
         """`signature` and `stencils` of a child of one of the elements."""
@@ -127,6 +144,8 @@ class RefinedRings:
 
     def signature(self, ring: int, number: int) -> Signature:
         """Signature of a child of one of the elements."""
+        if number in self._signatures:
+            return self._signatures[number]
         signature, _, around = self._pattern.child(number)
         semi = self._topology.semi_sharpness
         if semi is None:
@@ -143,7 +162,7 @@ class RefinedRings:
         SchemeError
             If weights of a control point do not sum to one.
         """
-        if isinstance(self._stencils, StencilTable):
+        if number in self._tables or isinstance(self._stencils, StencilTable):
             return self.table(number).dense(np.arange(self.table(number).row_count))
         stencils = self._stencils[ring, self._pattern.child(number)[1]]
         if not self._rows_sum_to_one:
@@ -166,11 +185,16 @@ class RefinedRings:
 def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRings:
     """The one-ring of a signature, refined alone."""
     pattern = ring_pattern(scheme, signature.smoothed)
-    refinement = pattern.refinement
+    topology, stencils = pattern.refinement.topology, pattern.refinement.stencils
     if signature.is_semi_sharp:
-        refinement = scheme.refine(one_ring(signature).topology)
-    half_edges = np.arange(refinement.topology.half_edge_count, dtype=np.int32)[None]
-    return RefinedRings(pattern, refinement.topology, half_edges, refinement.stencils, False)
+        refined, stencils = scheme.refine(one_ring(signature).topology)
+        # Connectivity is computed once for all that differ in semi-sharp features only.
+        topology = topology.with_rules(refined.rules, refined.semi_sharpness)
+    half_edges = np.arange(topology.half_edge_count, dtype=np.int32)[None]
+    found = RefinedRings(pattern, topology, half_edges, stencils, False)
+    if pattern.is_large:
+        found.keep_children()
+    return found
 
 
 def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:

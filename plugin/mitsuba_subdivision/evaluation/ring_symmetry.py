@@ -154,6 +154,39 @@ def symmetric_eigenbasis(matrix: Matrix, orbits: IntArray) -> Eigenbasis | None:
     return found
 
 
+def leading_of_symmetric(matrix: sparse.csr_array, orbits: IntArray) -> Eigenbasis | None:
+    """The first three vectors of `symmetric_eigenbasis`: the constant one, and the slowest waves.
+
+    None if the matrix has no such symmetry, or others are the first three.
+
+    Parameters
+    ----------
+    matrix : (K, K) sparse array
+    orbits : (m, n) int
+        As for `symmetric_eigenbasis`.
+
+    Returns
+    -------
+    Eigenbasis or None
+        With three vectors over all control points.
+    """
+    waves = _waves(matrix, orbits, slowest_only=True)
+    if waves is None:
+        return None
+    rest = _rest(matrix.shape[0], orbits)
+    if np.abs(waves.dual @ (matrix @ rest)).max() > SAME_WEIGHTS:
+        return None
+    # Faster waves have a part in points outside the ring only, which have none in the first three.
+    vectors, dual = np.hstack([rest, waves.vectors]), np.vstack([rest.T, waves.dual])
+    small = eigenbasis((matrix.T @ dual.T).T @ vectors, constant=dual.sum(axis=1))
+    is_slowest = np.abs(small.eigenvalues[1:3] - waves.eigenvalues.max()) < SAME_WEIGHTS
+    if not is_slowest.all() or any(rows.start < 3 for rows, _ in small.blocks):
+        return None
+    return Eigenbasis(
+        vectors @ small.vectors[:, :3], small.inverse[:3] @ dual, small.eigenvalues[:3], small.moduli[:3], ()
+    )
+
+
 def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     """Eigenbasis of a subdivision matrix of a face of a fan, by that of the fan's ring, which is found once.
 
@@ -174,7 +207,10 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     outside = np.setdiff1d(np.arange(len(matrix)), ring)
     if not len(outside) or matrix[np.ix_(ring, outside)].any():
         return None
-    of_ring = _ring_basis(_RingMatrix(matrix[np.ix_(ring, ring)]))
+    # A first picture needs no SciPy.
+    from scipy import sparse
+
+    of_ring = _ring_basis(_RingMatrix(sparse.csr_array(matrix[np.ix_(ring, ring)])))
     waves = _Waves(np.zeros((2, *matrix.shape)), of_ring.eigenvalues.copy())
     waves.vectors[ring], waves.dual[:, ring] = of_ring.vectors, of_ring.inverse
     rest = np.eye(len(matrix))[:, outside]
@@ -186,6 +222,45 @@ def fan_eigenbasis(matrix: FloatArray, ring: IntArray) -> Eigenbasis | None:
     found, places, lengths = _completed(matrix, waves, rest, is_separate)
     require_basis(matrix, found, _probes(len(matrix), PROBES_OF_FACE))
     return FanEigenbasis(found, ring, of_ring, np.flatnonzero(is_separate), places, lengths)
+
+
+def leading_of_fan(matrix: sparse.csr_array, ring: IntArray, count: int) -> Eigenbasis | None:
+    """The part of `fan_eigenbasis` that matters at the fan's vertex, without all that is of one face only.
+
+    None if the ring depends on other points, or its first three eigenvectors are not those of the face.
+
+    Parameters
+    ----------
+    matrix : (K, K) sparse array
+    ring : (r,) int
+        As for `fan_eigenbasis`.
+    count : int
+        Number of eigenvectors, from 3 to r.
+
+    Returns
+    -------
+    Eigenbasis or None
+        The first ones of the ring, over all control points. Beyond the ring all but three are zero.
+    """
+    size = matrix.shape[0]
+    outside = np.setdiff1d(np.arange(size), ring)
+    of_outside = matrix[outside][:, outside].toarray()
+    if not len(outside) or matrix[ring][:, outside].nnz:
+        return None
+    of_ring = _ring_basis(_RingMatrix(matrix[ring][:, ring]))
+    is_split = any(rows.start < end < rows.stop for rows, _ in of_ring.blocks for end in (3, count))
+    if is_split or of_ring.moduli[2] < np.abs(np.linalg.eigvals(of_outside)).max() + SEPARATE:
+        return None
+    # A first picture needs no SciPy.
+    from scipy.linalg import solve_sylvester
+
+    vectors, inverse = np.zeros((size, count)), np.zeros((count, size))
+    vectors[ring], inverse[:, ring] = of_ring.vectors[:, :count], of_ring.inverse[:count]
+    blocks = tuple((rows, block) for rows, block in of_ring.blocks if rows.stop <= count)
+    found = Eigenbasis(vectors, inverse, of_ring.eigenvalues[:count], of_ring.moduli[:count], blocks)
+    from_ring = matrix[outside][:, ring] @ vectors[ring, :3]
+    vectors[outside, :3] = solve_sylvester(of_outside, -found.block_matrix()[:3, :3], -from_ring)
+    return found
 
 
 class FanEigenbasis(Eigenbasis):
@@ -252,10 +327,12 @@ def _probes(size: int, count: int) -> FloatArray:
 class _RingMatrix:
     """The subdivision matrix of a ring; equal to others but for rounding."""
 
-    def __init__(self, matrix: FloatArray) -> None:
+    def __init__(self, matrix: sparse.csr_array) -> None:
         self.matrix = matrix
-        at = np.flatnonzero(matrix)
-        self._digits = at.tobytes(), matrix.ravel()[at].round(SAME_DIGITS).tobytes()
+        matrix.sort_indices()
+        matrix.eliminate_zeros()
+        digits = matrix.indptr, matrix.indices, matrix.data.round(SAME_DIGITS)
+        self._digits = tuple(each.tobytes() for each in digits)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _RingMatrix) and self._digits == other._digits
@@ -267,7 +344,7 @@ class _RingMatrix:
 # Fans of very many faces have bases of some megabytes.
 @lru_cache(maxsize=8)
 def _ring_basis(ring: _RingMatrix) -> Eigenbasis:
-    return eigenbasis(ring.matrix)
+    return eigenbasis(ring.matrix.toarray())
 
 
 def _completed(
@@ -314,8 +391,11 @@ class _Waves:
         return self.matrices[1, : len(self.eigenvalues)]
 
 
-def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
-    """The waves of a ring but for constants; None if sectors differ, or a wave has no real block."""
+def _waves(matrix: sparse.csr_array, orbits: IntArray, *, slowest_only: bool = False) -> _Waves | None:
+    """The waves of a ring but for constants; None if sectors differ, or a wave has no real block.
+
+    With ``slowest_only``, only those that go once around the ring; none if others have larger eigenvalues.
+    """
     (kinds, n), size = orbits.shape, matrix.shape[0]
     ring, next_sector = orbits.ravel(), np.roll(orbits, 1, axis=1).ravel()
     if abs(matrix[next_sector][:, next_sector] - matrix[ring][:, ring]).max() > SAME_WEIGHTS:
@@ -332,8 +412,14 @@ def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
     values, vectors = np.linalg.eig(blocks[k])
     if np.iscomplexobj(values) or np.abs(np.linalg.det(vectors)).min() < DEPENDENT:
         return None
+    has_signs = n % 2 == 0
+    if slowest_only:
+        faster = np.append(values[1:], blocks[n // 2].diagonal() if has_signs else ())
+        if np.abs(faster).max(initial=0) >= values[0].max():
+            return None
+        k, has_signs = k[:1], False
     inverses = np.linalg.inv(vectors)
-    found = _Waves(np.zeros((2, size, size)), np.empty(kinds * (n - 1)))
+    found = _Waves(np.zeros((2, size, size)), np.empty(kinds * (2 * len(k) + has_signs)))
     end = 0
     for wave in (np.cos, np.sin):
         for kind, orbit in enumerate(orbits):
@@ -342,11 +428,11 @@ def _waves(matrix: sparse.csr_array, orbits: IntArray) -> _Waves | None:
             amplitude = wave(np.pi / n * turns) * np.sqrt(2 / n)
             for column in range(kinds):
                 own = slice(end + column * len(k), end + (column + 1) * len(k))
-                found.vectors[orbit, own] = (amplitude * vectors[:, kind, column, None]).T
-                found.dual[own, orbit] = amplitude * inverses[:, column, kind, None]
-                found.eigenvalues[own] = values[:, column]
+                found.vectors[orbit, own] = (amplitude * vectors[: len(k), kind, column, None]).T
+                found.dual[own, orbit] = amplitude * inverses[: len(k), column, kind, None]
+                found.eigenvalues[own] = values[: len(k), column]
         end += kinds * len(k)
-    if n % 2 == 0:
+    if has_signs:
         # Signs that alternate: a cosine on edges, and a sine between them.
         for kind, orbit in enumerate(orbits):
             found.vectors[orbit, end + kind] = found.dual[end + kind, orbit] = (-1.0) ** np.arange(n) / np.sqrt(n)

@@ -14,6 +14,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -29,6 +30,8 @@ from .refined_rings import RingMesh
 
 # Stencils of more weights than these are not kept. The others take 16 MB at most.
 KEPT_WEIGHTS = 1 << 17
+# Levels of tips of high valence that are refined: derivatives have enough digits there without frames.
+REFINED_LEVELS = 3
 
 
 def stencils_by_signature(scheme: Scheme, signatures: Sequence[Signature], uv: FloatArray) -> list[FloatArray]:
@@ -112,6 +115,8 @@ class _Depth:
         The first sample of each, after which come its others; and the number of samples.
     uv : (s, 2) float64
         Parameters in the part.
+    is_in_piece : (s,) bool
+        Whether each is evaluated there, and not in a child.
     groups : list of (int, int, (m,) int64, int, (m,) int64)
         Samples that lie in the same child of an element: the element, the child's number, the samples; the child's
         index among the elements of the next depth, and the samples there. Together, all that do not lie in pieces.
@@ -125,6 +130,7 @@ class _Depth:
     elements: list[DividedElement]
     first: IntArray
     uv: FloatArray
+    is_in_piece: NDArray[np.bool_]
     groups: list[tuple[int, int, IntArray, int, IntArray]]
     stencils: list[FloatArray]
     frame_weights: FloatArray
@@ -135,12 +141,13 @@ class _Depth:
         elements: list[DividedElement],
         first: IntArray,
         uv: FloatArray,
+        is_in_piece: NDArray[np.bool_],
         groups: list[tuple[int, int, IntArray, int, IntArray]],
     ) -> _Depth:
         """A depth without weights yet."""
         counts = np.diff(first).tolist()
         stencils = [np.empty((3, n, each.control_count)) for each, n in zip(elements, counts, strict=True)]
-        return cls(elements, first, uv, groups, stencils, np.empty((2, len(uv))))
+        return cls(elements, first, uv, is_in_piece, groups, stencils, np.empty((2, len(uv))))
 
     def samples(self, element: int) -> slice:
         return slice(int(self.first[element]), int(self.first[element + 1]))
@@ -154,9 +161,12 @@ def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, u
         mesh = refine_elements(scheme, elements, mesh)
         first = ragged.offsets(np.bincount(element, minlength=len(elements)))
         kinds = np.array([each.kind for each in elements])
-        inner = np.flatnonzero(kinds[element] <= PartKind.ONLY_CHILD)
+        is_inner = kinds[element] <= PartKind.ONLY_CHILD
+        for each, samples in zip(elements, pairwise(first.tolist()), strict=True):
+            is_inner[slice(*samples)] |= _is_beside_tip(scheme, each, uv[slice(*samples)])
+        inner = np.flatnonzero(is_inner)
         if not len(inner):
-            return [*found, _Depth.of(elements, first, uv, [])]
+            return [*found, _Depth.of(elements, first, uv, ~is_inner, [])]
         parent = element[inner]
         child, in_child = scheme.domain.first_child(uv[inner].T)
         is_only = kinds[parent] == PartKind.ONLY_CHILD
@@ -170,7 +180,7 @@ def _depths(scheme: Scheme, elements: list[DividedElement], element: IntArray, u
             (key // 4, key % 4, inner[own], own_below, number[own])
             for key, own, own_below in zip(pairs.tolist(), in_pairs, below, strict=True)
         ]
-        found.append(_Depth.of(elements, first, uv, groups))
+        found.append(_Depth.of(elements, first, uv, ~is_inner, groups))
         elements, element, uv = list(numbers), element_below, uv_below
     raise not_isolated(scheme, elements[0].signature, MOST_DEPTH + 1)
 
@@ -188,24 +198,43 @@ def _distinct(element: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray, 
 
 def _evaluate_pieces(scheme: Scheme, depths: list[_Depth]) -> None:
     """Find the weights of all samples that lie in pieces, those of the same patch together."""
-    alike: dict[IrregularPatch | None, list[tuple[_Depth, int, Piece]]] = {}
+    alike: dict[IrregularPatch | None, list[tuple[_Depth, int, Piece, IntArray]]] = {}
     for depth in depths:
         for number, each in enumerate(depth.elements):
             if each.piece is not None:
-                alike.setdefault(each.piece.patch, []).append((depth, number, each.piece))
+                in_piece = np.flatnonzero(depth.is_in_piece[depth.samples(number)])
+                alike.setdefault(each.piece.patch, []).append((depth, number, each.piece, in_piece))
     for patch, pieces in alike.items():
-        uv = [piece.domain(depth.uv[depth.samples(number)]) for depth, number, piece in pieces]
-        rows, magnitude = _rows(scheme, patch, np.concatenate(uv))
+        uv = [piece.domain(depth.uv[depth.first[number] + own]) for depth, number, piece, own in pieces]
+        together = np.concatenate(uv)
+        at_point = patch is not None and not scheme.domain.extent(together).any()
+        if patch is not None and at_point and (limit := patch.limit_in_ring) is not None:
+            weights, magnitude = (np.repeat(each[:, None], len(together), axis=1) for each in limit)
+        else:
+            limit = None
+            weights, magnitude = _rows(scheme, patch, together)
         begin = 0
-        for (depth, number, piece), own_uv in zip(pieces, uv, strict=True):
-            own = slice(begin, begin + len(own_uv))
-            begin = own.stop
-            seen = _by_parent(rows[:, own], piece.domain.matrix)
-            depth.stencils[number][:] = piece.over_controls(seen)
-            by_piece = magnitude[:, own] @ piece.absolute_sums
+        for (depth, number, piece, own), own_uv in zip(pieces, uv, strict=True):
+            within = slice(begin, begin + len(own_uv))
+            begin = within.stop
+            to_controls = piece.over_controls if limit is None else piece.scattered
+            found = to_controls(weights[:, within])
+            depth.stencils[number][:, own] = _by_parent(found, piece.domain.matrix)
+            by_piece = magnitude[:, within] @ piece.absolute_sums
             if patch is not None:
-                by_piece = CANCELLED * by_piece + np.abs(piece.over_controls(rows[1:, own])).sum(axis=2)
-            depth.frame_weights[:, depth.samples(number)] = np.abs(piece.domain.matrix).T @ by_piece
+                by_piece = CANCELLED * by_piece + np.abs(found[1:]).sum(axis=2)
+            depth.frame_weights[:, depth.first[number] + own] = np.abs(piece.domain.matrix).T @ by_piece
+
+
+def _is_beside_tip(scheme: Scheme, element: DividedElement, uv: FloatArray) -> NDArray[np.bool_] | bool:
+    """Whether samples of an element lie in the first levels of a tip of high valence.
+
+    To refine its one-ring takes less time and memory than an eigenbasis, which in open fans each face has for itself.
+    """
+    piece = element.piece
+    if piece is None or piece.patch is None or piece.patch.limit_in_ring is None:
+        return False
+    return scheme.domain.extent(piece.domain(uv)) >= 2.0**-REFINED_LEVELS
 
 
 def _rows(scheme: Scheme, patch: IrregularPatch | None, uv: FloatArray) -> tuple[FloatArray, FloatArray]:

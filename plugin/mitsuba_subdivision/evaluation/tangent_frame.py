@@ -160,7 +160,7 @@ def _border_frame(point: _Point) -> FloatArray:
     _, inner, *_ = point.ring.edge_neighbours()
     weights = np.abs(basis.inverse[1:, inner]) / np.abs(basis.inverse[1:]).max(axis=1)
     mode = 1 + int(np.argmax(weights > INSIDE))
-    inward = np.zeros(len(basis.vectors))
+    inward = np.zeros(len(basis.eigenvalues))
     inward[mode] = np.sign(basis.inverse[mode, inner])
     return np.stack([point.along_border, inward])
 
@@ -172,7 +172,7 @@ def _lone_face_frame(point: _Point) -> FloatArray:
     that its powers turn to is the one that the nilpotent part of the block maps to.
     """
     basis = point.basis
-    inward = np.zeros(len(basis.vectors))
+    inward = np.zeros(len(basis.eigenvalues))
     inward[2] = 1
     for block_slice, block in basis.blocks:
         if block_slice.start <= 2 < block_slice.stop:

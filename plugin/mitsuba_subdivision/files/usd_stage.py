@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
-import struct
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cage.errors import CageError, shortened, warn
 from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
+from .usdc_sizes import require_plausible_sizes
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -23,12 +22,6 @@ _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
 # The function of the library that reports composition errors, which `open_stage` names.
 _REPORTS_COMPOSITION = "_ReportErrors"
-# Beginning of a binary file, with the place of its table of contents; a section in the table: name, place and size; the
-# number that begins the table and each section.
-_BINARY, _HEADER, _SECTION, _NUMBER = b"PXR-USDC", struct.Struct("<16xq"), struct.Struct("<16sqq"), struct.Struct("<Q")
-_MOST_SECTIONS = 100
-# LZ4 makes a byte of 255 at most, after integers have become a quarter of a byte.
-_MOST_PER_BYTE = 4 * 255
 _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 
 
@@ -73,7 +66,7 @@ def open_stage(
     """
     from pxr import Tf, Usd
 
-    _require_plausible_sections(path, name)
+    require_plausible_sizes(path, name)
     try:
         stage = Usd.Stage.Open(str(path))
         if completed is not None:
@@ -82,34 +75,6 @@ def open_stage(
         raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
     _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
     return stage
-
-
-def _require_plausible_sections(path: str | Path, name: str) -> None:
-    """Refuse a binary file with a section that announces more than it can hold: USD would reserve memory for it."""
-    with suppress(OSError), open(path, "rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(0)
-        header = file.read(_HEADER.size)
-        if not header.startswith(_BINARY) or len(header) < _HEADER.size:
-            return
-        (table,) = _HEADER.unpack(header)
-        if not 0 <= table <= size - 8:
-            raise CageError(
-                f"{name}: the table of contents is outside the file (is it cut short?); expected a USD file"
-            )
-        file.seek(table)
-        (count,) = _NUMBER.unpack(file.read(_NUMBER.size))
-        sections = file.read(min(count, _MOST_SECTIONS) * _SECTION.size)
-        for label, begin, length in _SECTION.iter_unpack(sections[: len(sections) // _SECTION.size * _SECTION.size]):
-            what = f'{name}: the section "{label.rstrip(bytes(1)).decode("ascii", "replace")}"'
-            if begin < 0 or length < _NUMBER.size or begin + length > size:
-                raise CageError(f"{what} is not inside the file (is it cut short?); expected a USD file")
-            file.seek(begin)
-            (announced,) = _NUMBER.unpack(file.read(_NUMBER.size))
-            if announced > _MOST_PER_BYTE * length:
-                raise CageError(
-                    f"{what} of {length} bytes announces {announced} entries; expected a USD file (is it damaged?)"
-                )
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:

@@ -245,6 +245,14 @@ class Topology:
         return offsets, half_edges
 
     @cached_property
+    def large_fans(self) -> dict[int, tuple[list[int], bool]]:
+        """Half-edges around vertices of very many faces, counter-clockwise, and whether they go all around.
+
+        As far as `fan_half_edges` has been around.
+        """
+        return {}
+
+    @cached_property
     def vertex_rules(self) -> NDArray[np.int8]:
         """``(n_v,)`` a `VertexRule` for each vertex."""
         return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
 
 import numpy as np
@@ -27,6 +27,7 @@ from .signature import (
     TaggedFan,
     fan_face_count,
     fan_half_edges,
+    half_edges_around,
 )
 
 # Elements up to which walks around one after the other take less time than steps of all together.
@@ -113,14 +114,20 @@ class OneRing:
         -------
         (K,) int32
         """
-        arrived = [
-            fans[corner][1][turns] if turns >= 0 else fans[corner][0][-1 - turns] for corner, turns in self.faces
-        ]
-        slots = np.array(self.slots)
-        half_edges = np.array(arrived)[slots[:, 0]]
+        corners, turns, steps = self._slot_walks
+        begins = ragged.starts(np.array([len(behind) + len(ahead) for behind, ahead in fans]))
+        unturned = begins + [len(behind) for behind, _ in fans]
+        half_edges = half_edges_around(fans)[unturned[corners] + turns]
         faces = topology.face_of(half_edges)
         first = topology.face_offsets[faces]
-        return topology.face_vertices[first + (half_edges - first + slots[:, 1]) % topology.face_sizes[faces]]
+        return topology.face_vertices[first + (half_edges - first + steps) % topology.face_sizes[faces]]
+
+    @cached_property
+    def _slot_walks(self) -> tuple[IntArray, IntArray, IntArray]:
+        """``(K,)`` for each local vertex: a corner of the element, turns about it, and steps along the face there."""
+        face, steps = np.array(self.slots).T
+        corners, turns = np.array(self.faces).T
+        return corners[face], turns[face], steps
 
     def _gather_chunk(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)

@@ -111,6 +111,10 @@ class SemiSharpness:
         return SemiSharpness.decaying(origin, edges, vertices, *across, method)
 
 
+# Of a smooth edge in `FanSharpness`: one for all, as a fan may have very many.
+SMOOTH_EDGE = 0.0, 0.0, 0.0
+
+
 class FanSharpness(NamedTuple):
     """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on numbers of edges.
 

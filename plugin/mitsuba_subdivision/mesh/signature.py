@@ -11,19 +11,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
 from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
-from .semi_sharpness import FanSharpness, SemiSharpness
+from .semi_sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
 Number = TypeVar("Number", int, IntArray)
 
 # Faces of a fan between two borders that matter to any one of them, see `TaggedFan.near`.
 NEAR_FACES = 64
+# Fans of so many faces are walked around once for all of these.
+LARGE_FAN = 32
 
 
 class TaggedFan(NamedTuple):
@@ -121,6 +122,11 @@ class Signature:
         return self.kind == other.kind and self.fans == other.fans
 
     def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        # Fans may have very many faces.
         return hash((self.kind, self.fans))
 
     @property
@@ -216,15 +222,21 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
     if kind == "face":
         while (corner := int(following(corners[-1]))) != half_edge:
             corners.append(corner)
-    return [_fan_half_edges(turn, turn_back, corner) for corner in corners]
+    return [_fan_half_edges(topology, turn, turn_back, corner) for corner in corners]
 
 
 def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
     """Half-edges of all fans, one fan after the other, each from its most clockwise half-edge on."""
-    return np.array([half_edge for behind, ahead in fans for half_edge in behind[::-1] + ahead], dtype=np.int32)
+    return np.concatenate([np.array(behind[::-1] + ahead, dtype=np.int32) for behind, ahead in fans])
 
 
-def _fan_half_edges(turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges:
+def _fan_half_edges(topology: Topology, turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges:
+    vertex = int(topology.face_vertices[half_edge])
+    around, closed = topology.large_fans.get(vertex, ([], False))
+    if half_edge in around:
+        at = around.index(half_edge)
+        return ([], around[at:] + around[:at]) if closed else (around[:at][::-1], around[at:])
+
     def half_edges(current: int, step: Walk) -> list[int]:
         found: list[int] = []
         while current >= 0 and not (found and current == half_edge):
@@ -234,7 +246,10 @@ def _fan_half_edges(turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges
 
     ahead = half_edges(half_edge, turn)
     closed = int(turn(ahead[-1])) >= 0
-    return [] if closed else half_edges(int(turn_back(half_edge)), turn_back), ahead
+    behind = [] if closed else half_edges(int(turn_back(half_edge)), turn_back)
+    if len(behind) + len(ahead) >= LARGE_FAN:
+        topology.large_fans[vertex] = behind[::-1] + ahead, closed
+    return behind, ahead
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
@@ -288,7 +303,11 @@ class FanSharpnessRows:
     def at(self, element: int, smooth: Signature) -> list[FanSharpness | None]:
         """Features at each corner of one of the elements; ``smooth`` is its signature without them."""
         semi = self._semi
-        rows = zip(*(values[element].tolist() for values in self._edges), strict=True)
+        own = [values[element] for values in self._edges]
+        sharp = np.flatnonzero(np.any(own, axis=0)).tolist()
+        rows: list[tuple[float, float, float]] = [SMOOTH_EDGE] * len(own[0])
+        for index, row in zip(sharp, zip(*(values[sharp].tolist() for values in own), strict=True), strict=True):
+            rows[index] = row
         vertices = self._vertices[element].tolist()
         found: list[FanSharpness | None] = []
         begin = 0
@@ -296,9 +315,9 @@ class FanSharpnessRows:
             vertex = vertices[begin]
             count = fan_face_count(fan)
             begin += count
-            edges, sharpness = tuple(islice(rows, count)), float(semi.vertices[vertex])
+            edges, sharpness = tuple(rows[begin - count : begin]), float(semi.vertices[vertex])
             across = _across(semi, vertex) if len(semi.across_vertex) else ()
-            is_sharp = sharpness or across or any(map(any, edges))
+            is_sharp = sharpness or across or any(row is not SMOOTH_EDGE for row in edges)
             found.append(FanSharpness(edges, sharpness, across) if is_sharp else None)
         return found
 

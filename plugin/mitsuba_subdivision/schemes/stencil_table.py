@@ -68,10 +68,26 @@ class StencilTable:
 
     def chosen(self, rows: IntArray) -> StencilTable:
         """Stencils of some refined vertices, as a table of as many rows."""
-        counts = np.bincount(self.rows, minlength=self.row_count)
-        entries = np.argsort(self.rows, kind="stable")[ragged.ranges(ragged.offsets(counts)[rows], counts[rows])]
-        own = np.repeat(np.arange(len(rows), dtype=self.rows.dtype), counts[rows])
+        order, first = self._by_row
+        counts = np.diff(first)[rows]
+        entries = order[ragged.ranges(first[rows], counts)]
+        own = np.repeat(np.arange(len(rows), dtype=self.rows.dtype), counts)
         return StencilTable(len(rows), self.column_count, own, self.columns[entries], self.weights[entries])
+
+    def only(self, rows: IntArray) -> StencilTable:
+        """The same stencils of some refined vertices, without weights of the others."""
+        is_kept = np.zeros(self.row_count, dtype=bool)
+        is_kept[rows] = True
+        own = np.flatnonzero(is_kept[self.rows])
+        kept = self.rows[own], self.columns[own], self.weights[own]
+        return StencilTable(self.row_count, self.column_count, *kept)
+
+    @cached_property
+    def _by_row(self) -> tuple[IntArray, IntArray]:
+        """Entries sorted by their rows, and where those of each row begin, and after them, where the last ends."""
+        first = ragged.offsets(np.bincount(self.rows, minlength=self.row_count))
+        # Few bits sort in linear time.
+        return np.argsort(self.rows.astype(np.min_scalar_type(self.row_count)), kind="stable"), first
 
     def dense(self, rows: IntArray) -> FloatArray:
         """Stencils of some refined vertices, ``(len(rows), column_count)``."""
