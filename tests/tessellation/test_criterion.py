@@ -15,6 +15,7 @@ from mitsuba_subdivision.tessellation.cones import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
 from scipy.spatial import ConvexHull, cKDTree
+from tessellation.distances import distances
 from tessellation.test_adaptive_grid import directed_edges, table_of
 
 # Distances are square roots of sums with rounding errors of this part of the surface's size.
@@ -41,10 +42,10 @@ CHECKED = [name for name in SURFACES if "50" not in name and name not in ("chaik
 
 @pytest.mark.parametrize("name", CHECKED)
 @pytest.mark.parametrize("error", [1e-2, 1e-3])
-def test_no_triangle_is_further_from_the_surface_than_asked(name, error):
+def test_neither_triangles_nor_the_surface_are_further_from_each_other_than_asked(name, error):
     surface = surface_named(name)
-    table = table_of(surface, error, max_rate=256)
-    assert distance(surface, table, 600) <= (error + ROUNDING) * size_of(surface)
+    found = distances(surface, table_of(surface, error, max_rate=256), 600, 64)
+    assert max(found) <= (error + ROUNDING) * size_of(surface)
 
 
 @pytest.mark.parametrize("name", SURFACES)
