@@ -64,7 +64,7 @@ def test_rates_stay_below_the_highest(name):
     # Around extraordinary vertices rings get smaller, but have no more segments.
     assert rates[tiles.depth == 0].max(initial=0) <= 6
     assert rates[tiles.depth > 0].max(initial=0) <= 3
-    assert (rates <= np.maximum(1, 6 // tiles.share)).all()
+    assert (rates <= np.maximum(1, 6 >> tiles.halvings.astype(int))).all()
     if name == "loop mixed torus":
         assert tiles.depth.max() > 15
 

@@ -88,7 +88,8 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
     if not is_coarse.any():
         return
     coarse, t = needed[is_coarse], patches.elements
-    most = (np.maximum(coarse.rates.max(axis=1), coarse.sides.max(axis=1)) * coarse.share.astype(np.int64)).max()
+    of_edges = np.maximum(coarse.rates.max(axis=1), coarse.sides.max(axis=1)).astype(np.int64) << coarse.halvings
+    most = of_edges.max()
     # Tiles halve their patches.
     rate = 1 << int(most - 1).bit_length()
     count, total = len(np.unique(t.face_of(coarse.corner))), int(np.count_nonzero(t.face_sizes))
@@ -231,7 +232,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
         is_done |= is_last
         index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
         children = [tiles.child(number, scheme.domain) for number in range(4)]
-        share = np.concatenate([each.share for each in children])
+        halvings = np.concatenate([each.halvings for each in children])
         divided, waiting = waiting, []
         of_pieces, coefficients = [], []
         for group in divided:
@@ -247,9 +248,9 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
                     continue
                 if tile is group.tile:
                     # Each ring around an extraordinary point may have as many segments as the one around it.
-                    share[at] = tiles.share[parents]
+                    halvings[at] = tiles.halvings[parents]
                 waiting.append(TileParts(tile, points, at))
-        tiles = replace(Tiles.joined(children), share=share)
+        tiles = replace(Tiles.joined(children), halvings=halvings)
         if of_pieces:
             pieces.append((tiles[np.concatenate(of_pieces)], np.concatenate(coefficients, axis=2)))
     in_pieces = Tiles.joined([each for each, _ in pieces])
