@@ -23,12 +23,12 @@ ROUNDING = 2e-14
 
 CAGES = {
     "cube": ("catmull_clark", cube()),
-    "valence 3": ("catmull_clark", extraordinary(3)),
+    "valence 3": ("catmull_clark", extraordinary(3, closed=False)),
     "dome": ("catmull_clark", extraordinary(5, closed=False)),
     "sheet": ("catmull_clark", sheet(4, 3)),
     "polygons": ("catmull_clark", ControlCage.from_file(SCENES / "cages/propeller.obj")),
     "fan": ("catmull_clark", half_disc(5)),
-    "loop ball": ("loop", extraordinary_triangles(5)),
+    "loop ball": ("loop", extraordinary_triangles(5, rows=2)),
     "loop sheet": ("loop", sheet(3, 3, triangles=True)),
     "loop fan": ("loop", half_disc(4)),
 }
@@ -282,7 +282,7 @@ def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
 @EVERY_MODE
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
 def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
-    cage = extraordinary(5)
+    cage = extraordinary(5, closed=False)
     t = cage.topology
     indices = random_indices(cage, np_rng, "islands")
     values = Attribute(np_rng.random((indices.max() + 1, 2)), "face_varying", indices)

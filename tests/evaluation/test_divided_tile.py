@@ -14,8 +14,8 @@ from mitsuba_subdivision.schemes.domain import IDENTITY
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # Weights are sums of products of up to 24 matrices.
 ROUNDING = 1e-11
-# Divisions that are looked at.
-DEPTH = 5
+# Divisions that are looked at: until nothing is semi-sharp, and of what is smooth until parts are like those before.
+DEPTH, SMOOTH_DEPTH = 5, 3
 # At most so many classes of each surface.
 MOST_CLASSES = 12
 
@@ -37,7 +37,7 @@ def parts(scheme, signature):
     """Of all parts that divisions lead to, the map to the element's parameters, and what they are."""
     (element,) = divided_elements(scheme, [signature])
     waiting = [(IDENTITY, part_of_tile(element, np.eye(element.control_count)))]
-    for _ in range(DEPTH):
+    for _ in range(DEPTH if signature.is_semi_sharp else SMOOTH_DEPTH):
         yield from waiting
         waiting = [
             (domain @ copy.inverse(), (child, of_child @ rows))

@@ -13,7 +13,7 @@ from reference.bars import NORMAL, POINT
 from reference.exact_samples import SCHEMES, angle, faces_of
 
 # The same examples in every run, and few: each random cage has some ten new classes to prepare.
-FEW = settings(derandomize=True, deadline=None, database=None, max_examples=15)
+FEW = settings(derandomize=True, deadline=None, database=None, max_examples=8)
 EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
 SEED = st.integers(0, 99)
 # Sums of products of some fifty weights.

@@ -10,9 +10,9 @@ import drjit as dr
 import numpy as np
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
-from patches.closed_cages import bumpy, cage_of, mixed_torus, triangulated
+from patches.closed_cages import bumpy, cage_of, mixed_torus, trapezohedron, triangulated
 from peers.fidelity_cages import book
-from reference.refined_cages import half_disc, sheet, spokes, tagged
+from reference.refined_cages import half_disc, sheet, spokes, tagged, upper_half
 
 CAGES = Path(__file__).parents[2] / "scenes/cages"
 INFINITE = 10.0
@@ -32,7 +32,7 @@ SURFACES = {
     "hexagon": ("catmull_clark", lambda: cage_of("catmull_clark", "hexagon")),
     "valence 2": ("catmull_clark", lambda: cage_of("catmull_clark", "valence 2 beside triangle")),
     "valence 3": ("catmull_clark", lambda: extraordinary(3)),
-    "valence 50": ("catmull_clark", lambda: extraordinary(50)),
+    "valence 50": ("catmull_clark", lambda: extraordinary(50, closed=False)),
     "face of 20": ("catmull_clark", lambda: extraordinary_face(20)),
     "smooth triangles": (
         "catmull_clark",
@@ -44,10 +44,10 @@ SURFACES = {
     "half disc of 6": ("catmull_clark", lambda: half_disc(6)),
     "holes": ("catmull_clark", lambda: tagged(mixed_torus(), holes=[0, 3])),
     "non-manifold": ("catmull_clark", non_manifold),
-    "dart": ("catmull_clark", lambda: spokes(extraordinary(5), 5, (INFINITE,))),
-    "crease": ("catmull_clark", lambda: spokes(extraordinary(6), 6, (INFINITE, 0, INFINITE))),
-    "corner": ("catmull_clark", lambda: spokes(extraordinary(8), 8, (INFINITE,) * 3)),
-    "into a dart": ("catmull_clark", lambda: spokes(extraordinary(5), 5, (INFINITE, 1.5))),
+    "dart": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (INFINITE,))),
+    "crease": ("catmull_clark", lambda: spokes(trapezohedron(6), 6, (INFINITE, 0, INFINITE))),
+    "corner": ("catmull_clark", lambda: spokes(extraordinary(8, closed=False), 8, (INFINITE,) * 3)),
+    "into a dart": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (INFINITE, 1.5))),
     "semi-sharp ring": ("catmull_clark", lambda: tagged(cube(), creases=[(a, b, 4) for a, b in RING])),
     "chaikin": (
         "catmull_clark",
@@ -62,10 +62,10 @@ SURFACES = {
     "propeller": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "propeller.obj")),
     "loop mixed torus": ("loop", lambda: triangulated(mixed_torus())),
     "loop valence 3": ("loop", lambda: extraordinary_triangles(3)),
-    "loop valence 50": ("loop", lambda: extraordinary_triangles(50)),
+    "loop valence 50": ("loop", lambda: upper_half(extraordinary_triangles(50))),
     "loop sheet": ("loop", lambda: sheet(3, 3, triangles=True, boundary="edge_only")),
     "loop half disc of 6": ("loop", lambda: half_disc(6)),
-    "loop corner": ("loop", lambda: spokes(extraordinary_triangles(5), 5, (0.5, 1.5, INFINITE))),
+    "loop corner": ("loop", lambda: spokes(upper_half(extraordinary_triangles(5)), 5, (0.5, 1.5, INFINITE))),
     "doo_sabin mixed torus": ("doo_sabin", mixed_torus),
     "doo_sabin face of 50": ("doo_sabin", lambda: extraordinary_face(50)),
     "doo_sabin sheet": ("doo_sabin", lambda: sheet(4, 4)),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -24,7 +26,7 @@ STEP, DIFFERENCES = 1e-6, 1e-7
 BASES = {
     "mixed torus": ("catmull_clark", mixed_torus),
     "sheet": ("catmull_clark", lambda: sheet(4, 3)),
-    "crease": ("catmull_clark", lambda: spokes(extraordinary(5), 5, (10, 0, 1.5))),
+    "crease": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (10, 0, 1.5))),
     "loop": ("loop", lambda: triangulated(mixed_torus())),
     "doo_sabin": ("doo_sabin", mixed_torus),
 }
@@ -37,7 +39,7 @@ def _llvm():
         pytest.skip(problem)
 
 
-@pytest.fixture(params=BASES)
+@pytest.fixture(params=BASES, scope="module")
 def surface(request):
     """A surface with attributes of every interpolation and size, some with seams if the scheme has rules for these."""
     scheme, cage = BASES[request.param]
@@ -69,9 +71,14 @@ def all_linear(surface):
     )
 
 
+@lru_cache(maxsize=4)
+def kernel_of(surface, variant):
+    return surface.on_device(variant)
+
+
 def evaluated(surface, name, variant, element, uv, corner):
     """``(s, k)`` value, and derivatives by u and v."""
-    kernel = surface.on_device(variant)
+    kernel = kernel_of(surface, variant)
     types, channel = kernel.types, channel_kernel(surface.channel(name), kernel.walk, float_type_of(variant))
     found = channel(kernel.walk.at(types.index(element), *map(types.float, uv.T), types.index(corner)))
     dr.eval(found)

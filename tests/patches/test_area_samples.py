@@ -26,9 +26,9 @@ NAMES = [
     "doo_sabin mixed torus",
 ]
 SIGNIFICANCE = 1e-3
-COUNT = 40_000
+COUNT = 20_000
 # Cells on each side of an element, and parts of a cell that are evaluated to measure it.
-CELLS, PARTS = 4, 10
+CELLS, PARTS = 4, 5
 
 
 def cell_areas(surface, element, corner):

@@ -20,13 +20,13 @@ from scipy.spatial import cKDTree
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # Points of each kind: all around, near the surface, on it, and far away.
-COUNT = 15
+COUNT = 6
 # Of distances, in sizes of the surface: both are sums of some tens of rounded products.
 ROUNDED = 1e-13
 # Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
-SAMPLES, REFINED = 6_000, 8
+SAMPLES, REFINED = 3_000, 8
 STEPS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
 
 
@@ -40,7 +40,7 @@ def points_around(samples, np_rng):
             samples.p[first] + np_rng.normal(size=(COUNT, 3)) * 0.02 * size,
             samples.p[second],
             samples.p[third] + np_rng.normal(size=(COUNT, 1)) * 0.1 * size * samples.n[third],
-            np_rng.normal(size=(5, 3)) * 30 * size,
+            np_rng.normal(size=(2, 3)) * 30 * size,
         ]
     )
 
@@ -87,7 +87,7 @@ def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np
     np.testing.assert_array_equal(found.n, there.n)
     np.testing.assert_array_equal(found.distance, np.linalg.norm(points - found.p, axis=1))
     inside = surface.scheme.domain.inside(found.uv) > 1e-9
-    assert inside.sum() > 20
+    assert inside.sum() > len(points) / 4
     assert (along_tangents(points, there) <= ALONG_NORMAL * found.distance + rounded)[inside].all()
 
 
@@ -128,12 +128,12 @@ def test_extraordinary_points_are_found(valence):
     np.testing.assert_allclose(found.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("deep", [2.0**-8, 2.0**-20, 2.0**-40])
 @pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin face of 50"])
-def test_points_above_places_next_to_extraordinary_ones(name, deep, np_rng):
+def test_points_above_places_next_to_extraordinary_ones(name, np_rng):
     surface = surface_named(name)
-    count = 8
-    uv = deep * np_rng.dirichlet(np.ones(surface.scheme.domain.corner_count), count) @ surface.scheme.domain.corners
+    deep = np.repeat([2.0**-8, 2.0**-20, 2.0**-40], 3)[:, None]
+    domain = surface.scheme.domain
+    uv = deep * (np_rng.dirichlet(np.ones(domain.corner_count), len(deep)) @ domain.corners)
     element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))
     samples = surface.evaluate(element, uv)
     away = 1e-3 * samples.n

@@ -38,7 +38,7 @@ CAGES = {
     "holes": ("catmull_clark", tagged(mixed_torus(), holes=[0, 3])),
     "boundary none": ("catmull_clark", sheet(4, 4, boundary="none")),
     "doo_sabin sheet": ("doo_sabin", sheet(4, 4)),
-    "crease": ("catmull_clark", spokes(extraordinary(5), 5, (INFINITE, 0, INFINITE))),
+    "crease": ("catmull_clark", spokes(extraordinary(5, closed=False), 5, (INFINITE, 0, INFINITE))),
     "creased cube": ("catmull_clark", tagged(cube(), creases=[(4, 5, 1.5), (5, 7, INFINITE), (7, 6, INFINITE)])),
 }
 

@@ -38,8 +38,16 @@ def tagged(cage, **options):
     return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options)
 
 
+def upper_half(ball):
+    """The faces of a ball that lie nowhere below its middle, in their order: vertex 0 is on top."""
+    lowest = np.minimum.reduceat(ball.positions[ball.face_vertices, 2], ball.topology.face_offsets[:-1])
+    is_above = lowest > -1e-9
+    kept, vertices = np.unique(ball.face_vertices[is_above[ball.topology.face]], return_inverse=True)
+    return ControlCage.from_arrays(ball.positions[kept], ball.face_sizes[is_above], vertices.ravel())
+
+
 def spokes(cage, valence, sharpness):
-    """Creases along the edges of vertex 0 of a ball, with a sharpness for each; the last ones may be left out."""
+    """Creases along the edges of vertex 0 of a ball, or half of one, by their sharpness; the last may be left out."""
     ring = cage.face_vertices.reshape(cage.face_count, -1)[:valence, 1].tolist()
     return tagged(cage, creases=[(0, far, s) for far, s in zip(ring, sharpness, strict=False) if s])
 

@@ -19,10 +19,14 @@ ROUNDING = 1e-12
 POINT = 1e-14
 # USD keeps points in single precision.
 SINGLE = 1e-6
-SAMPLES = 150
+SAMPLES = 60
 # The rules leave no list of faces that says which half-edges are one edge.
 NO_CAGE = "no manifold, Loop, valence 2 inside"
 PEERS = {**SURFACES, **ISLANDS}
+# Those that differ from others in the rule for seams only: their points are the same.
+OTHER_SEAMS = {name for name in ISLANDS if not name.endswith(", none")}
+# Of sharpness between integers that differs from another in its numbers only.
+OTHER_SHARPNESS = {name for name in SURFACES if name.endswith((" 0.5", " 2.5", " 4.0"))}
 TWICE = [
     "piece, rings and rims",
     "Chaikin, unequal ring",
@@ -43,7 +47,7 @@ def some_samples(surface, rng):
     """Half of them near the elements' first corners."""
     sizes = surface.patches.elements.face_sizes
     element = rng.choice(np.flatnonzero(sizes), SAMPLES)
-    uv = rng.uniform(0.01, 1, (SAMPLES, 2)) * 2.0 ** -rng.integers(0, 6, (SAMPLES, 1))
+    uv = rng.uniform(0.01, 1, (SAMPLES, 2)) * 2.0 ** -rng.integers(0, 3, (SAMPLES, 1))
     if surface.scheme.domain.corner_count == 3:
         uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
     return element, uv
@@ -61,29 +65,31 @@ def on_both(before, after, refinement, rng):
     return (old, old_uv, np.maximum(corner, 0)), (element, uv, is_middle.astype(int)), scale[:, None]
 
 
-def largest_difference(before, after, refinement, rng):
-    """Of points, derivatives, texture coordinates and attributes."""
+def largest_difference(before, after, refinement, rng, of_points=True):
+    """Of points and derivatives, if asked for, and of texture coordinates and attributes."""
     here, there, scale = on_both(before, after, refinement, rng)
-    one, other = before.evaluate(*here), after.evaluate(*there)
-    found = [one.p - other.p, scale * one.dp_du - other.dp_du, scale * one.dp_dv - other.dp_dv]
+    found = []
+    if of_points:
+        one, other = before.evaluate(*here), after.evaluate(*there)
+        found = [one.p - other.p, scale * one.dp_du - other.dp_du, scale * one.dp_dv - other.dp_dv]
     assert before.attribute_names == after.attribute_names
     for name in before.attribute_names:
         found.append(before.evaluate_attribute(name, *here) - after.evaluate_attribute(name, *there))
     return max(np.abs(each).max() for each in found)
 
 
-def check_refined(surface, rng):
+def check_refined(surface, rng, of_points=True):
     """Refine a surface's cage, compare, and return the refined surface."""
     refinement = surface.cage.refinement(surface.scheme.name)
     after = LimitSurface(refinement.cage)
     assert after.scheme.name == surface.scheme.name
-    assert largest_difference(surface, after, refinement, rng) <= ROUNDING
+    assert largest_difference(surface, after, refinement, rng, of_points) <= ROUNDING
     return after
 
 
-@pytest.mark.parametrize("name", [name for name in PEERS if name != NO_CAGE])
+@pytest.mark.parametrize("name", [name for name in PEERS if name not in {NO_CAGE, *OTHER_SHARPNESS}])
 def test_the_surface_is_the_same_with_every_feature(name, np_rng):
-    check_refined(surface_of(PEERS[name]), np_rng)
+    check_refined(surface_of(PEERS[name]), np_rng, of_points=name not in OTHER_SEAMS)
 
 
 @pytest.mark.parametrize(("scheme", "name"), CLOSED)
@@ -101,9 +107,11 @@ def test_a_refined_cage_can_be_refined(name, np_rng):
 
 @pytest.mark.parametrize(("scheme", "cage"), SEMI_SHARP.values(), ids=SEMI_SHARP)
 def test_points_and_sharpness_are_those_of_the_rules_vertex_by_vertex(scheme, cage):
+    """Of the scheme's refinement, too: `CageRefinement` checks that the cage has its rules and its sharpness."""
     cage = with_bumps(cage)
     slow = slow_mesh(scheme, cage)
-    for _ in range(2):
+    # After two refinements what was sharper is as something else was before.
+    for _ in range(3 if cage.face_count < 7 else 2):
         cage, slow = cage.refined(scheme), slow.refined()
         points, corners = cage.positions[cage.face_vertices], np.concatenate(slow.faces)
         np.testing.assert_allclose(points, slow.points[corners], atol=10 * POINT)

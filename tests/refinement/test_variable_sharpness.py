@@ -145,8 +145,6 @@ def test_points_are_those_of_the_tagged_cage_refined(name, np_rng):
 
 @pytest.mark.parametrize("name", FEW)
 def test_points_are_those_of_the_tagged_cage_where_everything_may_be_sharp(name, np_rng):
-    variable = with_every_edge(*cage_of(name))
-    check_points(variable, np_rng)
     check_points(with_every_edge(*cage_of(name), highest=3), np_rng)
 
 
@@ -179,7 +177,8 @@ def test_known_sharpness_stays_and_is_left_where_it_is_higher(np_rng):
 
 @EVERY_CAGE
 def test_forward_is_adjoint_to_backward(name, np_rng):
-    for variable in (with_every_second_tag(*cage_of(name)), with_every_edge(*cage_of(name))):
+    made = (with_every_second_tag, with_every_edge) if name in FEW else (with_every_second_tag,)
+    for variable in (each(*cage_of(name)) for each in made):
         count = variable.with_sharpness(variable.initial).vertex_count
         for sharpness in some_sharpness(variable, np_rng):
             points, direction = np_rng.normal(size=(2, count, 3))

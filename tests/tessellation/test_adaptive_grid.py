@@ -40,10 +40,18 @@ def numbered(edges, count):
 
 @EVERY_SURFACE
 @EVERY_ERROR
-def test_each_edge_inside_has_its_twin(name, error):
-    """No edge occurs twice in a direction, and those without a twin lie on edges of the elements without neighbours."""
+def test_triangles_have_no_cracks_and_no_folds_and_vertices_where_they_say(name, error):
     surface = surface_named(name)
     table = table_of(surface, error)
+    assert_each_edge_inside_has_its_twin(surface, table)
+    assert_nothing_is_open_but_the_boundary_of_the_cage(surface, table)
+    assert_elements_are_covered(surface, table)
+    if error == min(ERRORS):
+        assert_vertices_lie_where_triangles_say(surface, table)
+
+
+def assert_each_edge_inside_has_its_twin(surface, table):
+    """No edge occurs twice in a direction, and those without a twin lie on edges of the elements without neighbours."""
     edges = directed_edges(table.triangles)
     keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
     assert len(np.unique(keys)) == len(keys)
@@ -57,13 +65,6 @@ def test_each_edge_inside_has_its_twin(name, error):
         assert not len(lonely)
     # Seen from their corner, patches that are not whole have the element's edges along u = 0 and v = 0 only.
     assert (uv[lonely[~whole]].min(axis=1, initial=0) <= ROUNDING).all()
-
-
-@EVERY_SURFACE
-@EVERY_ERROR
-def test_triangles_cover_each_element_and_do_not_fold(name, error):
-    surface = surface_named(name)
-    assert_elements_are_covered(surface, table_of(surface, error))
 
 
 def assert_elements_are_covered(surface, table):
@@ -80,12 +81,6 @@ def assert_elements_are_covered(surface, table):
     assert (np.diff(table.element.astype(np.int64)) >= 0).all()
 
 
-@EVERY_SURFACE
-def test_vertices_lie_where_triangles_say(name):
-    surface = surface_named(name)
-    assert_vertices_lie_where_triangles_say(surface, table_of(surface))
-
-
 def assert_vertices_lie_where_triangles_say(surface, table):
     positions, normals = table.apply(surface.cage.positions)
     size = np.abs(positions).max()
@@ -99,17 +94,14 @@ def assert_vertices_lie_where_triangles_say(surface, table):
     assert np.array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
 
 
-@EVERY_SURFACE
-def test_nothing_is_open_but_the_boundary_of_the_cage(name):
+def assert_nothing_is_open_but_the_boundary_of_the_cage(surface, table):
     """With copies along creases joined, nothing is open on a closed cage."""
-    surface = surface_named(name)
-    table = table_of(surface, 3e-3)
     edges = table.weld_target[directed_edges(table.triangles)]
     keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
     open_edges = edges[~np.isin(twins, keys)]
     t = surface.cage.topology
     is_closed = bool((t.twin >= 0).all()) and not surface.cage.is_hole.any()
-    if surface.scheme.element == "face" and is_closed and name != "boundary none":
+    if surface.scheme.element == "face" and is_closed:
         assert not len(open_edges)
 
 

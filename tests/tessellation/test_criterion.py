@@ -14,7 +14,7 @@ from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measu
 from mitsuba_subdivision.tessellation.cones import NormalCone, TangentCone
 from mitsuba_subdivision.tessellation.least_rates import least_product
 from patches.closed_cages import bumpy
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull
 from tessellation.distances import distances
 from tessellation.test_adaptive_grid import directed_edges, table_of
 
@@ -28,7 +28,7 @@ def size_of(surface):
     return np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
 
 
-def distance(surface, table, most=4000):
+def distance(surface, table, most=300):
     """Largest distance of some points of triangles from the surface."""
     positions, _ = table.apply(surface.cage.positions)
     chosen = np.random.default_rng(1).permutation(len(table.triangles))[:most]
@@ -41,10 +41,9 @@ CHECKED = [name for name in SURFACES if "50" not in name and name not in ("chaik
 
 
 @pytest.mark.parametrize("name", CHECKED)
-@pytest.mark.parametrize("error", [1e-2, 1e-3])
-def test_neither_triangles_nor_the_surface_are_further_from_each_other_than_asked(name, error):
-    surface = surface_named(name)
-    found = distances(surface, table_of(surface, error, max_rate=256), 600, 64)
+def test_neither_triangles_nor_the_surface_are_further_from_each_other_than_asked(name):
+    surface, error = surface_named(name), 2e-3
+    found = distances(surface, table_of(surface, error, max_rate=256), 1000, 64)
     assert max(found) <= (error + ROUNDING) * size_of(surface)
 
 
@@ -143,21 +142,21 @@ def two_triangles(scheme):
 FOLDED = [flat_sheet(), pillow(0), pillow(1e-3), two_triangles("loop"), two_triangles("catmull_clark")]
 
 
-@pytest.mark.parametrize("surface", FOLDED)
-@pytest.mark.parametrize("error", [1e-2, 1e-3])
+@pytest.mark.parametrize(("surface", "error"), [*((surface, 1e-3) for surface in FOLDED), (FOLDED[0], 1e-2)])
 def test_flat_surfaces_end_where_they_should(surface, error):
     """Along open borders and folds: triangles do not stick out, and do not fall short."""
     table = table_of(surface, error, max_rate=256)
-    assert distance(surface, table) <= (error + ROUNDING) * size_of(surface)
+    # Of two sheets that are one, both are as near: searches take ten times as long.
+    assert distance(surface, table, 60) <= (error + ROUNDING) * size_of(surface)
     positions, _ = table.apply(surface.cage.positions)
-    # Points of the surface near its borders, and points all over the triangles' own borders and folds.
+    # Points of the surface near its borders, and the triangles' edges.
     dense = surface.tessellate(64).positions
-    corners = positions[directed_edges(table.triangles)]
-    along = np.linspace(0, 1, 200)[:, None, None]
-    lines = cKDTree(((1 - along) * corners[:, 0] + along * corners[:, 1]).reshape(-1, 3))
     outline = dense[ConvexHull(dense[:, [0, 2] if np.ptp(dense[:, 1]) == 0 else [0, 1]]).vertices]
-    spacing = np.linalg.norm(np.diff(corners, axis=1), axis=2).max() / 200
-    assert lines.query(outline)[0].max() <= error * size_of(surface) + spacing
+    start, end = positions[np.unique(np.sort(directed_edges(table.triangles)), axis=0)].swapaxes(0, 1)
+    along, away = end - start, outline[:, None] - start
+    nearest = np.clip((away * along).sum(axis=2) / (along**2).sum(axis=1), 0, 1)
+    gaps = np.linalg.norm(away - nearest[..., None] * along, axis=2).min(axis=1)
+    assert gaps.max() <= (error + ROUNDING) * size_of(surface)
 
 
 def test_an_isolated_point_of_high_rate_stays_isolated():
@@ -183,10 +182,10 @@ def test_flat_and_even_cages():
     """A flat sheet is two triangles for each face, and an even torus has no more triangles than the uniform grid."""
     surface = LimitSurface(torus(8, 6))
     uniform = surface.sampling(16)
-    found = distance(surface, uniform)
+    found = distance(surface, uniform, 4000)
     table = surface.adaptive_sampling(Criterion(Measure.CHORD, found), 64)
     assert len(table.triangles) <= 1.05 * len(uniform.triangles)
-    assert distance(surface, table) <= found
+    assert distance(surface, table, 4000) <= found
 
 
 @pytest.mark.parametrize("valence", [3, 5, 12])

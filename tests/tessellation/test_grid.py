@@ -17,7 +17,7 @@ WITHOUT_WHOLE_ELEMENTS = {
     ("doo_sabin", "trapezohedron"),
 }
 # Odd and even, each more than once: from here on they differ in numbers only.
-RATES = range(1, 7)
+RATES = range(1, 5)
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 # At rate 1, faces on both sides of a vertex of valence 2 may have a triangle in common, which meets only itself.
 COLLAPSED = {("catmull_clark", "valence 2", 1), ("catmull_clark", "valence 2 beside triangle", 1)}
@@ -174,19 +174,13 @@ def test_triangles_are_cells_of_the_lattice(scheme, name):
         for corners in patch_corners(grid):
             for part in grid.layout(corners)[1]:
                 for corner, vertices in zip(part.corners.tolist(), vertices_of(part).tolist(), strict=True):
-                    place |= {
-                        (int(t.face[corner]), vertex): (corner, uv)
-                        for vertex, uv in zip(vertices, part.uv, strict=True)
-                    }
-        whole = t.face_sizes == domain.corner_count
+                    face = int(t.face[corner])
+                    if t.face_sizes[face] == domain.corner_count:
+                        turned = domain.rotation(corner - int(t.face_offsets[face]))(part.uv)
+                        place |= {(face, vertex): uv for vertex, uv in zip(vertices, turned.tolist(), strict=True)}
         for element, triangle in zip(grid.element().tolist(), grid.triangles().tolist(), strict=True):
-            if not whole[element]:
-                continue
             found = [place[element, vertex] for vertex in triangle if (element, vertex) in place]
-            turned = [domain.rotation(corner - int(t.face_offsets[element]))(uv[None])[0] for corner, uv in found]
-            for one in turned:
-                for other in turned:
-                    assert np.abs(one - other).max() <= 1 / rate + 1e-12
+            assert all(max(each) - min(each) <= 1 / rate + 1e-12 for each in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])

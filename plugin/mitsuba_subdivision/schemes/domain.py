@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property, reduce
+from functools import cached_property, lru_cache, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,6 +133,12 @@ class ParameterDomain:
         raise NotImplementedError
 
 
+@lru_cache(maxsize=32)
+def _gauss(order: int) -> tuple[FloatArray, FloatArray]:
+    """Gauss's rule on [-1, 1], whose eigenvalue problem takes longer than the few sums that need it."""
+    return np.polynomial.legendre.leggauss(order)
+
+
 class _Square(ParameterDomain):
     @property
     def area(self) -> float:
@@ -164,7 +170,7 @@ class _Square(ParameterDomain):
         return uv
 
     def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
-        nodes, weights = np.polynomial.legendre.leggauss(order)
+        nodes, weights = _gauss(order)
         nodes, weights = (nodes + 1) / 2, weights / 2
         u, v = (each.ravel() for each in np.meshgrid(nodes, nodes))
         return np.stack([u, v], axis=1), np.outer(weights, weights).ravel()
