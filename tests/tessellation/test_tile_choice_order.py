@@ -1,9 +1,29 @@
-"""The order of tiles along Morton's curve."""
+"""The order of tiles along Morton's curve, and the blocks in which they are chosen."""
 
 import numpy as np
+from kernels.surfaces import surface_named
+from mitsuba_subdivision.tessellation import tile_choice
 from mitsuba_subdivision.tessellation.tile_choice import _interleaved
+from tessellation.test_adaptive_grid import table_of
 
 
 def test_bits_with_zeros_between_them_are_binary_digits_read_in_base_four(np_rng):
     values = np.append(np_rng.integers(1 << 26, size=200), [0, 1, (1 << 26) - 1])
     assert _interleaved(values).tolist() == [int(f"{value:b}", 4) for value in values.tolist()]
+
+
+def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
+    """And no block has more patches than it may: a class at its end is cut."""
+    surface, most, sizes = surface_named("rook"), 7, []
+    whole = table_of(surface, 1e-2, 64).triangles
+    have_flat_rings = tile_choice.have_flat_rings
+
+    def counted(rates, tiles, groups):
+        sizes.append(len(tiles))
+        return have_flat_rings(rates, tiles, groups)
+
+    monkeypatch.setattr(tile_choice, "PATCHES_AT_ONCE", most)
+    monkeypatch.setattr(tile_choice, "have_flat_rings", counted)
+    np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)
+    assert set(sizes[:-1]) == {most}
+    assert sum(sizes) == surface.patches.patch_count

@@ -15,7 +15,7 @@ from .adaptive_grid import AdaptiveGrid
 from .criterion import Criterion
 from .patch_frames import PatchFrames
 from .tile_choice import choose_tiles
-from .tile_sides import UNIT
+from .tiles import UNIT
 from .vertex_stencils import WEIGHTS_TOGETHER, ClassStencils, VertexStencils
 from .vertex_table import VertexTable
 

@@ -15,8 +15,8 @@ from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
 from .spans import Spans, SpanVertices, cut_into_spans, first_of_each
 from .stitching import SideSamples, inner_counts, inner_steps, stitched
-from .tile_sides import UNIT, at_vertices
-from .tiles import Tiles
+from .tile_sides import at_vertices
+from .tiles import UNIT, Tiles
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,6 @@ class AdaptiveGrid:
 
     Attributes
     ----------
-    tiles : Tiles
     frames : PatchFrames
     spans : Spans
         All sides of the tiles.
@@ -35,7 +34,6 @@ class AdaptiveGrid:
         As for `stitched`.
     """
 
-    tiles: Tiles
     frames: PatchFrames
     spans: Spans
     topology: Topology
@@ -58,7 +56,12 @@ class AdaptiveGrid:
             tiles = replace(tiles, rates=np.maximum(tiles.rates, least[:, None]))
         else:
             keeps = None
-        return cls(tiles, frames, cut_into_spans(tiles, frames), t, keeps)
+        return cls(frames, cut_into_spans(tiles, frames), t, keeps)
+
+    @property
+    def tiles(self) -> Tiles:
+        """The tiles, in the order of the elements."""
+        return self.spans.tiles
 
     def cut(self, topology: Topology) -> AdaptiveGrid:
         """See `Grid.cut`."""
@@ -78,7 +81,7 @@ class AdaptiveGrid:
     def _numbers(self) -> SpanVertices:
         return self.spans.numbered(self.topology.edge, self.topology.face_vertices)
 
-    @cached_property
+    @property
     def _inner_counts(self) -> IntArray:
         return inner_counts(self.tiles.rates, self._corner_count)
 
@@ -153,7 +156,7 @@ class AdaptiveGrid:
             of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
             span, along = spans.samples(of_tiles)
             counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))
-            sides = SideSamples(ragged.offsets(counts), spans.first[span] + along * spans.part[span], m)
+            sides = SideSamples(ragged.offsets(counts), spans.along_sides(span, along), m)
             keeps = None if self.keeps_corner is None else self.keeps_corner[own]
             triangles = stitched(self.tiles.rates[own], sides, keeps)
             is_inner = triangles >= len(span)
@@ -172,8 +175,10 @@ class AdaptiveGrid:
 
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
         """``(2, n)`` parameters in patches, in units of 1 / `UNIT`, from parameters in tiles."""
-        size: FloatArray = (UNIT >> self.tiles.depth[tile]).astype(np.float64)
-        return size * (self.tiles.origin[tile].T + np.where(self.tiles.is_flipped[tile], 1 - uv, uv))
+        found = np.where(self.tiles.is_flipped[tile], 1 - uv, uv)
+        found += self.tiles.origin[tile].T
+        found *= self.tiles.size[tile]
+        return found
 
     def vertex_parameters(self) -> tuple[IndexArray, FloatArray]:
         """Parameters of vertices, each in one of its tiles.

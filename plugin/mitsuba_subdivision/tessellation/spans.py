@@ -11,7 +11,7 @@ The sides of a crease are two lines with vertices of their own at the same posit
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,8 +22,8 @@ from ..mesh.chunks import chunks_of, gathered
 from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
-from .tile_sides import EDGE, HALVINGS, UNIT, SidePoints, points_on_sides, side_lines, tile_corners
-from .tiles import DEEPEST, Tiles
+from .tile_sides import EDGE, HALVINGS, SidePoints, points_on_sides, side_lines, tile_corners
+from .tiles import DEEPEST, UNIT, Tiles
 
 # Bits that numbers may have.
 MOST_BITS = 63
@@ -90,15 +90,16 @@ class Spans:
     Attributes
     ----------
     tiles : Tiles
+        Without `Tiles.sides`, as rates say what these did.
     frames : PatchFrames
         Of the tiles' patches.
     side : (s,) int32
         ``m`` times the tile, plus the corner at which its side begins.
     rate : (s,) int16
         Segments.
-    first : (s,) float32
-    part : (s,) float16
-        Beginning and length of each span, as fractions of the side: exact, as these are dyadic.
+    node : (s,) int32
+        Which part of its side each span is, in the tree of halves: 1 is the whole side, ``2 n`` and ``2 n + 1`` are the
+        halves of part ``n``.
     is_backward : (s,) bool
         Whether the numbers of the vertices inside fall along the side.
     at : (s,) int32
@@ -109,8 +110,7 @@ class Spans:
     frames: PatchFrames
     side: IndexArray
     rate: NDArray[np.int16]
-    first: NDArray[np.float32]
-    part: NDArray[np.float16]
+    node: IndexArray
     is_backward: NDArray[np.bool_]
     at: IndexArray
 
@@ -129,8 +129,14 @@ class Spans:
             side = self.side[own]
             begin = self._corners(side)
             way = self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin
-            found[:, block] = (self.first[own] + part[block] * self.part[own]) * way + begin
+            found[:, block] = self.along_sides(own, part[block]) * way + begin
         return found
+
+    def along_sides(self, span: IntArray | slice, part: FloatArray) -> FloatArray:
+        """``(n,)`` fractions of sides, of points at given fractions of spans."""
+        # The tree's levels begin at powers of two.
+        mantissa, exponent = np.frexp(self.node[span])
+        return np.ldexp(part, 1 - exponent) + (2 * mantissa - 1)
 
     def _corners(self, side: IntArray) -> IndexArray:
         """``(2, n)`` parameters at which sides begin."""
@@ -138,7 +144,7 @@ class Spans:
         tile = side // m
         number = side - m * tile + m * tiles.is_flipped[tile]
         corners = self.frames.domain.corners.T.astype(np.int32)
-        steps, size = np.concatenate([corners, 1 - corners], axis=1), UNIT >> tiles.depth[tile]
+        steps, size = np.concatenate([corners, 1 - corners], axis=1), tiles.size[tile]
         found = [size * (at[tile] + step[number]) for at, step in zip(tiles.origin.T, steps, strict=True)]
         return np.stack(found).astype(np.int32)
 
@@ -149,7 +155,7 @@ class Spans:
             first = side[block.start] // m
             own = self.tiles[first : side[block.stop - 1] // m + 1]
             points = tile_corners(own, self.frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
-            inside = np.flatnonzero(self.first[block])
+            inside = np.flatnonzero(self.node[block] & (self.node[block] - 1))
             points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
             yield block, points, points_on_sides(self.frames, self._corner(block), points)
 
@@ -286,18 +292,20 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
 
     side = np.repeat(np.arange(len(group), dtype=np.int32), counts)
     at = np.repeat(gathered(before, group), counts)
-    from_side, part = np.zeros(len(side), dtype=np.float32), np.ones(len(side), dtype=np.float16)
+    node = np.ones(len(side), dtype=np.int32)
     is_held = counts > 1
     rows = np.flatnonzero(gathered(is_held, side))
     of_side, place = side[rows], ragged.index_in_row(counts[is_held])
     backward = is_backward[of_side]
     at[rows] += np.where(backward, counts[of_side] - 1 - place, place).astype(np.int32)
     own = group[of_side]
-    part[rows] = span_size[at[rows]] / size[own]
-    passed = (span_begin[at[rows]] - begin[own]) / size[own]
-    from_side[rows] = np.where(backward, 1 - part[rows].astype(np.float64) - passed, passed)
+    length = span_size[at[rows]]
+    # Sizes are powers of two.
+    parts, passed = size[own] // length, (span_begin[at[rows]] - begin[own]) // length
+    node[rows] = parts + np.where(backward, parts - 1 - passed, passed)
     del group, begin, size, before, counts
-    return Spans(tiles, frames, side, gathered(span_rate, at), from_side, part, gathered(is_backward, side), at)
+    tiles = replace(tiles, sides=np.empty((len(tiles), 0), dtype=np.int16))
+    return Spans(tiles, frames, side, gathered(span_rate, at), node, gathered(is_backward, side), at)
 
 
 def _side_keys(tiles: Tiles, frames: PatchFrames, shift: int) -> tuple[IntArray, NDArray[np.bool_]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -27,8 +27,8 @@ from .tile_extents import TileParts, alike
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
-# Number of patches, or their pieces, processed together, which bounds temporary memory.
-PATCHES_AT_ONCE = 1 << 14
+# Number of patches, or of tiles in pieces, processed together, which bounds temporary memory.
+PATCHES_AT_ONCE = 1 << 13
 
 
 def choose_tiles(
@@ -74,13 +74,7 @@ def choose_tiles(
     points = control_points[control_of_vertex]
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
     features = feature_edges(patches, frames, points, criterion)
-    found: list[Tiles] = []
-    triangle_count = 0
-    for block, groups in _blocks(patches, frames, points, features):
-        for chosen in _chosen(rates, block, groups, triangle_count):
-            triangle_count += rates.cost(chosen)
-            found.append(chosen)
-    needed = Tiles.joined(found)
+    needed = Tiles.joined(list(_chosen(rates, _blocks(patches, frames, points, features))))
     tiles = rates.clipped(needed)
     if criterion.outline is None:
         _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
@@ -93,7 +87,8 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
     if not is_coarse.any():
         return
     coarse, t = needed[is_coarse], patches.elements
-    most = (np.maximum(coarse.rates.max(axis=1), coarse.sides.max(axis=1)) * coarse.share.astype(np.int64)).max()
+    of_edges = np.maximum(coarse.rates.max(axis=1), coarse.sides.max(axis=1)).astype(np.int64) << coarse.halvings
+    most = of_edges.max()
     # Tiles halve their patches.
     rate = 1 << int(most - 1).bit_length()
     count, total = len(np.unique(t.face_of(coarse.corner))), int(np.count_nonzero(t.face_sizes))
@@ -125,15 +120,17 @@ def _blocks(
     count = 0
     for patch_class in counted(table.classes, "Tiles of patch classes"):
         of_class = patch_class.corners if refined is None else refined.corners(patch_class)
-        for begin in range(0, len(of_class), PATCHES_AT_ONCE):
-            own = slice(begin, begin + PATCHES_AT_ONCE)
+        begin = 0
+        while begin < len(of_class):
+            own = slice(begin, begin + PATCHES_AT_ONCE - count)
+            begin = own.stop
             corners.append(of_class[own])
             controls = np.empty((patch_class.controls.shape[1], 3, len(corners[-1])))
             for axis, values in enumerate(coordinates):
                 controls[:, axis] = values.take(patch_class.controls[own].T, mode="clip")
             groups.append(PatchGroup(patch_class.signature, np.arange(count, count + len(corners[-1])), controls))
             count += len(corners[-1])
-            if count >= PATCHES_AT_ONCE:
+            if count == PATCHES_AT_ONCE:
                 yield _whole(frames, corners, features), groups
                 groups, corners, count = [], [], 0
     if groups:
@@ -145,34 +142,57 @@ def _whole(frames: PatchFrames, corners: list[IntArray], features: NDArray[np.bo
     return Tiles.whole(every, sides_on(features, frames, every))
 
 
-def _chosen(rates: TileRates, tiles: Tiles, patches: list[PatchGroup], triangle_count: int) -> Iterator[Tiles]:
-    """Tiles of some patches, with their rates.
-
-    Parameters
-    ----------
-    rates : TileRates
-    tiles : Tiles
-        The patches.
-    patches : list of PatchGroup
-    triangle_count : int
-        Of all patches before.
+def _chosen(rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]) -> Iterator[Tiles]:
+    """Tiles of all patches, with their rates.
 
     Raises
     ------
     MemoryError
         If there would be too many triangles.
     """
-    if optional_member(rates.scheme, "has_convex_rules"):
-        is_flat = have_flat_rings(rates, tiles, patches)
-        yield tiles[is_flat]
-        patches = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
-    flat, pieces, coefficients = _divided(rates, tiles, patches)
-    yield flat
-    for begin in range(0, len(pieces), PATCHES_AT_ONCE):
-        own = slice(begin, begin + PATCHES_AT_ONCE)
-        for found in rates.rated(pieces[own], coefficients[..., own], triangle_count):
-            triangle_count += rates.cost(found)
-            yield found
+    triangle_count = 0
+    for tiles, coefficients in _in_runs(_cut(rates, blocks)):
+        chosen = [tiles] if coefficients is None else rates.rated(tiles, coefficients, triangle_count)
+        triangle_count += sum(map(rates.cost, chosen))
+        yield from chosen
+
+
+def _cut(
+    rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]
+) -> Iterator[tuple[Tiles, FloatArray | None]]:
+    """Tiles of all patches: those with rates; and those that lie in pieces, with Bernstein coefficients over them."""
+    for tiles, patches in blocks:
+        rest = patches
+        if optional_member(rates.scheme, "has_convex_rules"):
+            is_flat = have_flat_rings(rates, tiles, patches)
+            yield tiles[is_flat], None
+            rest = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
+        flat, pieces, coefficients = _divided(rates, tiles, rest)
+        yield flat, None
+        yield pieces, coefficients
+
+
+def _in_runs(cut: Iterable[tuple[Tiles, FloatArray | None]]) -> Iterator[tuple[Tiles, FloatArray | None]]:
+    """The same tiles, those in pieces in runs of `PATCHES_AT_ONCE`: most blocks have few, and each run takes time."""
+    waiting: list[tuple[Tiles, FloatArray]] = []
+    for tiles, coefficients in cut:
+        if coefficients is None:
+            yield tiles, None
+            continue
+        waiting.append((tiles, coefficients))
+        if sum(len(each) for each, _ in waiting) >= PATCHES_AT_ONCE:
+            yield from _runs(waiting)
+            waiting = []
+    yield from _runs(waiting)
+
+
+def _runs(pieces: list[tuple[Tiles, FloatArray]]) -> Iterator[tuple[Tiles, FloatArray]]:
+    if pieces:
+        tiles = Tiles.joined([each for each, _ in pieces])
+        coefficients = np.concatenate([each for _, each in pieces], axis=2)
+        for begin in range(0, len(tiles), PATCHES_AT_ONCE):
+            run = slice(begin, begin + PATCHES_AT_ONCE)
+            yield tiles[run], coefficients[..., run]
 
 
 def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple[Tiles, Tiles, FloatArray]:
@@ -211,7 +231,7 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
         is_done |= is_last
         index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
         children = [tiles.child(number, scheme.domain) for number in range(4)]
-        share = np.concatenate([each.share for each in children])
+        halvings = np.concatenate([each.halvings for each in children])
         divided, waiting = waiting, []
         of_pieces, coefficients = [], []
         for group in divided:
@@ -227,9 +247,9 @@ def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple
                     continue
                 if tile is group.tile:
                     # Each ring around an extraordinary point may have as many segments as the one around it.
-                    share[at] = tiles.share[parents]
+                    halvings[at] = tiles.halvings[parents]
                 waiting.append(TileParts(tile, points, at))
-        tiles = replace(Tiles.joined(children), share=share)
+        tiles = replace(Tiles.joined(children), halvings=halvings)
         if of_pieces:
             pieces.append((tiles[np.concatenate(of_pieces)], np.concatenate(coefficients, axis=2)))
     in_pieces = Tiles.joined([each for each, _ in pieces])

@@ -18,7 +18,7 @@ from .criterion import Criterion, Measure
 from .least_rates import TINY, least_product, rounded_up
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
-from .tiles import Tiles
+from .tiles import UNIT, Tiles
 
 # Parts of tiles are looked at so many at once, whose derivatives stay in a core's cache.
 PARTS_AT_ONCE = 1 << 12
@@ -160,7 +160,7 @@ class TileRates:
 
     def most(self, tiles: Tiles) -> IntArray:
         """``(t,)`` the highest rates that tiles may have."""
-        return np.maximum(1, self.max_rate // tiles.share)
+        return np.maximum(1, self.max_rate >> tiles.halvings.astype(np.int64))
 
     def clipped(self, tiles: Tiles) -> Tiles:
         """The tiles, with no higher rates than these."""
@@ -180,7 +180,7 @@ class TileRates:
         if self.domain.corner_count == 3:
             # What is outside lies in the next element; the samples are mirrored at the diagonal.
             u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
-        flipped, size = tiles.is_flipped, 0.5**tiles.depth
+        flipped, size = tiles.is_flipped, tiles.size / UNIT
         uv = [size * (origin + np.where(flipped, 1 - t, t)) for origin, t in zip(tiles.origin.T, (u, v), strict=True)]
         corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
         scale = self.frames.scale[self.frames.topology.face_of(tiles.corner)]

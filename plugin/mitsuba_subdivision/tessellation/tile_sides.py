@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..schemes.domain import ParameterDomain
 from .patch_frames import PatchFrames
-from .tiles import DEEPEST, Tiles
+from .tiles import DEEPEST, UNIT, Tiles
 
-# Parameters of patches in integers: corners of tiles lie at multiples of this part of a patch.
-UNIT = 1 << DEEPEST
 # An edge of an element, along which a patch of a polygon reaches half way, in the same parts.
 EDGE = 2 * UNIT
 # Bits of how often an edge is halved.
@@ -26,7 +24,7 @@ HALVINGS = 5
 
 def tile_corners(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
     """``(2, t, m)`` corners of tiles in their patches, in parts of `UNIT`, counter-clockwise from the tile's (0, 0)."""
-    size = (UNIT >> tiles.depth).astype(np.int32)[:, None]
+    size = tiles.size[:, None]
     found = []
     for origin, steps in zip(tiles.origin.T, domain.corners.astype(np.int32).T, strict=True):
         found.append(origin.astype(np.int32)[:, None] + np.where(tiles.is_flipped[:, None], 1 - steps, steps))
@@ -125,7 +123,7 @@ class SideLines(NamedTuple):
 def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
     """Find the lines of some tiles' sides."""
     t, m, flipped = frames.topology, frames.domain.corner_count, tiles.is_flipped
-    size = (UNIT >> tiles.depth).astype(np.int32)
+    size = tiles.size
     u, v = (origin.astype(np.int32) * size for origin in tiles.origin.T)
     far_u, far_v, diagonal = u + size, v + size, u + v + size
     # Lines inside patches are numbered by their direction and patch, after edges and spokes.

@@ -12,6 +12,8 @@ from ..schemes.domain import ParameterDomain
 
 # Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
 DEEPEST = 24
+# Parameters of patches in integers: corners of tiles lie at multiples of this part of a patch.
+UNIT = 1 << DEEPEST
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,26 +26,26 @@ class Tiles:
     ----------
     corner : (t,) int32
         Corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`.
-    depth : (t,) int32
+    depth : (t,) int8
     origin : (t, 2) int32
         Where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``.
     is_flipped : (t,) bool
         Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
         at ``origin + 1``.
-    share : (t,) int32
-        How many tiles of this size there are along an edge of the cage; around extraordinary points, along a ring.
+    halvings : (t,) int8
+        How often an edge of the cage is halved to a tile's side; around extraordinary points, an edge of a ring.
     rates : (t, 2) int32
         Segments along u and v; over triangles both are the same.
     sides : (t, m) int16
         Least segments on each side: more than the rates where an outline may run along a border of the mesh, which the
-        boundary of the cage and the sides of creases are. 0 inside.
+        boundary of the cage and the sides of creases are. 0 inside. Spans have them instead, see `Spans`.
     """
 
     corner: IndexArray
-    depth: IndexArray
+    depth: NDArray[np.int8]
     origin: IndexArray
     is_flipped: NDArray[np.bool_]
-    share: IndexArray
+    halvings: NDArray[np.int8]
     rates: IndexArray
     sides: NDArray[np.int16]
 
@@ -55,7 +57,12 @@ class Tiles:
 
     @property
     def _arrays(self) -> tuple[NDArray, ...]:
-        return self.corner, self.depth, self.origin, self.is_flipped, self.share, self.rates, self.sides
+        return self.corner, self.depth, self.origin, self.is_flipped, self.halvings, self.rates, self.sides
+
+    @property
+    def size(self) -> IndexArray:
+        """``(t,)`` length of each tile's sides in its patch, in parts of `UNIT`."""
+        return np.int32(UNIT) >> self.depth.astype(np.int32)
 
     @classmethod
     def joined(cls, parts: list[Tiles]) -> Tiles:
@@ -79,7 +86,7 @@ class Tiles:
             self.depth + 1,
             2 * self.origin + step,
             self.is_flipped ^ is_middle,
-            2 * self.share,
+            self.halvings + 1,
             self.rates,
             np.where(own_sides, -(-self.sides // 2), 0),
         )
@@ -90,10 +97,10 @@ class Tiles:
         count = len(corners)
         return cls(
             np.asarray(corners, dtype=np.int32),
-            np.zeros(count, dtype=np.int32),
+            np.zeros(count, dtype=np.int8),
             np.zeros((count, 2), dtype=np.int32),
             np.zeros(count, dtype=bool),
-            np.ones(count, dtype=np.int32),
+            np.zeros(count, dtype=np.int8),
             np.ones((count, 2), dtype=np.int32),
             is_border.astype(np.int16),
         )
