@@ -94,7 +94,7 @@ FILES = {
     "fit": {"fit.png", "fit.pdf", "fit.exr"},
     "hero": {"hero.png", "hero.exr"},
 }
-# One function writes the plots of all figures: of this one, all formats are compared; of others, pixels where there are.
+# One function writes the plots of all figures: all formats of this one are compared, of others the pixels if there are.
 WRITTEN_TWICE = "refinement"
 
 
