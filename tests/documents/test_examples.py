@@ -450,38 +450,3 @@ def test_the_readme_is_a_landing_page():
     links = {(ROOT / target.partition("#")[0]).resolve() for target in re.findall(r"\]\((\w[^):]+)\)", text)}
     # Two pages of the documentation's site show the README and the changelog.
     assert links >= {page for page in PLUGIN.rglob("*.md") if page.name not in ("index.md", "changes.md")}
-
-
-@pytest.mark.skipif(find_spec("myst_nb") is None, reason="the extra docs is not installed")
-def test_the_documentation_is_built_without_warnings(tmp_path):
-    """One site: the README begins it, and guide, formulas, notebooks and API reference lead to each other."""
-    (words,) = (
-        words
-        for block in blocks(PLUGIN / "CONTRIBUTING.md")
-        for words in block.commands
-        if words[:3] == ["python", "-m", "sphinx"]
-    )
-    *command, source, _ = words[1:]
-    done = subprocess.run(
-        [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-    def page(name):
-        return (tmp_path / "html" / f"{name}.html").read_text(encoding="utf-8")
-
-    reference = page("reference/index")
-    assert [name for name in mitsuba_subdivision.__all__ if f'id="mitsuba_subdivision.{name}"' not in reference] == []
-    for name, parts in {
-        "index": ['src="_images/hero.png"', 'href="guide/speed.html"', 'href="reference/index.html"'],
-        "MATHEMATICS": ['class="math', 'href="ARCHITECTURE.html"'],
-        "guide/python": ['href="../reference/index.html#mitsuba_subdivision.LimitSurface"', 'href="../index.html"'],
-        "guide/notebooks/dark_spot": ['href="../../MATHEMATICS.html#the-equations"', "<img"],
-        "reference/fit": ['href="../guide/fitting.html"'],
-    }.items():
-        assert [part for part in parts if part not in page(name)] == [], name
