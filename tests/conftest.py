@@ -31,6 +31,7 @@ IN_ONE_THREAD = {
     "gradients",
     "kernels",
     "patches",
+    "regression",
     "shapes",
     "surface",
     "tessellation",
