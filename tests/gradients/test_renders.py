@@ -11,7 +11,7 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 exact = pytest.mark.skipif(bool(hook_problem()), reason=str(hook_problem()))
 
-SAMPLES, STEP = 256, 5e-3
+SAMPLES, STEP = 128, 5e-3
 # Standard errors of means of six that are allowed; seeds are fixed.
 ERRORS = 4
 # A standard error beside the value: else agreement would mean nothing.
