@@ -8,7 +8,7 @@ import math
 from .. import variants
 from ..llvm import best_variant
 from ..schemes import SCHEME_CLASSES
-from ..shapes.parameter_table import HIGHEST_RATE
+from ..tessellation import HIGHEST_RATE
 
 
 def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:

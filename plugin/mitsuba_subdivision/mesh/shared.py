@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from threading import RLock
+from threading import Lock, RLock
 from typing import Any, Generic, TypeVar
 from weakref import WeakValueDictionary
 
@@ -54,8 +54,9 @@ class Shared(Generic[Value]):
 
     def __init__(self) -> None:
         self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
-        # Of several threads that request a value, one makes it and others wait. Making it may request other values.
-        self._lock = RLock()
+        # Of several threads that request a value, one makes it and others wait, those of other values do not.
+        self._making: dict[Hashable, RLock] = {}
+        self._lock = Lock()
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
         """The value of a key.
@@ -65,11 +66,20 @@ class Shared(Generic[Value]):
         key : hashable
             Of what all of the value follows from. Held for as long as the value lives.
         make : callable
-            Makes the value if there is none. It must not wait for Dr.Jit, which may begin other work meanwhile that
-            asks for the same value.
+            Makes the value if there is none. It may request other values. It must not wait for Dr.Jit, which may begin
+            other work meanwhile that asks for the same value.
         """
         with self._lock:
             found = self._values.get(key)
-            if found is None:
-                found = self._values[key] = make()
-            return found
+            if found is not None:
+                return found
+            making = self._making.setdefault(key, RLock())
+        with making:
+            found = self._values.get(key)
+            try:
+                if found is None:
+                    found = self._values[key] = make()
+                return found
+            finally:
+                with self._lock:
+                    self._making.pop(key, None)

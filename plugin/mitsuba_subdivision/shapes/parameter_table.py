@@ -12,6 +12,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from ..cage.rules import RULES
+from ..tessellation import HIGHEST_RATE
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -23,8 +24,6 @@ DISCONTINUOUS = ("exposed", "differentiable", "discontinuous")
 READ_ONLY = ("exposed", "readonly")
 
 SHADINGS = ("vertex", "exact", "auto")
-# Triangles are numbered by 32 bits, and memory ends long before that.
-HIGHEST_RATE = 1024
 
 # Python types of Mitsuba's checked types, and their names in messages.
 _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {

@@ -46,7 +46,11 @@ if TYPE_CHECKING:
     from .vertex_stencils import ClassStencils, VertexStencils
     from .vertex_table import VertexMatrices, VertexTable
 
+# Segments along an edge of the control cage. Triangles are numbered by 32 bits, and memory ends long before that.
+HIGHEST_RATE = 1024
+
 __all__ = [
+    "HIGHEST_RATE",
     "AttributeLayout",
     "AttributeTable",
     "ClassStencils",

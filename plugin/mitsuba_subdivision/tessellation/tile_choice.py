@@ -17,6 +17,7 @@ from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme_members import optional_member
+from . import HIGHEST_RATE
 from .criterion import Criterion
 from .feature_edges import feature_edges, sides_on
 from .flat_tiles import PatchGroup, are_flat, have_flat_rings
@@ -28,8 +29,6 @@ from .tiles import DEEPEST, Tiles
 
 # Number of patches, or their pieces, processed together, which bounds temporary memory.
 PATCHES_AT_ONCE = 1 << 14
-# Segments along an edge above which no rate is advised.
-HIGHEST_RATE = 1024
 
 
 def choose_tiles(

@@ -1,0 +1,69 @@
+"""Values that threads share: made once for a key, and those of other keys meanwhile."""
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import pytest
+from mitsuba_subdivision.mesh.shared import Shared
+
+THREADS = 4
+# Seconds, by far more than threads take to begin.
+LIMIT = 20
+
+
+class _Value:
+    pass
+
+
+@pytest.fixture
+def pool():
+    with ThreadPoolExecutor(THREADS) as pool:
+        yield pool
+
+
+def test_values_of_different_keys_are_made_at_the_same_time(pool):
+    shared, all_make = Shared(), Barrier(THREADS)
+
+    def make():
+        all_make.wait(LIMIT)
+        return _Value()
+
+    found = list(pool.map(lambda key: shared.get(key, make), range(THREADS)))
+    assert len(set(found)) == THREADS
+
+
+def test_a_value_that_several_threads_request_is_made_once(pool):
+    shared, all_request, made = Shared(), Barrier(THREADS), []
+
+    def make():
+        made.append(_Value())
+        return made[-1]
+
+    def request(_):
+        all_request.wait(LIMIT)
+        return shared.get("key", make)
+
+    assert {*pool.map(request, range(THREADS))} == {*made}
+    assert len(made) == 1
+
+
+def test_a_value_is_kept_while_it_is_referenced():
+    shared = Shared()
+    value = shared.get("key", _Value)
+    assert shared.get("key", _Value) is value
+    del value
+    other = _Value()
+    assert shared.get("key", lambda: other) is other
+
+
+def test_a_value_that_could_not_be_made_is_tried_again():
+    shared = Shared()
+    with pytest.raises(ZeroDivisionError):
+        shared.get("key", lambda: 1 // 0)
+    value = _Value()
+    assert shared.get("key", lambda: value) is value
+
+
+def test_making_a_value_may_request_others():
+    shared, inner = Shared(), _Value()
+    assert shared.get("outer", lambda: shared.get("inner", lambda: inner)) is inner
