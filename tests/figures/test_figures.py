@@ -46,7 +46,7 @@ def few_steps(monkeypatch):
     from mitsuba_subdivision.figures import ball_fits, crease_fit, fit
 
     for module, names in {
-        fit: {"STEPS": 4, "CREASE_STEPS": 2},
+        fit: {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4},
         ball_fits: {"PIXELS": 12, "VIEWS": 2, "SPP": 1, "TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
         crease_fit: {"PIXELS": 12, "SPP": 1},
     }.items():
@@ -111,8 +111,7 @@ def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     first = drawn(formats)
     assert set(first) == {path.name for path in options().output.iterdir()} == FILES[name]
     assert {path.rpartition(".")[2] for path in FILES[name]} == set(formats)
-    second = drawn(formats if name == WRITTEN_TWICE else ("exr",) if "exr" in formats else ("png",))
-    assert second
+    second = drawn(formats if name == WRITTEN_TWICE else ("exr",))
     assert second.items() <= first.items()
 
 
