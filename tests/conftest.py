@@ -23,7 +23,19 @@ from mitsuba_subdivision.llvm import llvm_problem
 ALL_THREADS = dr.thread_count()
 # Folders of tests that compute with Dr.Jit, but for those marked `threads`. Its threads wait for work in a loop, for 20
 # ms each time, while the other processes of pytest have tests for all cores.
-IN_ONE_THREAD = {"evaluation", "fit", "gradients", "kernels", "patches", "shapes", "surface", "tessellation"}
+IN_ONE_THREAD = {
+    "documents",
+    "evaluation",
+    "figures",
+    "fit",
+    "gradients",
+    "kernels",
+    "patches",
+    "regression",
+    "shapes",
+    "surface",
+    "tessellation",
+}
 
 
 def pytest_collection_finish():

@@ -1,6 +1,7 @@
 """Imports between packages go one way (plugin/ARCHITECTURE.md)."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import mitsuba_subdivision
@@ -146,6 +147,13 @@ def imported_names(tree, package):
                 yield from (absolute(f".{name}", package) for name in names if isinstance(name, str))
 
 
+@cache
+def imports_of(path, root):
+    """The imported names of a file, each once."""
+    package = [PACKAGE, *path.relative_to(root).parts[:-1]]
+    return set(imported_names(ast.parse(path.read_text(encoding="utf-8")), package))
+
+
 def absolute(name, package):
     """A name without the dots at its beginning, each of which stands for a package."""
     level = len(name) - len(name.lstrip("."))
@@ -173,8 +181,7 @@ def violations(root):
     for path in sorted(root.rglob("*.py")):
         relative = path.relative_to(root)
         package = relative.parts[0].removesuffix(".py")
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for name in imported_names(tree, [PACKAGE, *relative.parts[:-1]]):
+        for name in imports_of(path, root):
             if name is None:
                 if relative.as_posix() not in BY_NAME:
                     found.append(f"{relative}: imports by a name that is no constant")
@@ -194,7 +201,7 @@ def module_graph(root):
     graph = {}
     for module, path in modules.items():
         relative = path.relative_to(root)
-        names = imported_names(ast.parse(path.read_text(encoding="utf-8")), [PACKAGE, *relative.parts[:-1]])
+        names = imports_of(path, root)
         candidates = {each for name in names if name and not goes_up(relative, name) for each in (name, parent(name))}
         graph[module] = {each for each in candidates if each in modules and each != module}
     return graph
@@ -231,14 +238,10 @@ def test_nothing_else_goes_up():
     used = {
         (relative, target)
         for relative, target in UP
-        for name in imported_names(ast.parse((ROOT / relative).read_text(encoding="utf-8")), package_of(relative))
+        for name in imports_of(ROOT / relative, ROOT)
         if name and f"{name}.".startswith(f"{PACKAGE}.{target}.")
     }
     assert used == UP
-
-
-def package_of(relative):
-    return [PACKAGE, *Path(relative).parts[:-1]]
 
 
 def test_modules_do_not_import_in_circles():

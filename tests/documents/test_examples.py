@@ -6,7 +6,8 @@ A comment above a block says where it runs in another way here:
 - ``in the tests: add ARGUMENTS`` appends arguments to each command of the block, so that it takes less time;
 - ``in the tests: "A" is "B"`` replaces text, for the same reason;
 - ``in the tests: needs PACKAGE`` leaves the block out where a package has no wheel;
-- ``in the tests: options only`` checks scripts that take minutes: that they load, and have the options;
+- ``in the tests: options only`` checks commands that take minutes, or are run elsewhere: that they load, and have the
+  options; so are all scripts of the tests;
 - ``pytest`` says that the block is a file of tests;
 - ``test command`` is for `.ci/run`.
 """
@@ -58,6 +59,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 EXTRAS = PROJECT["project"]["optional-dependencies"]
 MARKERS = [line.split(":")[0] for line in PROJECT["tool"]["pytest"]["ini_options"]["markers"]]
 OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
+DPI = 20
 # Files that the examples of a page leave, among others.
 WRITTEN = {
     "README": {"artifact.png", "human.png", "rook.png"},
@@ -78,6 +80,24 @@ SCENE = """<scene version="3.0.0">
     <shape type="sphere"/>
     <emitter type="constant"/>
 </scene>"""
+
+# References are written, and compared.
+PYTEST_TWICE = """import pytest
+for option in ("--render-update-all", "--render-report=none"):
+    pytest.main(["-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest", option])
+"""
+END_OF_HELP = "= end of help =\n"
+HELP_OF_SCRIPTS = f"""import os, runpy, sys
+for path, name in zip(sys.argv[1::2], sys.argv[2::2]):
+    sys.argv = [path, "--help"]
+    sys.path.insert(0, os.path.dirname(path))
+    try:
+        runpy.run_path(path, run_name=name)
+    except SystemExit as end:
+        assert not end.code, end
+    del sys.path[0]
+    print({END_OF_HELP!r}, end="")
+"""
 
 
 class Block(NamedTuple):
@@ -107,12 +127,7 @@ class Block(NamedTuple):
                 words = shlex.split(command, comments=True)
                 if words:
                     words[0] = words[0].removeprefix(".venv/bin/")
-                    yield [*words, *shlex.split(added)] if added and may_add(words) else words
-
-
-def may_add(words):
-    """Whether a command is one that can be told to take less time."""
-    return words[0] == OURS or (words[:2] == ["python", words[1]] and words[1].startswith("tests/"))
+                    yield [*words, *shlex.split(added)] if added and words[0] == OURS else words
 
 
 def blocks(page):
@@ -135,9 +150,15 @@ def blocks(page):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A working folder with the repository's scenes; schemes that examples register are forgotten."""
+    """A working folder with the repository's scenes; schemes that examples register are forgotten.
+
+    Plots have few pixels: most of the time to draw one goes into packing them.
+    """
+    from matplotlib.figure import Figure
     from mitsuba_subdivision.schemes import scheme_table
 
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
     monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     monkeypatch.chdir(tmp_path)
@@ -160,10 +181,10 @@ def run_as_tests(block, folder):
     """Run a block as a file of tests, which first write their references."""
     (folder / "scenes" / "my_scene.xml").write_text(SCENE)
     (folder / "test_example.py").write_text(block.text)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
-    for option, outcome in (("--render-update-all", "1 passed"), ("--render-report=none", "1 passed")):
-        done = subprocess.run([*command, option], capture_output=True, text=True, timeout=120, check=False)
-        assert outcome in done.stdout, done.stdout + done.stderr
+    done = subprocess.run(
+        [sys.executable, "-c", PYTEST_TWICE], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.stdout.count("1 passed") == 2, done.stdout + done.stderr
     assert list((folder / "renders" / "references").iterdir()) == [folder / "renders" / "references" / "my_scene.exr"]
 
 
@@ -200,25 +221,27 @@ def script_options(words):
     return {word for word in words if word.startswith("--")}
 
 
-def start_script(words, options_only):
-    """Start a script of the repository; if it takes long, its help, or its import where it has no options."""
-    path = ROOT / words[0]
-    source = (path / "__main__.py" if path.is_dir() else path).read_text(encoding="utf-8")
-    if not options_only:
-        arguments = words
-    elif "argparse" in source:
-        arguments = [words[0], "--help"]
-    else:
-        assert not script_options(words)
-        arguments = ["-c", f"import runpy; runpy.run_path({str(path)!r}, run_name='imported')"]
-    return subprocess.Popen(
-        [sys.executable, *arguments],
+def check_scripts(scripts):
+    """Load scripts, which take long, one after the other in one process, and find their options in their help."""
+    arguments = []
+    for path, *words in scripts:
+        program = ROOT / path / "__main__.py" if (ROOT / path).is_dir() else ROOT / path
+        has_options = "argparse" in program.read_text(encoding="utf-8")
+        assert has_options or not script_options(words), path
+        arguments += [path, "__main__" if has_options else "imported"]
+    done = subprocess.run(
+        [sys.executable, "-c", HELP_OF_SCRIPTS, *arguments],
         cwd=ROOT,
         env={**os.environ, "COLUMNS": "200"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        timeout=120,
+        check=False,
     )
+    assert done.returncode == 0, done.stdout
+    for (path, *words), said in zip(scripts, done.stdout.split(END_OF_HELP)[:-1], strict=True):
+        assert [option for option in script_options(words) if option not in said] == [], path
 
 
 def module(words):
@@ -241,8 +264,8 @@ def module(words):
 
 
 def run_commands(block):
-    """Run the program's commands and short scripts; check all others. Returns the scripts that are still running."""
-    started = []
+    """Run the program's commands; check all others. Returns the words of scripts."""
+    scripts = []
     for words in block.commands:
         first, *rest = words
         if first == OURS and block.mark.endswith(OPTIONS_ONLY):
@@ -253,10 +276,8 @@ def run_commands(block):
         elif first in ("python", "python3") and rest[0] == "-m":
             module(rest[1:])
         elif first == "python":
-            if find_spec("resource") is None:
-                continue  # On Windows, which lacks what scripts that measure need.
-            options_only = block.mark.endswith(OPTIONS_ONLY)
-            started.append((block, words, start_script(rest, options_only), options_only))
+            if find_spec("resource"):  # Windows lacks it, and scripts that measure need it.
+                scripts.append(rest)
         elif first == "pip":
             module(words)
         elif first == "export":
@@ -272,12 +293,12 @@ def run_commands(block):
             assert os.access(ROOT / first, os.X_OK), words
         else:
             assert first in requirements("dev"), words
-    return started
+    return scripts
 
 
 def run_blocks(page, folder):
     """Run all blocks of a page; returns the names that its Python has made."""
-    names, started = {"__name__": "example"}, []
+    names, scripts = {"__name__": "example"}, []
     for block in blocks(page):
         if block.mark == "pytest":
             run_as_tests(block, folder)
@@ -286,14 +307,11 @@ def run_blocks(page, folder):
         elif block.language == "xml":
             load_scene(block, folder)
         elif block.language == "sh":
-            started += run_commands(block)
+            scripts += run_commands(block)
         else:
             assert block.language == "bibtex", block
-    for block, words, process, options_only in started:
-        said, _ = process.communicate(timeout=120)
-        assert process.returncode == 0, (str(block), said)
-        if options_only:
-            assert [option for option in script_options(words) if option not in said] == [], str(block)
+    if scripts:
+        check_scripts(scripts)
     return names
 
 
@@ -432,38 +450,3 @@ def test_the_readme_is_a_landing_page():
     links = {(ROOT / target.partition("#")[0]).resolve() for target in re.findall(r"\]\((\w[^):]+)\)", text)}
     # Two pages of the documentation's site show the README and the changelog.
     assert links >= {page for page in PLUGIN.rglob("*.md") if page.name not in ("index.md", "changes.md")}
-
-
-@pytest.mark.skipif(find_spec("myst_nb") is None, reason="the extra docs is not installed")
-def test_the_documentation_is_built_without_warnings(tmp_path):
-    """One site: the README begins it, and guide, formulas, notebooks and API reference lead to each other."""
-    (words,) = (
-        words
-        for block in blocks(PLUGIN / "CONTRIBUTING.md")
-        for words in block.commands
-        if words[:3] == ["python", "-m", "sphinx"]
-    )
-    *command, source, _ = words[1:]
-    done = subprocess.run(
-        [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-    def page(name):
-        return (tmp_path / "html" / f"{name}.html").read_text(encoding="utf-8")
-
-    reference = page("reference/index")
-    assert [name for name in mitsuba_subdivision.__all__ if f'id="mitsuba_subdivision.{name}"' not in reference] == []
-    for name, parts in {
-        "index": ['src="_images/hero.png"', 'href="guide/speed.html"', 'href="reference/index.html"'],
-        "MATHEMATICS": ['class="math', 'href="ARCHITECTURE.html"'],
-        "guide/python": ['href="../reference/index.html#mitsuba_subdivision.LimitSurface"', 'href="../index.html"'],
-        "guide/notebooks/dark_spot": ['href="../../MATHEMATICS.html#the-equations"', "<img"],
-        "reference/fit": ['href="../guide/fitting.html"'],
-    }.items():
-        assert [part for part in parts if part not in page(name)] == [], name

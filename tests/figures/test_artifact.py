@@ -19,11 +19,6 @@ DARKENED = 0.9
 SIGMAS, INTERPOLATION = 4, 0.003
 
 
-@pytest.fixture(params=["variant_scalar_rgb", "variant_llvm_ad_rgb"])
-def variant(request):
-    return request.getfixturevalue(request.param)
-
-
 def disc_luminance(valence, **parameters):
     """Mean luminance of the disc around the vertex, and its standard error."""
     import mitsuba as mi
@@ -46,14 +41,12 @@ def disc_luminance(valence, **parameters):
     return np.mean(means), np.std(means, ddof=1) / np.sqrt(SEEDS)
 
 
-@pytest.fixture(params=[3, 5], ids="valence{}".format)
-def reference(request, variant):  # noqa: ARG001 - the variant must be set first
-    """Valence and disc luminance of a fine tessellation, exact at the vertex."""
-    return request.param, *disc_luminance(request.param, rate="24")
-
-
-def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(reference):
-    valence, expected, error = reference
+# Each valence in one kind of variant: tests of the shape compare the vertices of all kinds.
+@pytest.mark.parametrize(("valence", "variant"), [(3, "scalar_rgb"), (5, "llvm_ad_rgb")])
+def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(valence, variant, request):
+    """Against a fine tessellation, exact at the vertex."""
+    request.getfixturevalue(f"variant_{variant}")
+    expected, error = disc_luminance(valence, rate="24")
     offset = repr(OFFSETS[valence])
     stam, _ = disc_luminance(valence, evaluator="stam", sample_offset=offset)
     assert stam < DARKENED * expected

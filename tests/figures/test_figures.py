@@ -22,14 +22,22 @@ def options(tmp_path):
 
 
 @pytest.fixture
-def few_pixels(monkeypatch):
-    """Figures without the pixels that a printer needs: most of the time to draw one goes into packing them."""
+def coarse(monkeypatch):
+    """Figures without the pixels and triangles that a printer needs: most of the time to draw one goes into these."""
     from matplotlib.figure import Figure
+    from mitsuba_subdivision.figures import creases, displacement, zebra
 
     save = Figure.savefig
     monkeypatch.setattr(
         Figure, "savefig", lambda figure, path, **options: save(figure, path, **{**options, "dpi": DPI})
     )
+    for module, names in {
+        creases: {"RATE": 3},
+        displacement: {"COLUMNS": 96, "ROWS": 96},
+        zebra: {"RATE": 8, "STRIPE_PIXELS": 256},
+    }.items():
+        for name, value in names.items():
+            monkeypatch.setattr(module, name, value)
 
 
 @pytest.fixture
@@ -38,7 +46,7 @@ def few_steps(monkeypatch):
     from mitsuba_subdivision.figures import ball_fits, crease_fit, fit
 
     for module, names in {
-        fit: {"STEPS": 4, "CREASE_STEPS": 2},
+        fit: {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4},
         ball_fits: {"PIXELS": 12, "VIEWS": 2, "SPP": 1, "TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
         crease_fit: {"PIXELS": 12, "SPP": 1},
     }.items():
@@ -86,25 +94,31 @@ FILES = {
     "fit": {"fit.png", "fit.pdf", "fit.exr"},
     "hero": {"hero.png", "hero.exr"},
 }
+# One function writes the plots of all figures: all formats of this one are compared, of others the pixels if there are.
+WRITTEN_TWICE = "refinement"
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb", "few_pixels", "few_steps")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "few_steps")
 @pytest.mark.parametrize("name", FILES)
 def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     from mitsuba_subdivision.figures import FIGURES
 
-    first, second = (
-        {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in FIGURES[name](options())}
-        for _ in range(2)
-    )
+    def drawn(formats):
+        files = FIGURES[name](options(formats=formats))
+        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+    formats = FIGURES[name].formats
+    first = drawn(formats)
     assert set(first) == {path.name for path in options().output.iterdir()} == FILES[name]
-    assert {path.rpartition(".")[2] for path in FILES[name]} == set(FIGURES[name].formats)
-    assert first == second
+    assert {path.rpartition(".")[2] for path in FILES[name]} == set(formats)
+    second = drawn(formats if name == WRITTEN_TWICE else ("exr",))
+    assert second.items() <= first.items()
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb", "few_pixels")
-@pytest.mark.parametrize("name", ["subdivision", "zebra", "creases", "displacement"])
+@pytest.mark.usefixtures("variant_scalar_rgb", "coarse")
+@pytest.mark.parametrize("name", ["subdivision", "zebra", "displacement"])
 def test_scalar_variants_draw_too(name, options):
+    """So do `artifact` and `creases`, by commands of the README and of the guide."""
     from mitsuba_subdivision.figures import FIGURES
 
     assert len(FIGURES[name](options(formats=("png",)))) == 1
@@ -142,7 +156,7 @@ def test_numbers_stand_on_edges_that_the_camera_sees():
     assert in_front(cube(), cube().edges, np.array([5.0, 0, 0])).sum() == 4
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
 def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_path):
     from mitsuba_subdivision.figures import FIGURES
     from mitsuba_subdivision.figures.peers import VARIABLE

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from mitsuba_subdivision.figures.normal_error import LEVELS, exact_normals, normal_errors, offset_cage
@@ -21,26 +23,29 @@ FIRST_WRONG = {
 MOVED = 2
 
 
+@cache
+def cage_and_normals(valence, offset):
+    cage = offset_cage(valence, offset)
+    return cage, exact_normals(cage)
+
+
 @pytest.mark.parametrize(("case", "level"), FIRST_WRONG.items(), ids=str)
 def test_stam_fails_at_the_predicted_level(case, level):
     valence, offset, dtype = case
-    cage = offset_cage(valence, offset)
-    error = normal_errors(cage, exact_normals(cage), "stam", dtype)
+    error = normal_errors(*cage_and_normals(valence, offset), "stam", dtype)
     assert abs(int(np.argmax(error > 5)) - level) <= MOVED
 
 
 @pytest.mark.parametrize("valence", [3, 5])
 @pytest.mark.parametrize("offset", [0, 1, 100])
 def test_the_stabilised_form_is_right_at_every_level(valence, offset):
-    cage = offset_cage(valence, offset)
-    exact = exact_normals(cage)
+    cage, exact = cage_and_normals(valence, offset)
     assert normal_errors(cage, exact, "stabilized", np.float32).max() < 1e-4
     assert normal_errors(cage, exact, "stabilized", np.float64).max() < 1e-9
 
 
 def test_the_limit_normal_is_reached_as_the_eigenvalues_say():
-    cage = offset_cage(3, 0)
-    error = normal_errors(cage, exact_normals(cage), "limit", np.float64)
+    error = normal_errors(*cage_and_normals(3, 0), "limit", np.float64)
     slope = np.diff(np.log(error[10:30])).mean()
     # lambda_4 / lambda_2 at valence 3.
     assert slope == pytest.approx(np.log(1 / 6 / 0.4100970508), abs=0.02)

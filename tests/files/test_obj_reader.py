@@ -167,7 +167,7 @@ def obj_files(draw):
 
 
 @given(content=obj_files())
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_agrees_with_a_reader_of_lines(content, obj_file):
     assert_reads_as(content, obj_file(content))
 

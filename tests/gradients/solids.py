@@ -53,31 +53,36 @@ def derivatives_of(surface, directions, rate, types):
     return joined(dr.detach(found)), np.array(derivatives)
 
 
-def of_surface(surface, direction=None):
-    """Volume and moments of what a limit surface bounds, or their derivatives by moving its control points."""
-    cut = surface.cage.cut_mesh.vertex
-    own = SurfacePieces.build(surface.patches, surface.cage.positions[cut]).divided()
-    moves = own if direction is None else SurfacePieces.build(surface.patches, direction[cut]).divided()
-    total = _integrated(own.regular, moves.regular, direction is None)
-    for tips, moved in zip(own.tips, moves.tips, strict=True):
-        for level in range(MOST_LEVELS):
-            found = _integrated(tips.level(level), moved.level(level), direction is None)
-            total += found
-            if np.abs(found).max() <= LEFT_OUT * np.abs(total).max():
-                break
+def of_surface(surface):
+    """Volume and moments of what a limit surface bounds."""
+    # With the points themselves for a field, Gauss's theorem gives 3, 4 and 5 times the integrals.
+    (total,) = derivatives_of_surface(surface, [surface.cage.positions]) / np.repeat([3, 4, 5], [1, 3, 6])
     return {"volume": total[:1], "first": total[1:4], "second": total[4:]}
 
 
-def _integrated(pieces, moves, is_value):
-    """Integrals of 1, x, y, z and products of these, times the field's part along the normal."""
+def derivatives_of_surface(surface, directions):
+    """``(n, 10)`` derivatives of volume and moments by moving the control points along each of ``n`` directions."""
+    cut = surface.cage.cut_mesh.vertex
+    own = SurfacePieces.build(surface.patches, surface.cage.positions[cut]).divided()
+    moves = [SurfacePieces.build(surface.patches, each[cut]).divided() for each in directions]
+    total = _integrated(own.regular, [each.regular for each in moves])
+    for tips, *moved in zip(own.tips, *(each.tips for each in moves), strict=True):
+        for level in range(MOST_LEVELS):
+            found = _integrated(tips.level(level), [each.level(level) for each in moved])
+            total += found
+            if (np.abs(found).max(axis=1) <= LEFT_OUT * np.abs(total).max(axis=1)).all():
+                break
+    return total
+
+
+def _integrated(pieces, moves):
+    """``(n, 10)`` integrals of 1, x, y, z and products of these, times each field's part along the normal."""
     uv, weights = pieces.basis.domain.quadrature(ORDER)
     at = pieces.basis.values(uv)
     by_u, by_v = (at @ each for each in pieces.basis.derivatives)
     p = pieces.origins[:, None] + at @ pieces.coefficients
-    field = moves.origins[:, None] + at @ moves.coefficients
     normal = np.cross(by_u @ pieces.coefficients, by_v @ pieces.coefficients)
-    flow = (field * normal).sum(axis=2) * weights
-    # With the points themselves for a field, Gauss's theorem gives 3, 4 and 5 times the integrals.
-    divisor = np.repeat([3, 4, 5] if is_value else [1, 1, 1], [1, 3, 6])
+    fields = (each.origins[:, None] + at @ each.coefficients for each in moves)
+    flows = [((field * normal).sum(axis=2) * weights).ravel() for field in fields]
     functions = [np.ones(p.shape[:2]), *np.moveaxis(p, 2, 0), *(p[..., i] * p[..., j] for i, j in PAIRS)]
-    return np.array([(flow * f).sum() for f in functions]) / divisor
+    return np.array(flows) @ np.array([each.ravel() for each in functions]).T

@@ -12,7 +12,7 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
-SAMPLES = 128
+SAMPLES = 64
 # Standard errors of means of six that are allowed; seeds are fixed.
 ERRORS = 4
 # A standard error beside the value, or beside what scaling changes: else agreement would mean nothing.

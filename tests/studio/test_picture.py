@@ -40,7 +40,7 @@ def test_still_pictures_follow_the_sensor_and_others_do_not(capfd):
 @llvm
 def test_outlines_are_within_the_error():
     """The part of each pixel that a black model covers is that of a much finer one, but for a strip along its edge."""
-    size = 160, 120
+    size = 64, 48
     made, fine = (msub.studio_scene(CUBE, size=size, spp=256, **more) for more in ({}, {"rate": 64}))
 
     def covered(scene):

@@ -120,14 +120,16 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
             _rows_to_one(mpmath.matrix(table.tolist())) for table in (structure.matrix, *structure.children)
         )
         points = mpmath.matrix(cage.positions[controls].tolist())
+        tangents = []
+        for direction in DIRECTIONS:
+            inside = [scheme.domain.inside(child(direction)) for child in scheme.domain.children[1:]]
+            child = int(np.argmax(inside))
+            local = scheme.domain.children[child + 1](direction)[None]
+            basis = mpmath.matrix(scheme.regular_basis(local, 1)[1:, 0].tolist())
+            tangents.append(_rows_to_zero(_rows_to_zero(basis) * children[child]))
         normals = []
         for _ in LEVELS:
-            for direction in DIRECTIONS:
-                inside = [scheme.domain.inside(child(direction)) for child in scheme.domain.children[1:]]
-                child = int(np.argmax(inside))
-                local = scheme.domain.children[child + 1](direction)[None]
-                basis = mpmath.matrix(scheme.regular_basis(local, 1)[1:, 0].tolist())
-                normals.append(_unit_normal(_rows_to_zero(basis) * (children[child] * points), mpmath))
+            normals += [_unit_normal(each * points, mpmath) for each in tangents]
             points = matrix * points
     return np.array(normals, dtype=np.float64)
 

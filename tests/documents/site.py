@@ -1,0 +1,39 @@
+"""The documentation is built. `.ci/run` runs this file: it takes long, and needs the extra `docs`."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import mitsuba_subdivision
+
+ROOT = Path(__file__).resolve().parents[2]
+SPHINX = "python -m sphinx -q -W plugin"
+
+
+def test_the_documentation_is_built_without_warnings(tmp_path):
+    """One site: the README begins it, and guide, formulas, notebooks and API reference lead to each other."""
+    assert f"\n{SPHINX} " in (ROOT / "plugin" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    *command, source = SPHINX.split()[1:]
+    done = subprocess.run(
+        [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+    def page(name):
+        return (tmp_path / "html" / f"{name}.html").read_text(encoding="utf-8")
+
+    reference = page("reference/index")
+    assert [name for name in mitsuba_subdivision.__all__ if f'id="mitsuba_subdivision.{name}"' not in reference] == []
+    for name, parts in {
+        "index": ['src="_images/hero.png"', 'href="guide/speed.html"', 'href="reference/index.html"'],
+        "MATHEMATICS": ['class="math', 'href="ARCHITECTURE.html"'],
+        "guide/python": ['href="../reference/index.html#mitsuba_subdivision.LimitSurface"', 'href="../index.html"'],
+        "guide/notebooks/dark_spot": ['href="../../MATHEMATICS.html#the-equations"', "<img"],
+        "reference/fit": ['href="../guide/fitting.html"'],
+    }.items():
+        assert [part for part in parts if part not in page(name)] == [], name
