@@ -144,11 +144,6 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))",
                 "sharpness = Sharpness(np.where(seam, INFINITE, -1.0), np.zeros(topology.vertex_count))",
             ),
-            (
-                "patches/one_ring_codes.py",
-                "common[half_edges], sequence[half_edges] = 0, 1 + row_codes(columns).astype(np.int64)",
-                "common[half_edges], sequence[half_edges] = -1, 1 + row_codes(columns).astype(np.int64)",
-            ),
         ),
     ),
     (
