@@ -121,6 +121,7 @@ MAY_IMPORT = {
     "MaterialX": {"usd"},
     "mitsuba_oidn": {"studio"},
     "PIL": {"usd"},
+    "lz4": {"files"},
 }
 
 

@@ -511,6 +511,18 @@ def test_arrays_that_announce_more_than_they_can_hold_are_refused(tmp_path):
             ControlCage.from_file(tmp_path / "bad.usdc")
 
 
+@pytest.mark.parametrize("damage", [(8, bytes(7) + b"\x80"), (8, b"\xff"), (0, b"\x01")], ids=["far", "near", "count"])
+def test_damaged_fields_are_errors_that_name_the_file(tmp_path, damage):
+    cube().save(tmp_path / "cube.usdc")
+    content = (tmp_path / "cube.usdc").read_bytes()
+    (table,) = struct.unpack_from("<q", content, 16)
+    (begin,) = struct.unpack_from("<q", content, content.index(b"FIELDS", table) + 16)
+    at, new = begin + damage[0], damage[1]
+    (tmp_path / "bad.usdc").write_bytes(content[:at] + new + content[at + len(new) :])
+    with pytest.raises(CageError, match=r'bad\.usdc"'):
+        ControlCage.from_file(tmp_path / "bad.usdc")
+
+
 def test_long_arrays_of_equal_numbers_are_no_damage(tmp_path):
     n = 400
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()

@@ -17,12 +17,13 @@ from ..cage.errors import CageError
 # place and size. The number that begins the table, each section and each array.
 _NAME, _HEADER, _SECTION, _NUMBER = b"PXR-USDC", struct.Struct("<8s3B5xq"), struct.Struct("<16sqq"), struct.Struct("<Q")
 _MOST_SECTIONS = 100
-# LZ4 makes a byte of 255 at most, after integers have become a quarter of a byte.
-_MOST_PER_BYTE = 4 * 255
+# LZ4 makes 255 bytes of one at most, and an integer is a quarter of a byte before.
+_MOST_OF_BLOCK = 255
+_MOST_PER_BYTE = 4 * _MOST_OF_BLOCK
+# What LZ4 compresses at once.
+_LARGEST_BLOCK = 0x7E000000
 # The first version that begins arrays with a number of 64 bits.
 _LONG_ARRAYS = (0, 7)
-# Larger tables of fields are not decompressed here: a megabyte takes a second.
-_LARGEST_FIELDS = 1 << 20
 # In a field's value: whether it is an array, and its place in the file.
 _IS_ARRAY, _PLACE = np.uint64(1 << 63), np.uint64((1 << 48) - 1)
 
@@ -30,7 +31,7 @@ _IS_ARRAY, _PLACE = np.uint64(1 << 63), np.uint64((1 << 48) - 1)
 def require_plausible_sizes(path: str | Path, name: str) -> None:
     """Refuse a binary file with a section or an array that announces more entries than it can hold.
 
-    Arrays within time samples are not checked.
+    Arrays within time samples are not checked, and others only with the package lz4 of the extra ``usd``.
 
     Parameters
     ----------
@@ -92,58 +93,28 @@ def _number(file: BinaryIO, place: int) -> int:
 
 
 def _array_places(file: BinaryIO, begin: int, length: int) -> NDArray[np.int64]:
-    """Where the arrays of all fields begin; none if the fields are too many, or damaged, which the library reports."""
+    """Where the arrays of all fields begin; none without the package lz4, or if fields are damaged.
+
+    The USD library reports the latter.
+    """
     none = np.empty(0, dtype=np.int64)
-    if length > _LARGEST_FIELDS:
+    try:
+        from lz4.block import LZ4BlockError, decompress
+    except ImportError:
         return none
     file.seek(begin)
     section = file.read(length)
     # The number of fields; their names, compressed, after their length; their values likewise.
     try:
-        (names,) = _NUMBER.unpack_from(section, 8)
+        count, names = struct.unpack_from("<2Q", section)
         (values,) = _NUMBER.unpack_from(section, 16 + names)
-        fields = np.frombuffer(_decompressed(section[24 + names : 24 + names + values]), "<u8")
-    except (struct.error, IndexError, ValueError):
+        block = section[24 + names : 24 + names + values]
+        # The number of further blocks comes first.
+        if not block or block[0] or _NUMBER.size * count > min(_MOST_OF_BLOCK * len(block), _LARGEST_BLOCK):
+            return none
+        fields = np.frombuffer(decompress(block[1:], uncompressed_size=_NUMBER.size * count), "<u8")
+    except (struct.error, OverflowError, LZ4BlockError, ValueError):
         return none
     places = fields[(fields & _IS_ARRAY) != 0] & _PLACE
     # Empty arrays have no place.
     return np.unique(places[places > 0]).astype(np.int64)
-
-
-def _decompressed(content: bytes) -> bytes:
-    """The data of `TfFastCompression`: chunks in the block format of LZ4, after their number.
-
-    Raises
-    ------
-    IndexError, ValueError
-        If the content is damaged.
-    """
-    chunk_count, found = content[0], bytearray()
-    if chunk_count:
-        raise ValueError(f"{chunk_count} chunks; expected one, as of less than two gigabytes")
-    i = 1
-    while True:
-        # Lengths of a run of bytes as they are, and of a copy of earlier ones; 15 if more of the length follows.
-        token = content[i]
-        literal, i = _length(content, i + 1, token >> 4)
-        found += content[i : i + literal]
-        i += literal
-        if i >= len(content):
-            return bytes(found)
-        offset = content[i] | content[i + 1] << 8
-        copied, i = _length(content, i + 2, token & 15)
-        copied += 4
-        if not 0 < offset <= len(found):
-            raise ValueError("a copy from before the beginning; expected one within")
-        # A copy may overlap what it makes.
-        earlier = found[-offset:][:copied]
-        found += (earlier * (copied // len(earlier) + 1))[:copied]
-
-
-def _length(content: bytes, i: int, length: int) -> tuple[int, int]:
-    """A length of LZ4, and where what follows it begins."""
-    more = 255 if length == 15 else 0
-    while more == 255:
-        more = content[i]
-        length, i = length + more, i + 1
-    return length, i
