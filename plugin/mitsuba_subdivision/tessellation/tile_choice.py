@@ -28,7 +28,7 @@ from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
 # Number of patches, or of tiles in pieces, processed together, which bounds temporary memory.
-PATCHES_AT_ONCE = 1 << 13
+PATCHES_AT_ONCE = 1 << 14
 
 
 def choose_tiles(
