@@ -6,8 +6,6 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 
-pytestmark = pytest.mark.core
-
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 # Of which weights would take tens of gigabytes.
 TOO_HIGH = 20_000
@@ -32,6 +30,7 @@ def pyramid(count, *, has_base=False, **tags):
     return ControlCage(np.concatenate([circle(count), [[0, 0, 1]]]), faces + base, **tags)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 def test_a_vertex_of_too_high_a_valence_is_named(scheme):
     with pytest.raises(MemoryError, match=rf"vertex {TOO_HIGH} has {TOO_HIGH} faces; .* GB .*several vertices"):
@@ -46,6 +45,7 @@ def test_a_fan_whose_faces_have_weights_of_their_own_is_refused_sooner(count, sh
         LimitSurface(pyramid(count, creases=[[count, 0, sharpness]]), "catmull_clark").tessellate(1)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
 def test_a_face_of_too_many_corners_is_named(scheme):
     with pytest.raises(MemoryError, match=rf"face {TOO_HIGH} has {TOO_HIGH} corners; .*smaller faces"):
@@ -84,6 +84,7 @@ class WholeLoop(Loop):
     has_local_borders = False
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     ("scheme", "whole", "corner"),
     [(CatmullClark(), WholeCatmullClark(), 0), (Loop(), WholeLoop(), 0), (Loop(), WholeLoop(), 10)],

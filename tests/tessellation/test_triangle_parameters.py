@@ -7,8 +7,6 @@ from mitsuba_subdivision.cage.named_cages import torus
 from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus, triangulated
 from reference.refined_cages import half_disc, sheet, tagged
 
-pytestmark = pytest.mark.core
-
 # Of cages of a size of about 3.
 ROUNDING = 1e-13
 CAGES = {
