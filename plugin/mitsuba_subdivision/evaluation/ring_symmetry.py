@@ -244,10 +244,9 @@ def leading_of_fan(matrix: sparse.csr_array, ring: IntArray, count: int) -> Eige
     """
     size = matrix.shape[0]
     outside = np.setdiff1d(np.arange(size), ring)
-    of_outside = matrix[outside][:, outside].toarray()
     if not len(outside) or matrix[ring][:, outside].nnz:
         return None
-    of_ring = _ring_basis(_RingMatrix(matrix[ring][:, ring]))
+    of_outside, of_ring = matrix[outside][:, outside].toarray(), _ring_basis(_RingMatrix(matrix[ring][:, ring]))
     is_split = any(rows.start < end < rows.stop for rows, _ in of_ring.blocks for end in (3, count))
     if is_split or of_ring.moduli[2] < np.abs(np.linalg.eigvals(of_outside)).max() + SEPARATE:
         return None

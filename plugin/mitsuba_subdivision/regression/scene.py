@@ -159,7 +159,7 @@ def _instantiate(
         # random numbers.
         config.merge_meshes = False
         # Loaded at once, shapes are numbered in any order, and with it the kernels of instances differ: they would be
-        # compiled again in most processes.
+        # compiled again in some processes.
         config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
         mi.parser.transform_all(config, state)
         scene = mi.parser.instantiate(config, state)
