@@ -37,6 +37,9 @@ _LEAST_ETA = 1.001
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
+# Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take 0 to 8 % longer (chess set,
+# shader ball, McUsd of the assets of the USD working group).
+_ROULETTE = 3
 # Difference of reflectances that nobody sees at an edge.
 _VISIBLE = 0.05
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -110,6 +113,8 @@ def absorbs(material: MaterialContents) -> bool:
 def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:
     """An integrator with as long paths as glass needs, and that knows media if there are any.
 
+    Roulette ends paths earlier than by default, as most of the long ones carry little.
+
     Parameters
     ----------
     materials : list of MaterialContents
@@ -119,7 +124,7 @@ def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode
     if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):
         return usual
     kind = "volpath" if any(map(absorbs, materials)) else usual["type"]
-    return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST)}
+    return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
 
 class _Values:
