@@ -133,6 +133,14 @@ def test_a_rate_of_a_wrong_type_is_an_error():
     assert len(surface.tessellate(np.int64(2)).positions) == 26
 
 
+@pytest.mark.parametrize("rate", [0, -1, 2.5, "8", None, 1025, 40_000])
+def test_a_wrong_max_rate_is_an_error(rate):
+    # Rates of an adaptive grid have 16 bits.
+    surface = LimitSurface(named_cages.cube())
+    with pytest.raises(ValueError, match=r"max_rate .*; expected (an integer|1 or more|at most 1024)"):
+        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1), rate)
+
+
 def test_a_tessellation_is_shown_by_its_sizes():
     assert repr(LimitSurface(named_cages.cube()).tessellate(2)) == "Tessellation(26 vertices, 48 triangles)"
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageWarning, named_cages
 from mitsuba_subdivision.studio.model import frame_table
-from mitsuba_subdivision.studio.picture import ERRORS, HIGHEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
+from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.placed_points import points_at
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_subdivision.usd.limit_surfaces import DENSE, Surfaces
@@ -91,7 +91,7 @@ def test_segments_follow_the_size_in_the_picture():
     near, far, larger = (_rate(_shape(cage), each, "exact") for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))
     assert far < near < larger
     # Around the camera, a picture may show any part from near.
-    assert _rate(_shape(cage), _sensor(0), "exact") == HIGHEST_RATE
+    assert _rate(_shape(cage), _sensor(0), "exact") == FINEST_RATE
     # Four times the size, four times as far away.
     assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), _sensor(8), "exact") == near
     wide = mi.ScalarTransform4f().translate([0, 0, -8]).scale([3, 3, 1])
@@ -120,7 +120,7 @@ def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
     contents = _scene(shape, dense, groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
     segments = _segments(contents, sensor, "exact")
     found = _triangles(contents, sensor)
-    expected = {**outline_for(sensor), "max_rate": HIGHEST_RATE}
+    expected = {**outline_for(sensor), "max_rate": FINEST_RATE}
     assert {**found[shape], "sensor_to_world": None} == {**expected, "sensor_to_world": None}
     assert segments[dense] == 1
     assert found[dense] == {"tessellation_rate": 1}
@@ -139,9 +139,9 @@ def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
 def test_rates_end_where_there_are_most_triangles(cages):
     segments, corners = np.array(cages).T
     highest = highest_rate(segments, corners)
-    assert 1 <= highest <= HIGHEST_RATE
+    assert 1 <= highest <= FINEST_RATE
     assert highest == 1 or (np.minimum(segments, highest) ** 2 * corners).sum() // 2 <= MOST_TRIANGLES
-    more = min(highest + 1, HIGHEST_RATE)
+    more = min(highest + 1, FINEST_RATE)
     assert highest == more or (np.minimum(segments, more) ** 2 * corners).sum() // 2 > MOST_TRIANGLES
 
 

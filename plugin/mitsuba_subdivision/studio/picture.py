@@ -23,7 +23,7 @@ ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
 # few vertices are at outlines.
 MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
 # Segments on each edge of a cage: of uniform tessellations that a picture decides on, and of adaptive ones.
-MOST_SEGMENTS, HIGHEST_RATE = 8, 64
+MOST_SEGMENTS, FINEST_RATE = 8, 64
 # Triangles of all surfaces of a scene.
 MOST_TRIANGLES = 4_000_000
 # As many uniform ones as take as long as the choice of adaptive ones.
@@ -65,7 +65,7 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
 def segments_for(
     cage: ControlCage, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float, shading: str
 ) -> NDArray[np.int64]:
-    """Estimate of the rate of a cage at which an image shows no facets, up to `HIGHEST_RATE`.
+    """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`.
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def segments_for(
     stretch = np.linalg.norm(linear, 2, axis=(1, 2))
     error = _deviation(cage, shading) * stretch * pixels_of_boxes(corners, outline, near_clip)
     # At twice the rate, triangles are four times as near.
-    segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], HIGHEST_RATE**2)))
+    segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], FINEST_RATE**2)))
     return np.maximum(1, segments.astype(np.int64))
 
 
 def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) -> int:
-    """Largest rate, up to `HIGHEST_RATE`, with which cages have no more than `MOST_TRIANGLES`.
+    """Largest rate, up to `FINEST_RATE`, with which cages have no more than `MOST_TRIANGLES`.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) ->
     corners : (n,) int
         Of its faces; a quadrilateral has four, and two triangles for each square of the rate.
     """
-    rates = np.arange(2, HIGHEST_RATE + 1)
+    rates = np.arange(2, FINEST_RATE + 1)
     triangles = (np.minimum(segments, rates[:, None]) ** 2 * corners).sum(axis=1) // 2
     return 1 + int(np.searchsorted(triangles, MOST_TRIANGLES, side="right"))
 

@@ -511,13 +511,15 @@ class LimitSurface:
         ----------
         criterion : Criterion
         max_rate : int
-            Most segments along an edge of the cage. Around extraordinary vertices, rings get as small as the criterion
-            requires, with half as many segments at most along each.
+            Most segments along an edge of the cage, 1 to 1,024. Around extraordinary vertices, rings get as small as
+            the criterion requires, with half as many segments at most along each.
         control_points : (n, 3) float64, optional
             Positions for the criterion; by default the cage's.
 
         Raises
         ------
+        ValueError
+            If ``max_rate`` is anything else.
         MemoryError
             If the tessellation would not fit into memory.
 

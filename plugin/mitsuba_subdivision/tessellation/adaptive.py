@@ -11,11 +11,13 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
+from . import HIGHEST_RATE
 from .adaptive_grid import AdaptiveGrid
 from .criterion import Criterion
 from .patch_frames import PatchFrames
 from .tile_choice import choose_tiles
 from .tiles import UNIT
+from .uniform import checked_rate
 from .vertex_stencils import WEIGHTS_TOGETHER, ClassStencils, VertexStencils
 from .vertex_table import VertexTable
 
@@ -39,12 +41,14 @@ def adaptive_table(
         Control points for which the criterion is met. The table can be applied to others.
     criterion : Criterion
     max_rate : int
-        Most segments along an edge of the cage; see `choose_tiles`.
+        Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`.
     cage_name : str
         For a warning.
 
     Raises
     ------
+    ValueError
+        If ``max_rate`` is anything else.
     MemoryError
         If the tessellation would not fit into memory.
 
@@ -53,6 +57,9 @@ def adaptive_table(
     CageWarning
         As `choose_tiles`.
     """
+    max_rate = checked_rate(max_rate, "max_rate")
+    if max_rate > HIGHEST_RATE:
+        raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
     frames = PatchFrames.of(patches, control_of_vertex)
     tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate, cage_name)
     grid = AdaptiveGrid.of(tiles, frames)

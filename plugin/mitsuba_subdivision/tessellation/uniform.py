@@ -58,7 +58,7 @@ def uniform_table(
         vertex_stencils, copies = _vertex_stencils(patches, grid, controls), _copies(patches, grid, control)
         return VertexTable(count, patches.patch_count, grid, vertex_stencils, controls, copies, refinement)
 
-    return _TABLES.get((patches, _checked_rate(rate), Content(control_of_vertex), control_count), make)
+    return _TABLES.get((patches, checked_rate(rate), Content(control_of_vertex), control_count), make)
 
 
 _TABLES: Shared[VertexTable] = Shared()
@@ -72,7 +72,7 @@ def _checked_grid(patches: PatchTable, rate: int) -> UniformGrid:
     ValueError, MemoryError
         As `uniform_table`.
     """
-    checked = _checked_rate(rate)
+    checked = checked_rate(rate)
     grid = _grid(patches, checked)
     if grid.vertex_count > MOST_VERTICES:
         raise ValueError(
@@ -91,13 +91,20 @@ def _grid(patches: PatchTable, rate: int) -> UniformGrid:
     return TriangleGrid(patches.elements, rate)
 
 
-def _checked_rate(rate: int) -> int:
+def checked_rate(rate: int, name: str = "tessellation rate") -> int:
+    """A rate that is an integer of 1 or more.
+
+    Raises
+    ------
+    ValueError
+        If it is none. The message begins with the name.
+    """
     try:
         checked = operator.index(rate)
     except TypeError:
-        raise ValueError(f"tessellation rate {rate!r}; expected an integer") from None
+        raise ValueError(f"{name} {rate!r}; expected an integer") from None
     if checked < 1:
-        raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
+        raise ValueError(f"{name} {rate}; expected 1 or more segments per edge")
     return checked
 
 

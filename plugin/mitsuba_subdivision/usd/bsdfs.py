@@ -37,8 +37,8 @@ _LEAST_ETA = 1.001
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
-# Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take 0 to 8 % longer (chess set,
-# shader ball, McUsd of the assets of the USD working group).
+# Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take up to 8 % longer: chess
+# set, shader ball and McUsd of usd-wg/assets.
 _ROULETTE = 3
 # Difference of reflectances that nobody sees at an edge.
 _VISIBLE = 0.05

@@ -81,7 +81,7 @@ def triangles_for_picture(
 def segments_of(
     contents: SceneContents, surfaces: Surfaces, outline: SceneNode, near_clip: float, shading: str
 ) -> dict[ShapeContents, IntArray]:
-    """Segments on each edge of limit surfaces that a picture needs, at most `HIGHEST_RATE`; see `segments_for`.
+    """Segments on each edge of limit surfaces that a picture needs, at most `FINEST_RATE`; see `segments_for`.
 
     An array ``(n,)`` for the copies of each shape, in the order of ``contents.placed_shapes``. Cages that cannot be
     used are missing.
