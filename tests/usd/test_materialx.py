@@ -277,6 +277,20 @@ def test_networks_inside_a_stage(tmp_path):
     np.testing.assert_allclose(mi.traverse(entry)["bsdf.brdf_0.base_color.value"], [[0.1], [0.2], [0.3]], rtol=1e-5)
 
 
+def test_each_output_of_a_node_is_its_own(tmp_path):
+    """A colour taken apart by the library's graph of three outputs, and put together in another order."""
+    graph = """<constant name="tone" type="color3"><input name="value" type="color3" value="0.2, 0.5, 0.7" /></constant>
+    <separate3 name="parts" type="multioutput"><input name="in" type="color3" nodename="tone" /></separate3>
+    <combine3 name="turned" type="color3">
+        <input name="in1" type="float" nodename="parts" output="outb" />
+        <input name="in2" type="float" nodename="parts" output="outr" />
+        <input name="in3" type="float" nodename="parts" output="outg" />
+    </combine3>"""
+    inputs = '<input name="base_color" type="color3" nodename="turned" />'
+    (found,) = materials(stage(tmp_path, LOOKS % "" + bound(), red=surface(inputs, graph=graph)))
+    np.testing.assert_allclose(found.inputs["base_color"], [0.7, 0.2, 0.5], rtol=1e-6)
+
+
 def test_a_process_of_its_own_reads_the_same_expressions(tmp_path, monkeypatch):
     path = stage(tmp_path, LOOKS % "" + bound(), red=surface(USED, graph=GRAPH))
     here = StageReader(path).at().materials
