@@ -65,6 +65,13 @@ def test_polygons(read):
     assert cage.scheme is None
 
 
+def test_comments_may_stand_anywhere_in_a_header(read):
+    header, rows = SHEET.split("end_header")
+    first, *lines = header.splitlines()
+    commented = "\n".join([first, *(f"{line}\ncomment and more" for line in lines)])
+    assert same(read(f"{commented}\nend_header{rows}").contents, read(SHEET).contents)
+
+
 @pytest.mark.parametrize("byte_order", ["<", ">"])
 @pytest.mark.parametrize(
     "lists", [("vertex_indices", "u1", "i4"), ("vertex_index", "i4", "u4"), ("vertex_index", "u2", "u2")]
