@@ -340,6 +340,11 @@ def test_flip_with_pinned_exposures_tells_changes_apart():
     assert all(score["exposures"] == exposures for score in scores)
 
 
+def test_no_difference_is_too_large_for_flip():
+    limits = LIMITS.with_values({"flip_mean": 0, "flip_p95": 0})
+    assert flip(truth(), truth(), limits).status is Status.PASS
+
+
 def test_flip_refuses_what_it_does_not_see():
     broken = truth()
     broken[0, 0] = np.nan
