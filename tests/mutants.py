@@ -44,33 +44,30 @@ CHECKS = ("strict", "frozen", "eq", "copy")
 
 
 def lines_without_results(path: Path) -> set[int]:
-    """Lines, from 1, of annotations, of what is raised or warned, of ``__repr__`` and of imports for types."""
+    """Lines, from 1, of signatures, of what is raised or warned, of ``__repr__`` and of imports for types."""
     lines: set[int] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        parts: list[ast.AST | None] = []
+        part: ast.AST | None = None
         if isinstance(node, ast.FunctionDef):
-            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-            parts = [node.returns, *(argument.annotation for argument in arguments)]
-            parts += [node] if node.name == "__repr__" else []
+            # A default value may stand there; it is left out as well.
+            lines.update(range(node.lineno, node.body[0].lineno))
+            part = node if node.name == "__repr__" else None
         elif isinstance(node, ast.Raise) or (
             isinstance(node, ast.Call | ast.If)
             and ast.unparse(node.func if isinstance(node, ast.Call) else node.test) in SILENT
         ):
-            parts = [node]
-        for part in parts:
-            if part is not None:
-                # A default value may share its line with an annotation; it is left out as well.
-                lines.update(range(part.lineno, part.end_lineno + 1))
+            part = node
+        if part is not None:
+            lines.update(range(part.lineno, part.end_lineno + 1))
     return lines
 
 
-def options_without_results(path: Path) -> set[tuple[int, int]]:
-    """Line, from 1, and column, from 0, of the values of options that leave results as they are."""
-    return {
-        (node.value.lineno, node.value.col_offset)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.keyword) and node.arg in CHECKS
-    }
+def places_without_results(path: Path) -> set[tuple[int, int]]:
+    """Line, from 1, and column, from 0, of annotations and of the values of options that leave results as they are."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    parts = [node.annotation for node in nodes if isinstance(node, ast.AnnAssign)]
+    parts += [node.value for node in nodes if isinstance(node, ast.keyword) and node.arg in CHECKS]
+    return {(part.lineno, column) for part in parts for column in range(part.col_offset, part.end_col_offset)}
 
 
 def sample(session: str, count: int, seed: int) -> None:
@@ -84,9 +81,9 @@ def sample(session: str, count: int, seed: int) -> None:
         without_results: dict[str, tuple[set[int], set[tuple[int, int]]]] = {}
         for path, line, column, operator, _, job in mutations:
             if path not in without_results:
-                without_results[path] = lines_without_results(Path(path)), options_without_results(Path(path))
-            lines_without, options_without = without_results[path]
-            if OPERATORS.match(operator) and line not in lines_without and (line, column) not in options_without:
+                without_results[path] = lines_without_results(Path(path)), places_without_results(Path(path))
+            lines_without, places_without = without_results[path]
+            if OPERATORS.match(operator) and line not in lines_without and (line, column) not in places_without:
                 package = Path(path).relative_to(PACKAGE).parts[0]
                 places.setdefault(package, {}).setdefault((path, line), []).append(job)
         drawn = set()
