@@ -109,6 +109,14 @@ def mutated_lines() -> tuple[Path, list[int]]:
     return Path(path[1]), lines
 
 
+def lines_of_functions(path: Path) -> set[int]:
+    """Lines, from 1, that run when a function is called."""
+    functions = (
+        node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.FunctionDef)
+    )
+    return {line for node in functions for line in range(node.body[0].lineno, node.end_lineno + 1)}
+
+
 def covering_tests(path: Path, lines: list[int]) -> list[str]:
     """Tests that run any of the lines: of the module's package first, and of each test function one case first."""
     from coverage import CoverageData
@@ -117,8 +125,8 @@ def covering_tests(path: Path, lines: list[int]) -> list[str]:
     data.read()
     measured = next((file for file in data.measured_files() if file.endswith(str(path))), "")
     contexts = data.contexts_by_lineno(measured) if measured else {}
-    if any("" in contexts.get(line, [""]) for line in lines):
-        # What runs at import takes part wherever the module does.
+    if not lines_of_functions(path).issuperset(lines):
+        # What runs at import, in whichever test that is, takes part wherever the module does.
         lines = list(contexts)
     tests = {context.partition("|")[0] for line in lines for context in contexts.get(line, ()) if context}
     own = f"tests/{path.relative_to(PACKAGE).parts[0]}/"
