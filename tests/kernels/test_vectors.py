@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.kernels.vectors import unit
 
-
 # A few units in the last place of single precision.
 ROUNDING = 1e-6
 
