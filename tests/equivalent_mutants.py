@@ -42,6 +42,13 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "number = (np.cumsum(vertex_counts[kinds]) - 1) // max(1, BLOCK_WEIGHTS // size)",
                 "number = (np.cumsum(vertex_counts[kinds]) - 1) * max(1, BLOCK_WEIGHTS // size)",
             ),
+            (
+                "tessellation/uniform_grid.py",
+                "length = max(1, VERTICES_AT_ONCE // size)",
+                "length = max(1, VERTICES_AT_ONCE * size)",
+            ),
+            ("tessellation/tile_rates.py", "@lru_cache(maxsize=16)", "@lru_cache(maxsize= 17)"),
+            ("shapes/vertex_choice.py", "WORTH_A_KERNEL = 300_000", "WORTH_A_KERNEL = 300001"),
         ),
     ),
     (
@@ -60,6 +67,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 'is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64',
                 'is_usual = evaluator == "stabilized" and derivatives != 1 and np.dtype(dtype) == np.float64',
             ),
+            (
+                "usd/stage_scenes.py",
+                "if self._first is not None and self._first[0] == number:",
+                "if self._first is not None and self._first[ 1] == number:",
+            ),
         ),
     ),
     (
@@ -70,6 +82,17 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)",
                 "ratios = np.where(kept, basis.eigenvalues / base, 1).astype(real)",
             ),
+            (
+                "evaluation/eigenbasis.py",
+                "weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, 0.0), 0)",
+                "weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, -1.0), 0)",
+            ),
+            (
+                "images/compare.py",
+                "paired, is_replaced = found.get(PAIRED), False",
+                "paired, is_replaced = found.get(PAIRED), True",
+            ),
+            ("schemes/scheme.py", "regular_border_faces: int = 0", "regular_border_faces: int = -1"),
             (
                 "files/obj_reader.py",
                 "return None if vertices is None else (vertices, has_texcoord, vertices[:0])",
@@ -91,8 +114,14 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     (
         "the same element, or another of the same value: all half-edges of a fan begin at its vertex, all channels have"
         " as many pixels, a field of view is one number, a fan that begins at half-edge 0 is found either way,"
-        " closed meshes have no valence of one, maps of coefficients are square",
+        " closed meshes have no valence of one, maps of coefficients are square, a rule is the same in all meshes",
         (
+            (
+                "evaluation/divided_element.py",
+                "self._refined = refined_ring(self.scheme, self.signature), 0",
+                "self._refined = refined_ring(self.scheme, self.signature), -1",
+            ),
+            ("files/joined_meshes.py", "return values[0]", "return values[ 1]"),
             (
                 "images/paired_tier.py",
                 'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
@@ -138,6 +167,18 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "mesh/manifold.py",
                 "is_again = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)",
                 "is_again = _is_later(t.edge.astype(np.int64) * t.face_count - t.face)",
+            ),
+            (
+                "tessellation/tile_sides.py",
+                "line[at, side] = (own.astype(np.int64) + t.half_edge_count) << DEEPEST",
+                "line[at, side] = (own.astype(np.int64) - t.half_edge_count) << DEEPEST",
+            ),
+            (
+                "tessellation/tile_sides.py",
+                "line[:, side] = (tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count)"
+                " << DEEPEST | own_level",
+                "line[:, side] = (tiles.corner.astype(np.int64) + ( 3 + axis) * t.half_edge_count)"
+                " << DEEPEST | own_level",
             ),
             (
                 "mesh/seams.py",
@@ -193,6 +234,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 ' "count": max(2, int(np.ceil(stop - start)))}',
             ),
             ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 61"),
+            ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 59"),
+            (
+                "files/usd_stage.py",
+                "files = _listed(sorted({Path(each).name for each in documents}), 3)",
+                "files = _listed(sorted({Path(each).name for each in documents}), 2)",
+            ),
             ("tessellation/memory.py", "ADAPTIVE_TRIANGLE_BYTES = 400", "ADAPTIVE_TRIANGLE_BYTES = 399"),
         ),
     ),
