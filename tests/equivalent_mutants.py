@@ -192,6 +192,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         (
             ("mesh/refinement_differences.py", "DECIMALS = 12", "DECIMALS = 13"),
             ("patches/area_samples.py", "ROUNDED = 1 + 1e-9", "ROUNDED = 1 - 1e-9"),
+            ("evaluation/scheme_check.py", "SAME_DIGITS = 9", "SAME_DIGITS = 8"),
+            (
+                "tessellation/tile_extents.py",
+                "is_last = division == MOST_DIVISIONS[is_convex] - 1",
+                "is_last = division == MOST_DIVISIONS[is_convex] - 2",
+            ),
             (
                 "patches/closest_points.py",
                 "self._slope[self._squared_distance > limit] = np.inf",
@@ -250,6 +256,26 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "usd/texture_detail.py",
                 "found[texture.file] = max(needed, found.get(texture.file, 0.0))",
                 "found[texture.file] = max(needed, found.get(texture.file, 1.0))",
+            ),
+        ),
+    ),
+    (
+        "no picture shows a single point, wherever the studio around it stands",
+        (
+            (
+                "usd/studio_defaults.py",
+                "bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())",
+                "bounds += np.array([[-1], [ 2]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())",
+            ),
+        ),
+    ),
+    (
+        "the spaces of a file that programs read",
+        (
+            (
+                "images/report.py",
+                '_write_text(folder / NUMBERS, json.dumps(numbers, indent=1) + "\\n")',
+                '_write_text(folder / NUMBERS, json.dumps(numbers, indent= 2) + "\\n")',
             ),
         ),
     ),
