@@ -248,6 +248,15 @@ def test_paired_difference_fails_and_says_where(reference, np_rng):
     assert found.exit_status == 2
 
 
+@pytest.mark.parametrize(("part", "status"), [(0.5, "pass"), (2, "fail")])
+def test_differences_of_dark_pixels_are_relative_to_a_thousandth_of_the_mean(reference, np_rng, part, status):
+    dark, light = reference.paired.copy(), reference.paired.copy()
+    dark[7, 9] = 0
+    light[7, 9] = part * LIMITS.paired_relative * 1e-3 * dark.mean()
+    images = replace(reference, paired=dark), random_image(np_rng, paired=light)
+    assert statuses(compare(*images, ["paired"]))["paired"] == status
+
+
 def test_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
     test = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
     assert compare(reference, test, ["paired"]).exit_status == 0
