@@ -49,6 +49,21 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
             ),
             ("tessellation/tile_rates.py", "@lru_cache(maxsize=16)", "@lru_cache(maxsize= 17)"),
             ("shapes/vertex_choice.py", "WORTH_A_KERNEL = 300_000", "WORTH_A_KERNEL = 300001"),
+            ("usd/stage_materials.py", "_DEEPEST = 16", "_DEEPEST = 17"),
+            ("patches/surface_area.py", "MOST_HALVINGS = 10", "MOST_HALVINGS = 11"),
+            ("evaluation/divided_tile.py", "elif depth > 1:", "elif depth > 0:"),
+            (
+                "patches/closest_points.py",
+                "is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1) + rounded",
+                "is_flat = boxes.halves[:, 2] <= FLAT / boxes.halves[:, :2].max(axis=1) + rounded",
+            ),
+            (
+                "mesh/connectivity.py",
+                "return paired(self.edge_names.__getitem__, self.half_edge_count,"
+                " int(self.edge_names.max(initial=0)) + 1)",
+                "return paired(self.edge_names.__getitem__, self.half_edge_count,"
+                " int(self.edge_names.max(initial=0)) + 2)",
+            ),
         ),
     ),
     (
@@ -94,6 +109,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
             ),
             ("schemes/scheme.py", "regular_border_faces: int = 0", "regular_border_faces: int = -1"),
             (
+                "tessellation/patch_frames.py",
+                "twin = np.concatenate([twin, *corners[:2]])",
+                "twin = np.concatenate([twin, *corners[: 3]])",
+            ),
+            (
                 "files/obj_reader.py",
                 "return None if vertices is None else (vertices, has_texcoord, vertices[:0])",
                 "return None if vertices is None else (vertices, has_texcoord, vertices[: -1])",
@@ -114,7 +134,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     (
         "the same element, or another of the same value: all half-edges of a fan begin at its vertex, all channels have"
         " as many pixels, a field of view is one number, a fan that begins at half-edge 0 is found either way,"
-        " closed meshes have no valence of one, maps of coefficients are square, a rule is the same in all meshes",
+        " closed meshes have no valence of one, maps of coefficients are square, a rule is the same in all meshes,"
+        " a polygon is closed if its mirror image is, and one place has one row of values",
         (
             (
                 "evaluation/divided_element.py",
@@ -122,6 +143,16 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "self._refined = refined_ring(self.scheme, self.signature), -1",
             ),
             ("files/joined_meshes.py", "return values[0]", "return values[ 1]"),
+            (
+                "patches/turned_boxes.py",
+                "middle = basis.values(basis.domain.centre[None])[0]",
+                "middle = basis.values(basis.domain.centre[None])[ -1]",
+            ),
+            (
+                "schemes/scheme_members.py",
+                "point, edge = point + edge, scheme.edge_turn @ edge",
+                "point, edge = point - edge, scheme.edge_turn @ edge",
+            ),
             (
                 "images/paired_tier.py",
                 'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
@@ -203,6 +234,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "self._slope[self._squared_distance > limit] = np.inf",
                 "self._slope[self._squared_distance >= limit] = np.inf",
             ),
+            ("patches/nearest_in_piece.py", "on_edge = inside <= ON_EDGE", "on_edge = inside < ON_EDGE"),
+            ("patches/patch_table.py", "is_less = codes[turn] < least", "is_less = codes[turn] <= least"),
             (
                 "patches/nearest_in_piece.py",
                 "bend = np.where(is_newton[slides], bend, flat + damped[slides])",
@@ -222,6 +255,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "uv = np.array([(0.1, 0.2), ( 1.5, 0.25), (0.3, 0.6)])",
             ),
             ("patches/nearest_in_piece.py", "SHORTER = 0.25", "SHORTER = -0.75"),
+            (
+                "patches/nearest_in_piece.py",
+                "self.part = np.where(improves, 1, self.part * SHORTER)",
+                "self.part = np.where(improves, 2, self.part * SHORTER)",
+            ),
         ),
     ),
     (
