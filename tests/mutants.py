@@ -3,7 +3,8 @@
 Cosmic Ray makes the mutants and runs ``mutants.py test`` on each. Three commands of this file surround it:
 
 - ``mutants.py sample SESSION COUNT`` keeps a random sample of the mutants of each package and skips all others. What
-  cannot change results is not drawn: annotations, messages, ``__repr__``, and options of calls such as ``strict``.
+  cannot change results is not drawn: signatures, annotations, messages, ``__repr__``, and options of calls such as
+  ``strict``.
 - ``mutants.py test`` runs the tests that cover the mutated line, those of its own package first, until one fails. It
   reads which tests these are from the contexts in ``.coverage``.
 - ``mutants.py report SESSION ..`` counts the mutants of each package that change results, and those killed, and shows

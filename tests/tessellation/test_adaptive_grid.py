@@ -11,6 +11,7 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.feature_edges import feature_edges
 from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from patches.closed_cages import bumpy
 from tessellation.test_attribute_table import CAGES as WITH_SEAMS
@@ -249,6 +250,15 @@ FOLDED = {
         [(0, 1, 2, 3, 4, 5), (5, 4, 3), (5, 1, 0)],
     ),
 }
+
+
+@pytest.mark.parametrize(("cage", "is_folded"), [(cube(), False), (FOLDED["convex"], True)], ids=["cube", "folded"])
+def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
+    """Not where they are at right angles."""
+    surface = LimitSurface(cage)
+    vertex = surface.cage.cut_mesh.vertex
+    frames, criterion = PatchFrames.of(surface.patches, vertex), Criterion(Measure.CHORD, 1e-3)
+    assert (feature_edges(surface.patches, frames, cage.positions[vertex], criterion) == is_folded).all()
 
 
 def distance_to_triangles(points, corners):
