@@ -42,6 +42,28 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "number = (np.cumsum(vertex_counts[kinds]) - 1) // max(1, BLOCK_WEIGHTS // size)",
                 "number = (np.cumsum(vertex_counts[kinds]) - 1) * max(1, BLOCK_WEIGHTS // size)",
             ),
+            (
+                "tessellation/uniform_grid.py",
+                "length = max(1, VERTICES_AT_ONCE // size)",
+                "length = max(1, VERTICES_AT_ONCE * size)",
+            ),
+            ("tessellation/tile_rates.py", "@lru_cache(maxsize=16)", "@lru_cache(maxsize= 17)"),
+            ("shapes/vertex_choice.py", "WORTH_A_KERNEL = 300_000", "WORTH_A_KERNEL = 300001"),
+            ("usd/stage_materials.py", "_DEEPEST = 16", "_DEEPEST = 17"),
+            ("patches/surface_area.py", "MOST_HALVINGS = 10", "MOST_HALVINGS = 11"),
+            ("evaluation/divided_tile.py", "elif depth > 1:", "elif depth > 0:"),
+            (
+                "patches/closest_points.py",
+                "is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1) + rounded",
+                "is_flat = boxes.halves[:, 2] <= FLAT / boxes.halves[:, :2].max(axis=1) + rounded",
+            ),
+            (
+                "mesh/connectivity.py",
+                "return paired(self.edge_names.__getitem__, self.half_edge_count,"
+                " int(self.edge_names.max(initial=0)) + 1)",
+                "return paired(self.edge_names.__getitem__, self.half_edge_count,"
+                " int(self.edge_names.max(initial=0)) + 2)",
+            ),
         ),
     ),
     (
@@ -60,6 +82,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 'is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64',
                 'is_usual = evaluator == "stabilized" and derivatives != 1 and np.dtype(dtype) == np.float64',
             ),
+            (
+                "usd/stage_scenes.py",
+                "if self._first is not None and self._first[0] == number:",
+                "if self._first is not None and self._first[ 1] == number:",
+            ),
         ),
     ),
     (
@@ -69,6 +96,22 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "evaluation/equations.py",
                 "ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)",
                 "ratios = np.where(kept, basis.eigenvalues / base, 1).astype(real)",
+            ),
+            (
+                "evaluation/eigenbasis.py",
+                "weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, 0.0), 0)",
+                "weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, -1.0), 0)",
+            ),
+            (
+                "images/compare.py",
+                "paired, is_replaced = found.get(PAIRED), False",
+                "paired, is_replaced = found.get(PAIRED), True",
+            ),
+            ("schemes/scheme.py", "regular_border_faces: int = 0", "regular_border_faces: int = -1"),
+            (
+                "tessellation/patch_frames.py",
+                "twin = np.concatenate([twin, *corners[:2]])",
+                "twin = np.concatenate([twin, *corners[: 3]])",
             ),
             (
                 "files/obj_reader.py",
@@ -91,8 +134,25 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
     (
         "the same element, or another of the same value: all half-edges of a fan begin at its vertex, all channels have"
         " as many pixels, a field of view is one number, a fan that begins at half-edge 0 is found either way,"
-        " closed meshes have no valence of one, maps of coefficients are square",
+        " closed meshes have no valence of one, maps of coefficients are square, a rule is the same in all meshes,"
+        " a polygon is closed if its mirror image is, and one place has one row of values",
         (
+            (
+                "evaluation/divided_element.py",
+                "self._refined = refined_ring(self.scheme, self.signature), 0",
+                "self._refined = refined_ring(self.scheme, self.signature), -1",
+            ),
+            ("files/joined_meshes.py", "return values[0]", "return values[ 1]"),
+            (
+                "patches/turned_boxes.py",
+                "middle = basis.values(basis.domain.centre[None])[0]",
+                "middle = basis.values(basis.domain.centre[None])[ -1]",
+            ),
+            (
+                "schemes/scheme_members.py",
+                "point, edge = point + edge, scheme.edge_turn @ edge",
+                "point, edge = point - edge, scheme.edge_turn @ edge",
+            ),
             (
                 "images/paired_tier.py",
                 'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
@@ -140,6 +200,18 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "is_again = _is_later(t.edge.astype(np.int64) * t.face_count - t.face)",
             ),
             (
+                "tessellation/tile_sides.py",
+                "line[at, side] = (own.astype(np.int64) + t.half_edge_count) << DEEPEST",
+                "line[at, side] = (own.astype(np.int64) - t.half_edge_count) << DEEPEST",
+            ),
+            (
+                "tessellation/tile_sides.py",
+                "line[:, side] = (tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count)"
+                " << DEEPEST | own_level",
+                "line[:, side] = (tiles.corner.astype(np.int64) + ( 3 + axis) * t.half_edge_count)"
+                " << DEEPEST | own_level",
+            ),
+            (
                 "mesh/seams.py",
                 "sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))",
                 "sharpness = Sharpness(np.where(seam, INFINITE, -1.0), np.zeros(topology.vertex_count))",
@@ -151,11 +223,19 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         (
             ("mesh/refinement_differences.py", "DECIMALS = 12", "DECIMALS = 13"),
             ("patches/area_samples.py", "ROUNDED = 1 + 1e-9", "ROUNDED = 1 - 1e-9"),
+            ("evaluation/scheme_check.py", "SAME_DIGITS = 9", "SAME_DIGITS = 8"),
+            (
+                "tessellation/tile_extents.py",
+                "is_last = division == MOST_DIVISIONS[is_convex] - 1",
+                "is_last = division == MOST_DIVISIONS[is_convex] - 2",
+            ),
             (
                 "patches/closest_points.py",
                 "self._slope[self._squared_distance > limit] = np.inf",
                 "self._slope[self._squared_distance >= limit] = np.inf",
             ),
+            ("patches/nearest_in_piece.py", "on_edge = inside <= ON_EDGE", "on_edge = inside < ON_EDGE"),
+            ("patches/patch_table.py", "is_less = codes[turn] < least", "is_less = codes[turn] <= least"),
             (
                 "patches/nearest_in_piece.py",
                 "bend = np.where(is_newton[slides], bend, flat + damped[slides])",
@@ -175,6 +255,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "uv = np.array([(0.1, 0.2), ( 1.5, 0.25), (0.3, 0.6)])",
             ),
             ("patches/nearest_in_piece.py", "SHORTER = 0.25", "SHORTER = -0.75"),
+            (
+                "patches/nearest_in_piece.py",
+                "self.part = np.where(improves, 1, self.part * SHORTER)",
+                "self.part = np.where(improves, 2, self.part * SHORTER)",
+            ),
         ),
     ),
     (
@@ -193,6 +278,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 ' "count": max(2, int(np.ceil(stop - start)))}',
             ),
             ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 61"),
+            ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 59"),
+            (
+                "files/usd_stage.py",
+                "files = _listed(sorted({Path(each).name for each in documents}), 3)",
+                "files = _listed(sorted({Path(each).name for each in documents}), 2)",
+            ),
             ("tessellation/memory.py", "ADAPTIVE_TRIANGLE_BYTES = 400", "ADAPTIVE_TRIANGLE_BYTES = 399"),
         ),
     ),
@@ -203,6 +294,26 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "usd/texture_detail.py",
                 "found[texture.file] = max(needed, found.get(texture.file, 0.0))",
                 "found[texture.file] = max(needed, found.get(texture.file, 1.0))",
+            ),
+        ),
+    ),
+    (
+        "no picture shows a single point, wherever the studio around it stands",
+        (
+            (
+                "usd/studio_defaults.py",
+                "bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())",
+                "bounds += np.array([[-1], [ 2]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())",
+            ),
+        ),
+    ),
+    (
+        "the spaces of a file that programs read",
+        (
+            (
+                "images/report.py",
+                '_write_text(folder / NUMBERS, json.dumps(numbers, indent=1) + "\\n")',
+                '_write_text(folder / NUMBERS, json.dumps(numbers, indent= 2) + "\\n")',
             ),
         ),
     ),

@@ -3,7 +3,8 @@
 Cosmic Ray makes the mutants and runs ``mutants.py test`` on each. Three commands of this file surround it:
 
 - ``mutants.py sample SESSION COUNT`` keeps a random sample of the mutants of each package and skips all others. What
-  cannot change results is not drawn: annotations, messages, ``__repr__``, and options of calls such as ``strict``.
+  cannot change results is not drawn: signatures, annotations, messages, ``__repr__``, and options of calls such as
+  ``strict``.
 - ``mutants.py test`` runs the tests that cover the mutated line, those of its own package first, until one fails. It
   reads which tests these are from the contexts in ``.coverage``.
 - ``mutants.py report SESSION ..`` counts the mutants of each package that change results, and those killed, and shows
@@ -44,33 +45,30 @@ CHECKS = ("strict", "frozen", "eq", "copy")
 
 
 def lines_without_results(path: Path) -> set[int]:
-    """Lines, from 1, of annotations, of what is raised or warned, of ``__repr__`` and of imports for types."""
+    """Lines, from 1, of signatures, of what is raised or warned, of ``__repr__`` and of imports for types."""
     lines: set[int] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        parts: list[ast.AST | None] = []
+        part: ast.AST | None = None
         if isinstance(node, ast.FunctionDef):
-            arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-            parts = [node.returns, *(argument.annotation for argument in arguments)]
-            parts += [node] if node.name == "__repr__" else []
+            # A default value may stand there; it is left out as well.
+            lines.update(range(node.lineno, node.body[0].lineno))
+            part = node if node.name == "__repr__" else None
         elif isinstance(node, ast.Raise) or (
             isinstance(node, ast.Call | ast.If)
             and ast.unparse(node.func if isinstance(node, ast.Call) else node.test) in SILENT
         ):
-            parts = [node]
-        for part in parts:
-            if part is not None:
-                # A default value may share its line with an annotation; it is left out as well.
-                lines.update(range(part.lineno, part.end_lineno + 1))
+            part = node
+        if part is not None:
+            lines.update(range(part.lineno, part.end_lineno + 1))
     return lines
 
 
-def options_without_results(path: Path) -> set[tuple[int, int]]:
-    """Line, from 1, and column, from 0, of the values of options that leave results as they are."""
-    return {
-        (node.value.lineno, node.value.col_offset)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.keyword) and node.arg in CHECKS
-    }
+def places_without_results(path: Path) -> set[tuple[int, int]]:
+    """Line, from 1, and column, from 0, of annotations and of the values of options that leave results as they are."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    parts = [node.annotation for node in nodes if isinstance(node, ast.AnnAssign)]
+    parts += [node.value for node in nodes if isinstance(node, ast.keyword) and node.arg in CHECKS]
+    return {(part.lineno, column) for part in parts for column in range(part.col_offset, part.end_col_offset)}
 
 
 def sample(session: str, count: int, seed: int) -> None:
@@ -84,9 +82,9 @@ def sample(session: str, count: int, seed: int) -> None:
         without_results: dict[str, tuple[set[int], set[tuple[int, int]]]] = {}
         for path, line, column, operator, _, job in mutations:
             if path not in without_results:
-                without_results[path] = lines_without_results(Path(path)), options_without_results(Path(path))
-            lines_without, options_without = without_results[path]
-            if OPERATORS.match(operator) and line not in lines_without and (line, column) not in options_without:
+                without_results[path] = lines_without_results(Path(path)), places_without_results(Path(path))
+            lines_without, places_without = without_results[path]
+            if OPERATORS.match(operator) and line not in lines_without and (line, column) not in places_without:
                 package = Path(path).relative_to(PACKAGE).parts[0]
                 places.setdefault(package, {}).setdefault((path, line), []).append(job)
         drawn = set()
@@ -112,6 +110,14 @@ def mutated_lines() -> tuple[Path, list[int]]:
     return Path(path[1]), lines
 
 
+def lines_of_functions(path: Path) -> set[int]:
+    """Lines, from 1, that run when a function is called."""
+    functions = (
+        node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.FunctionDef)
+    )
+    return {line for node in functions for line in range(node.body[0].lineno, node.end_lineno + 1)}
+
+
 def covering_tests(path: Path, lines: list[int]) -> list[str]:
     """Tests that run any of the lines: of the module's package first, and of each test function one case first."""
     from coverage import CoverageData
@@ -120,8 +126,8 @@ def covering_tests(path: Path, lines: list[int]) -> list[str]:
     data.read()
     measured = next((file for file in data.measured_files() if file.endswith(str(path))), "")
     contexts = data.contexts_by_lineno(measured) if measured else {}
-    if any("" in contexts.get(line, [""]) for line in lines):
-        # What runs at import takes part wherever the module does.
+    if not lines_of_functions(path).issuperset(lines):
+        # What runs at import, in whichever test that is, takes part wherever the module does.
         lines = list(contexts)
     tests = {context.partition("|")[0] for line in lines for context in contexts.get(line, ()) if context}
     own = f"tests/{path.relative_to(PACKAGE).parts[0]}/"

@@ -136,6 +136,16 @@ class Leaking(CatmullClark):
         return refinement._replace(stencils=StencilTable.from_matrix(1.001 * refinement.stencils.matrix))
 
 
+class Turned(CatmullClark):
+    """Rows and columns of the matrix are exchanged."""
+
+    name = "turned"
+
+    def refine(self, topology):
+        refinement = super().refine(topology)
+        return refinement._replace(stencils=StencilTable.from_matrix(refinement.stencils.matrix.T))
+
+
 class OtherBasis(DooSabin):
     name = "other_basis"
 
@@ -165,6 +175,7 @@ class Standing(CatmullClark):
     [
         (object(), "object is no scheme: it has no name, element, domain"),
         (Leaking(), "leaking: .* has weights that sum to 1.001; expected 1"),
+        (Turned(), r"stencils of (\d+) vertices over (\d+); expected stencils of \2 refined vertices over \1"),
         (OtherBasis(), "other_basis: the regular basis does not fit the rules: child 0 of a regular patch is"),
         (TooWide(), r"too_wide: "),
         (

@@ -65,6 +65,13 @@ def test_polygons(read):
     assert cage.scheme is None
 
 
+def test_comments_may_stand_anywhere_in_a_header(read):
+    header, rows = SHEET.split("end_header")
+    first, *lines = header.splitlines()
+    commented = "\n".join([first, *(f"{line}\ncomment and more" for line in lines)])
+    assert same(read(f"{commented}\nend_header{rows}").contents, read(SHEET).contents)
+
+
 @pytest.mark.parametrize("byte_order", ["<", ">"])
 @pytest.mark.parametrize(
     "lists", [("vertex_indices", "u1", "i4"), ("vertex_index", "i4", "u4"), ("vertex_index", "u2", "u2")]
@@ -87,8 +94,8 @@ def test_binary_files_of_all_types(tmp_path, byte_order, lists):
 @pytest.mark.parametrize("byte_order", ["<", ">"])
 @pytest.mark.parametrize("corner_counts", [[4, 4, 4], [3, 3, 3], [4, 3, 4], [3, 4, 3], [4, 4, 3]])
 def test_tables_are_read_as_files_of_rows_are(tmp_path, monkeypatch, np_rng, byte_order, corner_counts):
-    # Lists of vertices, numbers of faces, and an element between that is neither. Written by hand, as plyfile writes
-    # numbers beside lists in the machine's own byte order.
+    # Lists of vertices, numbers of faces, and elements between and after that are neither. Written by hand, as plyfile
+    # writes numbers beside lists in the machine's own byte order.
     header = f"""ply
 format binary_{"little" if byte_order == "<" else "big"}_endian 1.0
 element vertex 5
@@ -104,6 +111,8 @@ element face 3
 property uchar id
 property list uchar int vertex_indices
 property list uint float none
+element after 1
+property ushort id
 end_header
 """
 
@@ -118,11 +127,12 @@ end_header
     content += packed("u2", [1, 2])
     for face in faces:
         content += packed("u1 u1 i4 u4", 7, len(face), face, 0)
+    content += packed("u2", [3])
     path = tmp_path / "cage.ply"
     path.write_bytes(content)
 
     lengths = PlyHeader.read(content, "").tables(content)[0]
-    assert list(lengths) == ["vertex", "between", *(["face"] if len(set(corner_counts)) == 1 else [])]
+    assert list(lengths) == ["vertex", "between", *(["face", "after"] if len(set(corner_counts)) == 1 else [])]
     with pytest.warns(CageWarning, match='"id" of faces, "none" of faces, the list "pair" of vertices, the list "one"'):
         found = read_ply(path)
     np.testing.assert_array_equal(found.face_sizes, corner_counts)

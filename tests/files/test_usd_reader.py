@@ -3,11 +3,14 @@
 import re
 import struct
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.cage.rules import RULES
+from mitsuba_subdivision.files.usd_writer import write_usd
 
 pxr = pytest.importorskip("pxr")
 
@@ -91,6 +94,13 @@ def test_rules(read, token, rule, value):
 
 def test_an_argument_overrides_a_rule(read):
     assert read("token interpolateBoundary = 'none'", boundary="edge_only").boundary == "edge_only"
+
+
+def test_contents_that_name_no_rules_are_written_with_the_usual_ones(tmp_path):
+    """As a cage has them that is given none; USD's own differ."""
+    write_usd(replace(cube().contents, rules={}), tmp_path / "cube.usda")
+    again = ControlCage.from_file(tmp_path / "cube.usda")
+    assert {rule: getattr(again, rule) for rule in RULES} == cube().contents.rules
 
 
 def test_creases_corners_and_holes(read):

@@ -248,6 +248,15 @@ def test_paired_difference_fails_and_says_where(reference, np_rng):
     assert found.exit_status == 2
 
 
+@pytest.mark.parametrize(("part", "status"), [(0.5, "pass"), (2, "fail")])
+def test_differences_of_dark_pixels_are_relative_to_a_thousandth_of_the_mean(reference, np_rng, part, status):
+    dark, light = reference.paired.copy(), reference.paired.copy()
+    dark[7, 9] = 0
+    light[7, 9] = part * LIMITS.paired_relative * 1e-3 * dark.mean()
+    images = replace(reference, paired=dark), random_image(np_rng, paired=light)
+    assert statuses(compare(*images, ["paired"]))["paired"] == status
+
+
 def test_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
     test = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
     assert compare(reference, test, ["paired"]).exit_status == 0
@@ -338,6 +347,11 @@ def test_flip_with_pinned_exposures_tells_changes_apart():
     scores = [flip(pixels, factor * pixels, LIMITS, exposures).numbers for factor in (1, 1.0001, 1.05)]
     assert [score["flip_mean"] < LIMITS.flip_mean for score in scores] == [True, True, False]
     assert all(score["exposures"] == exposures for score in scores)
+
+
+def test_no_difference_is_too_large_for_flip():
+    limits = LIMITS.with_values({"flip_mean": 0, "flip_p95": 0})
+    assert flip(truth(), truth(), limits).status is Status.PASS
 
 
 def test_flip_refuses_what_it_does_not_see():

@@ -11,6 +11,7 @@ import pytest
 from images.random_images import random_image, truth
 from mitsuba_subdivision.images.compare import compare
 from mitsuba_subdivision.images.exr import read_channels
+from mitsuba_subdivision.images.panel import relative_panel
 from mitsuba_subdivision.images.png import colours, png_bytes, srgb
 from mitsuba_subdivision.images.report import write_index, write_report
 
@@ -43,6 +44,18 @@ class Reader(HTMLParser):
         if self.tags and self.tags[-1] == "h2":
             self.titles.append(data)
             self.tags.append("")
+
+
+def test_the_ends_of_the_scale_are_the_differences_they_say():
+    """Half of the pixels are brighter, and half are darker, by as much as the scale reaches."""
+    reference = np.ones((4, 4, 3))
+    change = np.where(np.arange(4)[:, None, None] < 2, -0.1, 0.1)
+    panel = relative_panel("", reference, reference + change, "")
+    darkest, brightest = colours(np.array([0.0, 1.0]), panel.colour_map)
+    np.testing.assert_array_equal(panel.pixels[:2], np.broadcast_to(darkest, (2, 4, 3)))
+    np.testing.assert_array_equal(panel.pixels[2:], np.broadcast_to(brightest, (2, 4, 3)))
+    # Differences are relative to the sum of a pixel and a hundredth of the mean.
+    assert panel.ends == ("&minus;9.9%", "+9.9%")
 
 
 def test_the_page_has_every_panel_and_runs_nothing(tmp_path, failed):

@@ -99,6 +99,16 @@ def test_points_tangents_and_normals_are_the_surfaces(name, variant, np_rng):
         assert unequal(one, other)[has_derivatives].max() <= bars["derivative"]
 
 
+@pytest.mark.core
+@pytest.mark.parametrize("shape", [(0, 0, 0), (1, 0, 0)], ids=["a point", "a curve"])
+def test_normals_of_a_collapsed_surface_do_not_turn(shape, np_rng):
+    kernel = LimitSurface(cube().with_positions(cube().positions * shape)).on_device(SINGLE)
+    locations = random_locations(surface_named("cube"), np_rng, 20, deepest=1)
+    found = evaluated(kernel, *on_device(kernel.types, *locations), derivatives=2)
+    for derivative in (found.dn_du, found.dn_dv):
+        np.testing.assert_array_equal(vectors(derivative), 0)
+
+
 BORDERS = ["sheet without corners", "half disc of 6", "dart", "crease", "corner", "loop sheet", "loop half disc of 6"]
 
 

@@ -53,6 +53,19 @@ def test_boxes_contain_the_surface_far_from_the_origin(name, np_rng):
     assert_contained(LimitSurface(cage, surface.scheme), np_rng)
 
 
+def test_a_minimum_inside_an_element_is_met_to_a_256th_of_its_square():
+    """Over z = (x - 1/16)^2, the minimum is in the middle of the first of eight parts, whose coefficients are
+    ab = -1/256 at least, for a part from a to b.
+    """
+    x, y = np.indices((6, 6)) - 2.0
+    # Points of a uniform cubic spline are a third below the parabola's.
+    points = np.stack([x, y, (x - 1 / 16) ** 2 - 1 / 3], axis=-1).reshape(-1, 3)
+    first = np.add.outer(6 * np.arange(5), np.arange(5)).ravel()
+    bounds = LimitSurface(ControlCage(points, first[:, None] + [0, 6, 7, 1])).bounds()
+    (middle,) = np.flatnonzero((bounds.lower[:, :2].round(2) == 0).all(axis=1))
+    assert -1 / 256 - 1e-5 <= bounds.lower[middle, 2] <= 0
+
+
 @EVERY_SURFACE
 def test_boxes_are_tight(name):
     assert_tight(surface_named(name))

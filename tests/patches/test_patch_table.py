@@ -54,20 +54,24 @@ def test_patches_of_a_class_have_its_signature_and_others_have_not(scheme, name)
     assert len(set(classes)) == len(classes)
 
 
-def test_patches_of_a_class_see_the_same_near_faces_of_large_fans():
-    # Two fans that differ in their numbers of faces, each of mixed sizes.
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
+    # Two fans that differ in their numbers of faces, each of mixed sizes where the scheme takes these.
     faces, centre = [], 0
     for count in (NEAR_FACES + 6, 2 * NEAR_FACES):
         for i in range(centre + 1, centre + 2 * count, 2):
-            faces.append([centre, i, i + 2] if i % 3 else [centre, i, i + 1, i + 2])
+            if scheme == "loop":
+                faces += [[centre, i, i + 1], [centre, i + 1, i + 2]]
+            else:
+                faces.append([centre, i, i + 2] if i % 3 else [centre, i, i + 1, i + 2])
         centre += 2 * count + 2
-    table = PatchTable(mesh_of(centre, faces), scheme_named("catmull_clark"))
+    table = PatchTable(mesh_of(centre, faces), scheme_named(scheme))
     for patch_class in table.classes:
         assert {signature_of(table, corner).near() for corner in patch_class.corners} == {patch_class.signature}
         start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
         for controls, ends in zip(patch_class.controls, zip(start, end, strict=True), strict=True):
             assert {*ends} <= {*controls}
-    signatures = [least_turn(patch_class.signature, 4) for patch_class in table.classes]
+    signatures = [least_turn(patch_class.signature, table.scheme.domain.corner_count) for patch_class in table.classes]
     assert len(set(signatures)) == len(signatures)
     # Far from the ends of both fans there are three kinds of faces, and so three of each of their corners.
     assert table.class_count < table.patch_count / 2

@@ -1,6 +1,7 @@
 """Adaptive tessellations have no cracks and no folds, and their vertices lie where they say."""
 
 import warnings
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.feature_edges import feature_edges
+from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from patches.closed_cages import bumpy
 from tessellation.test_attribute_table import CAGES as WITH_SEAMS
 from tessellation.test_attribute_table import with_seams
@@ -178,6 +181,33 @@ def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme):
     assert_vertices_lie_where_triangles_say(surface, table)
 
 
+# Random cages of whole elements, of which some meet twice: of three corners, and of four.
+MEETING_TWICE = (82, 115, 19, 114, 468)
+
+
+@pytest.mark.parametrize("seed", MEETING_TWICE)
+def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(seed):
+    """Every edge of the mesh connects its ends once, and so does every diagonal of an element of four corners."""
+    with without_warnings():
+        surface = LimitSurface(*random_cage(np.random.default_rng(seed)))
+    frames, t = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex), surface.patches.elements
+    connections, of_face = defaultdict(set), defaultdict(set)
+    for half_edge, face in enumerate(t.face_of(np.arange(t.half_edge_count))):
+        following = t.following(half_edge)
+        ways = [(("edge", t.edge[half_edge]), following)]
+        if t.face_sizes[face] == 4:
+            opposite = t.following(following)
+            ways.append((("diagonal", min(half_edge, opposite)), opposite))
+        for way, end in ways:
+            ends = frozenset(t.face_vertices[[half_edge, end]])
+            connections[ends].add(way)
+            of_face[face].add(ends)
+    expected = [any(len(ends) == 1 or len(connections[ends]) > 1 for ends in of_face[face]) for face in of_face]
+    np.testing.assert_array_equal(frames.meets_twice, expected)
+    assert frames.is_whole.all()
+    assert any(expected)
+
+
 def test_a_surface_may_be_a_curve():
     cage = cube()
     surface = LimitSurface(cage.with_positions(cage.positions * [1, 0, 0]))
@@ -220,6 +250,15 @@ FOLDED = {
         [(0, 1, 2, 3, 4, 5), (5, 4, 3), (5, 1, 0)],
     ),
 }
+
+
+@pytest.mark.parametrize(("cage", "is_folded"), [(cube(), False), (FOLDED["convex"], True)], ids=["cube", "folded"])
+def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
+    """Not where they are at right angles."""
+    surface = LimitSurface(cage)
+    vertex = surface.cage.cut_mesh.vertex
+    frames, criterion = PatchFrames.of(surface.patches, vertex), Criterion(Measure.CHORD, 1e-3)
+    assert (feature_edges(surface.patches, frames, cage.positions[vertex], criterion) == is_folded).all()
 
 
 def distance_to_triangles(points, corners):

@@ -241,6 +241,27 @@ def test_parts_said_to_curve_one_way_do(np_rng):
     assert np.count_nonzero(found) > 0.3 * np.count_nonzero(curves_one_way)
 
 
+@pytest.mark.parametrize("direction", [None, np.array([0.6, 0.0, -0.8])], ids=["perspective", "orthographic"])
+def test_an_outline_in_view_is_noticed(direction, np_rng):
+    """Where one point and normal of a part face the sensor and others face away; and hardly where none do."""
+    count, samples = 400, 60
+    centre, half = np_rng.normal(size=(3, count)), 0.3 * np_rng.random((3, count))
+    axis, angle = np_rng.normal(size=(3, count)), 0.5 * np_rng.random(count)
+    axis /= np.linalg.norm(axis, axis=0)
+    eye = np.array([0.0, -4, 1])
+    cone = NormalCone(axis, np.sin(angle))
+    found = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone, np.ones(count, dtype=bool))
+
+    points = centre + half * np_rng.uniform(-1, 1, (samples, 3, count))
+    across = np.cross(np_rng.normal(size=(samples, 3, count)), axis[None], axis=1)
+    normals = np.cos(angle) * axis + np.sin(angle) * across / np.linalg.norm(across, axis=1, keepdims=True)
+    view = points - eye[:, None] if direction is None else np.broadcast_to(direction[:, None], points.shape)
+    tilt = np.einsum("sit,uit->sut", normals, view).reshape(-1, count)
+    is_seen = (tilt.min(axis=0) < 0) & (tilt.max(axis=0) > 0)
+    assert found[is_seen].all()
+    assert np.count_nonzero(found) < 1.2 * np.count_nonzero(is_seen)
+
+
 def test_only_outlines_are_fine_where_only_they_are_asked_for():
     surface = LimitSurface(torus(8, 6))
     sensor = Sensor(np.array([0.0, -8, 5]), 2e-3)

@@ -15,7 +15,7 @@ from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.stencil_table import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation import Criterion, Measure
-from mitsuba_subdivision.tessellation.flat_tiles import are_flat
+from mitsuba_subdivision.tessellation.flat_tiles import _normals_to, are_flat
 from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from mitsuba_subdivision.tessellation.tile_extents import TileParts, fit_within
 from mitsuba_subdivision.tessellation.tile_rates import TileRates
@@ -149,3 +149,15 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
         assert not found[size > rates.criterion.error].any()
         larger += np.count_nonzero(size > rates.criterion.error)
     assert larger
+
+
+def test_two_unit_vectors_lie_across_every_vector(np_rng):
+    """Whatever its length; across zero lie any two."""
+    ways = np.concatenate(
+        [np_rng.normal(size=(3, 20)) * 10.0 ** np.linspace(-9, 9, 20), np.eye(3), np.zeros((3, 1))], 1
+    )
+    length = np.linalg.norm(ways, axis=0)
+    frame = np.stack([*_normals_to(ways), ways / np.where(length > 0, length, 1)])
+    expected = np.tile(np.eye(3), (ways.shape[1], 1, 1))
+    expected[length == 0, 2, 2] = 0
+    np.testing.assert_allclose(np.einsum("idt,jdt->tij", frame, frame), expected, atol=ROUNDING)

@@ -52,6 +52,13 @@ def test_copies_of_a_part_show_its_faces_only():
     np.testing.assert_array_equal(found.shapes[0].shown_faces, expected)
 
 
+@pytest.mark.parametrize("faces", [FACES[:1], FACES[:2]])
+def test_copies_of_few_faces_are_one_shape(faces):
+    sheet = CageContents(POINTS, np.full(len(faces), 4), np.concatenate(faces), scheme="catmull_clark")
+    found, _ = with_copies(scene(group=[ShapeContents("/sheet", sheet, np.eye(4))]), {}, "exact", StageWarnings())
+    assert [len(each.cage.face_sizes) for each in found.shapes] == [len(faces) * COUNT]
+
+
 def test_few_instances_stay():
     shape = ShapeContents("/cube", cube(), np.eye(4))
     contents = scene(group=[shape], count=LEAST_INSTANCES - 1)

@@ -1,5 +1,6 @@
 """MaterialX documents and networks of stages: composed by USD, read as expressions, and seen."""
 
+import contextlib
 import warnings
 import zipfile
 
@@ -275,6 +276,32 @@ def test_networks_inside_a_stage(tmp_path):
     assert color.name == "tone"
     (entry,) = (each for each in msub.usd_scene(path, mi).values() if getattr(each, "bsdf", None))
     np.testing.assert_allclose(mi.traverse(entry)["bsdf.brdf_0.base_color.value"], [[0.1], [0.2], [0.3]], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("space", "is_srgb"), [("srgb_texture", True), ("lin_rec709", False), ("acescg", False)])
+def test_colours_are_linear_unless_their_space_is_that_of_srgb(tmp_path, space, is_srgb):
+    color = np.array([0.5, 0.2, 0.8])
+    inputs = value("base_color", "color3", "0.5, 0.2, 0.8").replace(" value", f' colorspace="{space}" value')
+    path = stage(tmp_path, LOOKS % "" + bound(), red=surface(inputs))
+    note = pytest.warns(CageWarning, match="colour space") if space == "acescg" else contextlib.nullcontext()
+    with note:
+        (found,) = StageReader(path).at().materials
+    expected = ((color + 0.055) / 1.055) ** 2.4 if is_srgb else color
+    np.testing.assert_allclose(found.inputs["base_color"], expected, rtol=1e-6)
+
+
+def test_each_output_of_a_node_is_its_own(tmp_path):
+    """A colour taken apart by the library's graph of three outputs, and put together in another order."""
+    graph = """<constant name="tone" type="color3"><input name="value" type="color3" value="0.2, 0.5, 0.7" /></constant>
+    <separate3 name="parts" type="multioutput"><input name="in" type="color3" nodename="tone" /></separate3>
+    <combine3 name="turned" type="color3">
+        <input name="in1" type="float" nodename="parts" output="outb" />
+        <input name="in2" type="float" nodename="parts" output="outr" />
+        <input name="in3" type="float" nodename="parts" output="outg" />
+    </combine3>"""
+    inputs = '<input name="base_color" type="color3" nodename="turned" />'
+    (found,) = materials(stage(tmp_path, LOOKS % "" + bound(), red=surface(inputs, graph=graph)))
+    np.testing.assert_allclose(found.inputs["base_color"], [0.7, 0.2, 0.5], rtol=1e-6)
 
 
 def test_a_process_of_its_own_reads_the_same_expressions(tmp_path, monkeypatch):

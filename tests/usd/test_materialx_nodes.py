@@ -82,6 +82,9 @@ def test_operations_take_arrays_of_points():
         assert operation(category, "color3", {**given, name: wide}).shape == (2, 3, 3)
     grey = wide[..., :1]
     np.testing.assert_array_equal(operation("convert", "color3", {"in": grey}), np.repeat(grey, 3, axis=-1))
+    parts = {"in1": grey, "in2": np.array([0.3]), "in3": wide[..., 1:2]}
+    joined = np.stack([wide[..., 0], np.full((2, 3), 0.3), wide[..., 1]], axis=-1)
+    np.testing.assert_array_equal(operation("combine3", "vector3", parts), joined)
 
 
 @pytest.mark.core

@@ -660,6 +660,19 @@ def test_lights_light_a_plane_as_the_closed_form_says(stage, text, irradiance):
     assert found == pytest.approx(0.5 / np.pi * irradiance, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [("RectLight", [1, 1]), ("DiskLight", [0.5]), ("SphereLight", [0.5]), ("CylinderLight", [1, 0.5])],
+)
+def test_lights_of_which_nothing_is_said_are_as_large_as_usd_says_and_shine_everywhere(stage, kind, size):
+    schemas = '"lamp" ( prepend apiSchemas = ["ShapingAPI", "ShadowAPI"] )'
+    path = stage(light(kind, []).replace('"lamp"', schemas))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CageWarning)
+        (found,) = read_stage(path).lights
+    assert found.size == size
+
+
 def test_a_stretched_cylinder_is_as_long_and_as_wide_as_its_axes_say(stage):
     """It lies along x: its scale there makes it longer, and the scales of y and z wider."""
     lamp = light("CylinderLight", ["float inputs:length = 2", "float inputs:radius = 0.25"])

@@ -134,7 +134,7 @@ class TileRates:
             children = Tiles.joined([tiles[tried].child(number, self.domain) for number in range(4)])
             child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1))
             cost = self._costs(children, child_rates).reshape(4, -1).sum(axis=0)
-            is_better = (cost < self._costs(tiles[tried], rates[tried])) & (self.most(tiles[tried]) > 1)
+            is_better = cost < self._costs(tiles[tried], rates[tried])
             keeps = np.full(len(tiles), True)
             keeps[tried[is_better]] = False
             kept = replace(tiles[keeps], rates=rates[keeps])

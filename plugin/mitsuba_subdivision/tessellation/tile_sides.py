@@ -126,7 +126,8 @@ def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
     size = tiles.size
     u, v = (origin.astype(np.int32) * size for origin in tiles.origin.T)
     far_u, far_v, diagonal = u + size, v + size, u + v + size
-    # Lines inside patches are numbered by their direction and patch, after edges and spokes.
+    # Lines inside patches, whose levels are below `UNIT`, are numbered by their direction and patch, after edges and
+    # spokes.
     shape = len(tiles), m
     line, half_edge = np.empty(shape, dtype=np.int64), np.full(shape, -1, dtype=np.int32)
     low, halvings = (np.empty(shape, dtype=np.int32) for _ in range(2))
@@ -150,7 +151,7 @@ def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
         ]
     for side, (own_level, own_low, distance, along) in enumerate(sides):
         axis = side if m == 3 else side % 2
-        line[:, side] = (tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count) << (DEEPEST + 1) | own_level
+        line[:, side] = (tiles.corner.astype(np.int64) + (2 + axis) * t.half_edge_count) << DEEPEST | own_level
         low[:, side] = own_low
         is_backward[:, side] = flipped ^ (side == 2 or (m == 4 and side == 3))
         on = np.flatnonzero((distance == 0) & ~flipped)
@@ -162,12 +163,12 @@ def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
             borders.append((other, own, at - size[other] if side == 2 else at, size[other], is_spoke))
         for at, own, begin, own_length, is_spoke in borders:
             if is_spoke:
-                line[at, side] = (own.astype(np.int64) + t.half_edge_count) << (DEEPEST + 1)
+                line[at, side] = (own.astype(np.int64) + t.half_edge_count) << DEEPEST
                 low[at, side] = begin
                 is_backward[at, side] = side == 2
             else:
                 backward = frames.is_backward[own]
-                line[at, side] = frames.edge[own].astype(np.int64) << (DEEPEST + 1)
+                line[at, side] = frames.edge[own].astype(np.int64) << DEEPEST
                 half_edge[at, side] = own
                 low[at, side] = np.where(backward, EDGE - begin - own_length, begin)
                 is_backward[at, side] = backward

@@ -22,13 +22,13 @@ KINDS = {
     "DomeLight": "dome",
     "DomeLight_1": "dome",
 }
-# Attributes for the sizes of each kind, and what they are without a value.
-_SIZES: dict[str, list[tuple[str, float]]] = {
-    "distant": [("inputs:angle", 0.53)],
-    "rect": [("inputs:width", 1.0), ("inputs:height", 1.0)],
-    "disk": [("inputs:radius", 0.5)],
-    "sphere": [("inputs:radius", 0.5)],
-    "cylinder": [("inputs:length", 1.0), ("inputs:radius", 0.5)],
+# Attributes for the sizes of each kind. The schemas of lights say what they are without a value.
+_SIZES = {
+    "distant": ["inputs:angle"],
+    "rect": ["inputs:width", "inputs:height"],
+    "disk": ["inputs:radius"],
+    "sphere": ["inputs:radius"],
+    "cylinder": ["inputs:length", "inputs:radius"],
     "dome": [],
 }
 # Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
@@ -63,7 +63,7 @@ def read_light(
         notes.add(f"lights of type {given} are ignored; expected one of {', '.join(KINDS)}", path)
         return None
     _note_ignored(prim, time, notes)
-    size = [float(_value(prim, name, time, usual)) for name, usual in _SIZES[kind]]
+    size = [float(prim.GetAttribute(name).Get(time)) for name in _SIZES[kind]]
     if kind == "distant" and size[0] > _POINTLIKE:
         notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
     if kind == "sphere" and _value(prim, "treatAsPoint", time, False):
