@@ -33,7 +33,8 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from ..schemes.scheme_members import optional_member
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_together, ring_pattern
+from .refined_fans import RefinedFace, window
+from .refined_rings import RefinedRing, RingMesh, refined_ring, refined_together, ring_pattern
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
@@ -68,7 +69,7 @@ class DividedElement:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature.smoothed).vertex_count
         self._steady = _steady_refinements(scheme, signature)
-        self._refined: tuple[RefinedRings, int] | None = None
+        self._refined: RefinedRing | RefinedFace | None = None
         self._children: dict[int, DividedElement] = {}
         self._stencils: dict[int, FloatArray] = {}
 
@@ -114,26 +115,24 @@ class DividedElement:
         element = self.child_element(number)
         if number in self._stencils:
             return element, self._stencils[number]
-        rings, ring = self.base._rings
-        stencils = rings.stencils(ring, number)
+        stencils = self.base._ring.stencils(number)
         if stencils.size <= KEPT_WEIGHTS:
             self._stencils[number] = stencils
         return element, stencils
 
     def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
         """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element."""
-        if self.control_count * rows.shape[2] <= KEPT_WEIGHTS:
-            return rows @ self.child(number)[1]
-        # Nearly all weights of so many are zero.
-        rings, _ = self.base._rings
-        found = rings.table(number).matrix.T @ rows.reshape(-1, rows.shape[2]).T
-        return found.T.reshape(*rows.shape[:2], -1)
+        ring = self.base._ring
+        # Nearly all weights of very many are zero.
+        if isinstance(ring, RefinedFace) or self.control_count * rows.shape[2] > KEPT_WEIGHTS:
+            return ring.over_controls(rows, number)
+        return rows @ self.child(number)[1]
 
     def child_element(self, number: int) -> DividedElement:
         """One of the children."""
         if number not in self._children:
-            rings, ring = self.base._rings
-            self._children[number] = element_of(self.scheme, rings.signature(ring, number).sharpened(self._steady))
+            signature = self.base._ring.signature(number).sharpened(self._steady)
+            self._children[number] = element_of(self.scheme, signature)
         return self._children[number]
 
     @property
@@ -152,10 +151,12 @@ class DividedElement:
         return element_of(self.scheme, self.signature.sharpened(-self._steady)) if self._steady else self
 
     @property
-    def _rings(self) -> tuple[RefinedRings, int]:
-        """Refined one-rings, and which of them is this element's."""
+    def _ring(self) -> RefinedRing | RefinedFace:
+        """The refined one-ring."""
         if self._refined is None:
-            self._refined = refined_ring(self.scheme, self.signature), 0
+            refine_elements(self.scheme, [self], None)
+        if self._refined is None:
+            self._refined = RefinedRing(refined_ring(self.scheme, self.signature), 0)
         return self._refined
 
     @cached_property
@@ -282,10 +283,14 @@ def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMe
         The result of the last call, as in `refined_together`.
     """
     bases = dict.fromkeys(element.base for element in elements if element.piece is None)
-    new = {base.signature: base for base in bases if base._refined is None}
-    found, mesh = refined_together(scheme, new, mesh)
-    for signature, refined in found.items():
-        new[signature]._refined = refined
+    new = [(base, window(scheme, base.signature)) for base in bases if base._refined is None]
+    found, mesh = refined_together(scheme, dict.fromkeys(near or base.signature for base, near in new), mesh)
+    for base, near in new:
+        if near is not None:
+            refined = found.get(near) or RefinedRing(refined_ring(scheme, near), 0)
+            base._refined = RefinedFace(scheme, base.signature, refined)
+        elif base.signature in found:
+            base._refined = found[base.signature]
     return mesh
 
 

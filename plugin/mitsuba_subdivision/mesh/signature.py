@@ -196,9 +196,14 @@ class Signature:
         if self.kind == "face":
             return Signature("face", self.fans[corner:] + self.fans[:corner])
         fan = self.fans[0]
-        if isinstance(fan, TaggedFan):
-            raise TypeError("a vertex element with tags; expected one without, as only faces have borders and rules")
-        return Signature("vertex", (fan[corner:] + fan[:corner],))
+        if not isinstance(fan, TaggedFan):
+            return Signature("vertex", (fan[corner:] + fan[:corner],))
+        if not fan.is_closed:
+            raise TypeError("a vertex on a border; expected one amid faces, as another has a first and a last face")
+        sharpness = fan.sharpness
+        if sharpness is not None:
+            sharpness = sharpness._replace(edges=sharpness.edges[corner:] + sharpness.edges[:corner])
+        return Signature("vertex", (fan._replace(ahead=fan.ahead[corner:] + fan.ahead[:corner], sharpness=sharpness),))
 
 
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:

@@ -1,0 +1,244 @@
+"""One-rings at a closed fan of very many faces, refined as a window of near faces and as the fan, which faces share.
+
+Where something around a vertex of a high valence n is semi-sharp, each of the n faces has a signature of its own, over
+all points of the fan. But of the vertices of its refined one-ring, only the vertex itself and those around it depend on
+more than near faces, and these are the same for all faces, turned. So the fan is refined once; and for each face its
+*window*, the one-ring in which the fan is cut down to three faces, which is as small as those elsewhere.
+"""
+
+from __future__ import annotations
+
+from array import array
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.semi_sharpness import SMOOTH_EDGE, FanSharpness
+from ..mesh.signature import (
+    LARGE_FAN,
+    Fan,
+    Signature,
+    TaggedFan,
+    fan_face_count,
+    fan_half_edges,
+    fan_is_closed,
+    signature_at,
+)
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
+from ..schemes.stencil_table import StencilTable
+from .refined_rings import RefinedRing, RingPattern, ring_pattern
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+# Faces of a window on each side of the element. No refined vertex of the element's children depends on others, but for
+# the vertex of the fan and those around it.
+BESIDE = 2
+
+
+def window(scheme: Scheme, signature: Signature) -> Signature | None:
+    """The signature of a face with its large fan cut down to near faces.
+
+    None if nothing is semi-sharp, if there is no large closed fan or more than one, and under rules by which refined
+    vertices may depend on faces further away.
+    """
+    if signature.kind != "face" or not signature.is_semi_sharp or not optional_member(scheme, "has_local_borders"):
+        return None
+    # Chaikin's method takes the mean of all edges at a vertex.
+    large = _large_fans(signature)
+    if len(large) != 1 or optional_member(scheme, "crease_method") == "chaikin":
+        return None
+    return _window(signature, large[0])
+
+
+def _large_fans(signature: Signature) -> list[int]:
+    """Corners of a face at closed fans of very many faces."""
+    fans = enumerate(signature.fans)
+    return [corner for corner, fan in fans if fan_is_closed(fan) and fan_face_count(fan) >= LARGE_FAN]
+
+
+def _window(signature: Signature, corner: int) -> Signature:
+    fan = signature.fans[corner]
+    around, sharpness = (fan.ahead, fan.sharpness) if isinstance(fan, TaggedFan) else (fan, None)
+    if sharpness is not None:
+        edges = sharpness.edges[-BESIDE:] + sharpness.edges[: 1 + BESIDE]
+        sharpness = None if set(edges) == {SMOOTH_EDGE} else FanSharpness(edges, 0.0, ())
+    near = TaggedFan(around[: 1 + BESIDE], around[: -1 - BESIDE : -1], sharpness=sharpness)
+    return Signature("face", (*signature.fans[:corner], near, *signature.fans[corner + 1 :]))
+
+
+class RefinedFace:
+    """The refined one-ring of a face at a large fan, in place of `RefinedRings`.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    signature : Signature
+    near : RefinedRing
+        The refined one-ring of the face's `window`.
+    """
+
+    def __init__(self, scheme: Scheme, signature: Signature, near: RefinedRing) -> None:
+        (corner,) = _large_fans(signature)
+        self._near = near
+        fan, self._turn = _unturned(signature.fans[corner])
+        self._fan = _refined_fan(scheme, fan)
+        self._control_count = one_ring(signature.smoothed).vertex_count
+        points = _fan_points(signature.smoothed, corner)
+        self._ring, self._window = points.turned(self._fan.begins, self._turn), points.window
+        self._pattern, self._vertex = _window_pattern(scheme, _window(signature.smoothed, corner), corner)
+
+    def signature(self, number: int) -> Signature:
+        """Signature of a child."""
+        found, corner = self._near.signature(number), self._corner(number)
+        if corner is None:
+            return found
+        fan = self._fan.refined.rotated(self._turn).fans[0]
+        return Signature("face", (*found.fans[:corner], fan, *found.fans[corner + 1 :]))
+
+    def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
+        """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the face."""
+        stencils, corner = self._near.stencils(number), self._corner(number)
+        flat = rows.reshape(-1, rows.shape[2])
+        found = np.zeros((len(flat), self._control_count))
+        is_vertex = self._pattern.child(number)[1] == self._vertex
+        if corner is None:
+            found[:, self._ring] = flat[:, is_vertex] @ np.tile(self._fan.vertex_weights, (int(is_vertex.sum()), 1))
+            found[:, self._window] += flat[:, ~is_vertex] @ stencils[~is_vertex]
+        else:
+            points = _fan_points(self.signature(number).smoothed, corner)
+            ring_of_child = points.turned(self._fan.begins_refined, self._turn)
+            found[:, self._ring] = (self._fan.matrix @ flat[:, ring_of_child].T).T
+            is_outside = ~np.isin(points.window, ring_of_child)
+            found[:, self._window] += flat[:, points.window[is_outside]] @ stencils[is_outside]
+        return found.reshape(*rows.shape[:2], -1)
+
+    def stencils(self, number: int) -> FloatArray:
+        """Control points of a child over those of the face, ``(K_child, K)``."""
+        count = one_ring(self.signature(number).smoothed).vertex_count
+        return self.over_controls(np.eye(count)[None], number)[0]
+
+    def _corner(self, number: int) -> int | None:
+        """Corner of a child at which the refined fan is; None if it only has the vertex in its one-ring."""
+        smooth, vertices, _ = self._pattern.child(number)
+        corner = int(np.argmax(vertices == self._vertex))
+        return corner if vertices[corner] == self._vertex and corner < len(smooth.fans) else None
+
+
+@lru_cache(maxsize=1024)
+def _window_pattern(scheme: Scheme, smooth: Signature, corner: int) -> tuple[RingPattern, int]:
+    """How a window is refined, and the vertex of the fan at one of its corners in the refined mesh."""
+    pattern, before, half_edge = ring_pattern(scheme, smooth), one_ring(smooth).topology, 0
+    for _ in range(corner):
+        half_edge = int(before.next[half_edge])
+    after = pattern.refinement.topology
+    _, refined_half_edge = scheme.children(before, after, half_edge)[0]
+    return pattern, int(after.face_vertices[refined_half_edge])
+
+
+class _RefinedFan:
+    """The closed fan around a vertex, refined once.
+
+    Its *ring* is the vertex, and then the points of each face, from the end of its first edge to before that of its
+    last.
+
+    Parameters
+    ----------
+    scheme : Scheme
+    fan : Signature
+        Of the vertex, with its semi-sharp features.
+
+    Attributes
+    ----------
+    refined : Signature
+        Of the vertex after the refinement.
+    begins, begins_refined : (n,) int64
+        The first point of each face in the ring before the refinement, and after it.
+    matrix : (r, r_refined) sparse array
+        Weights over the refined ring, multiplied by this, are weights over the ring.
+    vertex_weights : (r,) float64
+        The refined vertex over the ring.
+    """
+
+    def __init__(self, scheme: Scheme, fan: Signature) -> None:
+        before = one_ring(fan).topology
+        after, stencils = scheme.refine(before)
+        _, half_edge = scheme.children(before, after, 0)[0]
+        self.refined = signature_at(after, half_edge, "vertex")
+        ring, self.begins = _ring_points(before, 0)
+        ring_refined, self.begins_refined = _ring_points(after, half_edge)
+        table, order = stencils.chosen(ring_refined), np.argsort(ring)
+        matrix = StencilTable(len(ring), len(ring_refined), order[table.columns], table.rows, table.weights).matrix
+        self.matrix: sparse.csr_array = matrix
+        self.vertex_weights: FloatArray = matrix[:, [0]].toarray()[:, 0]
+
+
+@lru_cache(maxsize=64)
+def _refined_fan(scheme: Scheme, fan: Signature) -> _RefinedFan:
+    return _RefinedFan(scheme, fan)
+
+
+def _ring_points(topology: Topology, half_edge: int) -> tuple[IntArray, IntArray]:
+    """The ring of the vertex at which a half-edge begins, from its face on, and the first point of each face in it."""
+    ((_, ahead),) = fan_half_edges(topology, half_edge, "vertex")
+    half_edges = np.array(ahead)
+    faces = topology.face_of(half_edges)
+    first, counts = topology.face_offsets[faces], topology.face_sizes[faces] - 2
+    face = np.repeat(np.arange(len(faces)), counts)
+    steps = 1 + ragged.index_in_row(counts)
+    at = first[face] + (half_edges[face] - first[face] + steps) % (counts[face] + 2)
+    return np.append(topology.face_vertices[half_edge], topology.face_vertices[at]), 1 + ragged.starts(counts)
+
+
+class _FanPoints(NamedTuple):
+    """Vertices of the one-ring of a face at a large fan: the fan's ring, as the face sees it, and those of its window."""
+
+    ring: NDArray[np.int32]
+    window: NDArray[np.int32]
+
+    def turned(self, begins: IntArray, turn: int) -> IntArray:
+        """The ring as seen by the first face of the fan, from which so many turns lead to this face."""
+        return np.append(self.ring[:1], np.roll(self.ring[1:], begins[turn] - 1))
+
+
+@lru_cache(maxsize=4096)
+def _fan_points(smooth: Signature, corner: int) -> _FanPoints:
+    """Find them in a one-ring without semi-sharp features."""
+    topology = one_ring(smooth).topology
+    around = fan_half_edges(topology, 0, "face")
+    _, ahead = around[corner]
+    around[corner] = ahead[: -1 - BESIDE : -1], ahead[: 1 + BESIDE]
+    near = one_ring(_window(smooth, corner)).vertices_around(topology, around)
+    return _FanPoints(_ring_points(topology, ahead[0])[0], near)
+
+
+def _unturned(fan: Fan) -> tuple[Signature, int]:
+    """One fan for all that are equal but turned, as the signature of its vertex; and the turns from there to this."""
+    own = Signature("vertex", (fan,))
+    if not isinstance(fan, TaggedFan) or fan.sharpness is None:
+        rest: tuple[object, ...] = ()
+        faces = array("q", fan.ahead if isinstance(fan, TaggedFan) else fan)
+    else:
+        rest = fan.sharpness.vertex, fan.sharpness.across
+        faces = array("q", map(hash, zip(fan.ahead, fan.sharpness.edges, strict=True)))
+    known = _fans_with(len(faces), sum(faces), rest, fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC)
+    for twice, found in known:
+        begin = twice.find(faces.tobytes())
+        turn, offset = divmod(begin, faces.itemsize)
+        if begin >= 0 and not offset and found.rotated(turn) == own:
+            return found, turn
+    known.append((2 * faces.tobytes(), own))
+    return own, 0
+
+
+@lru_cache(maxsize=1024)
+def _fans_with(*properties: object) -> list[tuple[bytes, Signature]]:  # noqa: ARG001
+    """Fans of some properties that `_unturned` has met: the codes of their faces, twice around, and signatures."""
+    return []
