@@ -8,7 +8,6 @@ more than near faces, and these are the same for all faces, turned. So the fan i
 
 from __future__ import annotations
 
-from array import array
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.connectivity import IntArray, Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.semi_sharpness import SMOOTH_EDGE, FanSharpness
 from ..mesh.signature import (
@@ -24,6 +23,7 @@ from ..mesh.signature import (
     Fan,
     Signature,
     TaggedFan,
+    TurnedEdges,
     fan_face_count,
     fan_half_edges,
     fan_is_closed,
@@ -116,8 +116,7 @@ class RefinedFace:
             points = _fan_points(self.signature(number).smoothed, corner)
             ring_of_child = points.turned(self._fan.begins_refined, self._turn)
             found[:, self._ring] = (self._fan.matrix @ flat[:, ring_of_child].T).T
-            is_outside = ~np.isin(points.window, ring_of_child)
-            found[:, self._window] += flat[:, points.window[is_outside]] @ stencils[is_outside]
+            found[:, self._window] += flat[:, points.window[points.is_outside]] @ stencils[points.is_outside]
         return found.reshape(*rows.shape[:2], -1)
 
     def stencils(self, number: int) -> FloatArray:
@@ -198,14 +197,26 @@ def _ring_points(topology: Topology, half_edge: int) -> tuple[IntArray, IntArray
 
 
 class _FanPoints(NamedTuple):
-    """Vertices of the one-ring of a face at a large fan: the fan's ring, as the face sees it, and those of its window."""
+    """Vertices of the one-ring of a face at a large fan.
+
+    Attributes
+    ----------
+    ring : (r,) int32
+        The fan's ring, as the face sees it.
+    window : (w,) int32
+        Those of the face's window.
+    is_outside : (w,) bool
+        Which of these are not in the ring.
+    """
 
     ring: NDArray[np.int32]
     window: NDArray[np.int32]
+    is_outside: NDArray[np.bool_]
 
     def turned(self, begins: IntArray, turn: int) -> IntArray:
         """The ring as seen by the first face of the fan, from which so many turns lead to this face."""
-        return np.append(self.ring[:1], np.roll(self.ring[1:], begins[turn] - 1))
+        first = len(self.ring) - begins[turn] + 1
+        return np.concatenate([self.ring[:1], self.ring[first:], self.ring[1:first]])
 
 
 @lru_cache(maxsize=4096)
@@ -216,29 +227,16 @@ def _fan_points(smooth: Signature, corner: int) -> _FanPoints:
     _, ahead = around[corner]
     around[corner] = ahead[: -1 - BESIDE : -1], ahead[: 1 + BESIDE]
     near = one_ring(_window(smooth, corner)).vertices_around(topology, around)
-    return _FanPoints(_ring_points(topology, ahead[0])[0], near)
+    ring, _ = _ring_points(topology, ahead[0])
+    return _FanPoints(ring, near, ~np.isin(near, ring))
 
 
 def _unturned(fan: Fan) -> tuple[Signature, int]:
-    """One fan for all that are equal but turned, as the signature of its vertex; and the turns from there to this."""
-    own = Signature("vertex", (fan,))
-    if not isinstance(fan, TaggedFan) or fan.sharpness is None:
-        rest: tuple[object, ...] = ()
-        faces = array("q", fan.ahead if isinstance(fan, TaggedFan) else fan)
-    else:
-        rest = fan.sharpness.vertex, fan.sharpness.across
-        faces = array("q", map(hash, zip(fan.ahead, fan.sharpness.edges, strict=True)))
-    known = _fans_with(len(faces), sum(faces), rest, fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC)
-    for twice, found in known:
-        begin = twice.find(faces.tobytes())
-        turn, offset = divmod(begin, faces.itemsize)
-        if begin >= 0 and not offset and found.rotated(turn) == own:
-            return found, turn
-    known.append((2 * faces.tobytes(), own))
-    return own, 0
+    """The signature of the vertex that a fan is around, the same for all its faces; and the turns from there to this.
 
-
-@lru_cache(maxsize=1024)
-def _fans_with(*properties: object) -> list[tuple[bytes, Signature]]:  # noqa: ARG001
-    """Fans of some properties that `_unturned` has met: the codes of their faces, twice around, and signatures."""
-    return []
+    Faces whose fan is smooth, and has faces of different sizes, have one for each.
+    """
+    edges = fan.sharpness.edges if isinstance(fan, TaggedFan) and fan.sharpness is not None else ()
+    if isinstance(edges, TurnedEdges):
+        return edges.vertex, edges.turn
+    return Signature("vertex", (fan,)), 0
