@@ -154,15 +154,20 @@ class DividedElement:
     def _ring(self) -> RefinedRing | RefinedFace:
         """The refined one-ring."""
         if self._refined is None:
-            refine_elements(self.scheme, [self], None)
-        if self._refined is None:
-            self._refined = RefinedRing(refined_ring(self.scheme, self.signature), 0)
+            near = window(self.scheme, self.signature)
+            alone = RefinedRing(refined_ring(self.scheme, near or self.signature), 0)
+            self._refined = alone if near is None else RefinedFace(self.scheme, self.signature, alone)
         return self._refined
 
     @cached_property
     def regular_count(self) -> int:
         """Number of regular pieces."""
         return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child in self.child_elements)
+
+    @cached_property
+    def tip_count(self) -> int:
+        """Number of pieces with an extraordinary point."""
+        return int(self.kind == PartKind.TIP) + sum(child.tip_count for child in self.child_elements)
 
     @cached_property
     def tips(self) -> tuple[Piece, ...]:
@@ -207,7 +212,7 @@ class DividedElement:
         for child in children:
             rows.append(np.array([[child.kind, child.turn, first[child.kind]]]))
             below.append(child._below + first[child._below[:, :1]] * np.array([0, 0, 1]))
-            first += [len(child._below)] * 2 + [child.regular_count, len(child.tips)]
+            first += [len(child._below)] * 2 + [child.regular_count, child.tip_count]
         return np.concatenate(rows + below)
 
     def coefficients(
@@ -238,13 +243,13 @@ class DividedElement:
             found[:] = form @ self.piece.stencils if len(found) else 0
             return found
         end = 0
-        for child, stencils in self.children:
+        for number, child in enumerate(self.child_elements):
             if child not in known:
                 known[child] = child.coefficients(form, np.float64, known)
             rows = known[child]
             begin, end = end, end + len(rows)
-            # Piece by piece, so that BLAS starts no threads: these would take longer to wait for each other.
-            np.matmul(rows, stencils, out=found[begin:end], casting="same_kind")
+            if len(rows):
+                found[begin:end] = self.over_controls(rows, number)
         return found
 
 
@@ -286,11 +291,9 @@ def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMe
     new = [(base, window(scheme, base.signature)) for base in bases if base._refined is None]
     found, mesh = refined_together(scheme, dict.fromkeys(near or base.signature for base, near in new), mesh)
     for base, near in new:
-        if near is not None:
-            refined = found.get(near) or RefinedRing(refined_ring(scheme, near), 0)
-            base._refined = RefinedFace(scheme, base.signature, refined)
-        elif base.signature in found:
-            base._refined = found[base.signature]
+        refined = found.get(near or base.signature)
+        if refined is not None:
+            base._refined = refined if near is None else RefinedFace(scheme, base.signature, refined)
     return mesh
 
 

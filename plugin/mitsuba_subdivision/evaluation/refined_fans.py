@@ -106,18 +106,18 @@ class RefinedFace:
     def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
         """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the face."""
         stencils, corner = self._near.stencils(number), self._corner(number)
-        flat = rows.reshape(-1, rows.shape[2])
-        found = np.zeros((len(flat), self._control_count))
-        is_vertex = self._pattern.child(number)[1] == self._vertex
+        # Control points come first in memory, so that their rows are picked and added up as wholes.
+        by_control = rows.reshape(-1, rows.shape[2]).T
+        found = np.zeros((self._control_count, by_control.shape[1]))
         if corner is None:
-            found[:, self._ring] = flat[:, is_vertex] @ np.tile(self._fan.vertex_weights, (int(is_vertex.sum()), 1))
-            found[:, self._window] += flat[:, ~is_vertex] @ stencils[~is_vertex]
+            is_vertex = self._pattern.child(number)[1] == self._vertex
+            found[self._ring] = self._fan.vertex_weights[:, None] * by_control[is_vertex].sum(axis=0)
+            found[self._window] += stencils[~is_vertex].T @ by_control[~is_vertex]
         else:
             points = _fan_points(self.signature(number).smoothed, corner)
-            ring_of_child = points.turned(self._fan.begins_refined, self._turn)
-            found[:, self._ring] = (self._fan.matrix @ flat[:, ring_of_child].T).T
-            found[:, self._window] += flat[:, points.window[points.is_outside]] @ stencils[points.is_outside]
-        return found.reshape(*rows.shape[:2], -1)
+            found[self._ring] = self._fan.matrix @ by_control[points.turned(self._fan.begins_refined, self._turn)]
+            found[self._window] += stencils[points.is_outside].T @ by_control[points.window[points.is_outside]]
+        return found.T.reshape(*rows.shape[:2], self._control_count)
 
     def stencils(self, number: int) -> FloatArray:
         """Control points of a child over those of the face, ``(K_child, K)``."""
