@@ -29,6 +29,7 @@ from ..schemes.scheme import Scheme
 from .divided_element import DividedElement, PartKind, divided_elements
 from .equations import times_powers
 from .irregular_patch import IrregularPatch, float32_levels
+from .patch_pieces import Piece
 from .polynomial_basis import polynomial_basis
 
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
@@ -194,7 +195,7 @@ class _Tip(NamedTuple):
 def _tips(element: DividedElement, piece_levels: int) -> list[_Tip]:
     """All tips of an element, over its control points."""
     if element.piece is not None:
-        return [] if element.piece.patch is None else [_tip(element, piece_levels)]
+        return [] if element.piece.patch is None else [_tip(element.scheme, element.piece, piece_levels)]
     return [
         tip._replace(rows=element.over_controls(tip.rows, number))
         for number, child in enumerate(element.child_elements)
@@ -204,9 +205,9 @@ def _tips(element: DividedElement, piece_levels: int) -> list[_Tip]:
 
 # Around vertices of high valence, tips take some megabytes, and many elements have the same.
 @lru_cache(maxsize=16)
-def _tip(element: DividedElement, piece_levels: int) -> _Tip:
-    """The tip that an element is."""
-    scheme, patch, coordinates = element.scheme, element.piece.irregular_patch, element.piece.coordinates
+def _tip(scheme: Scheme, piece: Piece, piece_levels: int) -> _Tip:
+    """The tip that a piece is, over the control points of its element."""
+    patch, coordinates = piece.irregular_patch, piece.coordinates
     basis, polynomials = patch.basis, polynomial_basis(scheme)
     # The regular children's polynomials over the eigen-coordinates.
     rows: FloatArray = polynomials.matrix @ patch.eigen_children

@@ -201,16 +201,16 @@ class _FanPoints(NamedTuple):
 
     Attributes
     ----------
-    ring : (r,) int32
+    ring : (r,) int
         The fan's ring, as the face sees it.
-    window : (w,) int32
+    window : (w,) int
         Those of the face's window.
     is_outside : (w,) bool
         Which of these are not in the ring.
     """
 
-    ring: NDArray[np.int32]
-    window: NDArray[np.int32]
+    ring: IntArray
+    window: IntArray
     is_outside: NDArray[np.bool_]
 
     def turned(self, begins: IntArray, turn: int) -> IntArray:

@@ -42,15 +42,15 @@ class RefinedRing(NamedTuple):
     """One of some refined one-rings."""
 
     rings: RefinedRings
-    index: int
+    ring: int
 
     def signature(self, number: int) -> Signature:
         """Signature of a child."""
-        return self.rings.signature(self.index, number)
+        return self.rings.signature(self.ring, number)
 
     def stencils(self, number: int) -> FloatArray:
         """Control points of a child over those of the element, ``(K_child, K)``."""
-        return self.rings.stencils(self.index, number)
+        return self.rings.stencils(self.ring, number)
 
     def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
         """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element.

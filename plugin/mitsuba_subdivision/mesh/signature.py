@@ -235,12 +235,17 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     is_large = [kind == "face" and fan_is_closed(fan) and fan_face_count(fan) >= LARGE_FAN for fan in smooth.fans]
     if not any(is_large):
         return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
-    found = [_turned_fan(topology, ahead) if large else None for (_, ahead), large in zip(fans, is_large, strict=True)]
-    if not all(is_large):
-        small = Signature(kind, tuple(fan for fan, large in zip(smooth.fans, is_large, strict=True) if not large))
-        around = half_edges_around([each for each, large in zip(fans, is_large, strict=True) if not large])
-        rest = iter(with_sharpness(small, FanSharpnessRows(topology, around[None], semi), 0).fans)
-        found = [next(rest) if fan is None else fan for fan in found]
+    found = list(smooth.fans)
+    for corner, large in enumerate(is_large):
+        if large:
+            found[corner] = _turned_fan(topology, fans[corner][1])
+    small = [corner for corner, large in enumerate(is_large) if not large]
+    if small:
+        rest = Signature(kind, tuple(smooth.fans[corner] for corner in small))
+        around = half_edges_around([fans[corner] for corner in small])
+        sharp = with_sharpness(rest, FanSharpnessRows(topology, around[None], semi), 0)
+        for corner, fan in zip(small, sharp.fans, strict=True):
+            found[corner] = fan
     return _with_fans(smooth, found)
 
 
