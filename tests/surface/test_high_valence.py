@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
+from mitsuba_subdivision.patches import patch_samples, patch_table
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
@@ -50,6 +51,25 @@ def test_a_fan_whose_faces_have_weights_of_their_own_is_refused_sooner(count, sh
 def test_a_face_of_too_many_corners_is_named(scheme):
     with pytest.raises(MemoryError, match=rf"face {TOO_HIGH} has {TOO_HIGH} corners; .*smaller faces"):
         LimitSurface(pyramid(TOO_HIGH, has_base=True), scheme).tessellate(1)
+
+
+def test_pieces_of_a_semi_sharp_fan_that_take_too_much_are_refused():
+    """Weights of a tessellation fit into memory, and polynomials of each face over all points do not."""
+    surface = LimitSurface(pyramid(HIGH, creases=[[HIGH, 0, 2.5]]), "catmull_clark")
+    surface.tessellate(1)
+    with pytest.raises(MemoryError, match=rf"vertex {HIGH} has {HIGH} faces, and pieces .* GB .*several vertices"):
+        surface.pieces()
+
+
+def test_samples_on_a_fan_are_those_of_its_faces_one_after_the_other(monkeypatch, np_rng):
+    cage = pyramid(60, creases=[[60, 0, 2.5], [60, 7, 1.5]])
+    element, uv = np.repeat(np.arange(60), 5), np_rng.random((300, 2))
+    together = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
+    monkeypatch.setattr(patch_samples, "WEIGHTS", 1)
+    monkeypatch.setattr(patch_table, "KEPT_BYTES", 0)
+    apart = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
+    np.testing.assert_allclose(apart.p, together.p, rtol=0, atol=ROUNDED_POINT)
+    np.testing.assert_allclose(apart.n, together.n, rtol=0, atol=ROUNDED_NORMAL)
 
 
 @SCHEMES

@@ -33,7 +33,8 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from ..schemes.scheme_members import optional_member
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_rings import RefinedRings, RingMesh, refined_ring, refined_together, ring_pattern
+from .refined_fans import RefinedFace, window
+from .refined_rings import RefinedRing, RingMesh, refined_ring, refined_together, ring_pattern
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
@@ -68,7 +69,7 @@ class DividedElement:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature.smoothed).vertex_count
         self._steady = _steady_refinements(scheme, signature)
-        self._refined: tuple[RefinedRings, int] | None = None
+        self._refined: RefinedRing | RefinedFace | None = None
         self._children: dict[int, DividedElement] = {}
         self._stencils: dict[int, FloatArray] = {}
 
@@ -114,26 +115,24 @@ class DividedElement:
         element = self.child_element(number)
         if number in self._stencils:
             return element, self._stencils[number]
-        rings, ring = self.base._rings
-        stencils = rings.stencils(ring, number)
+        stencils = self.base._ring.stencils(number)
         if stencils.size <= KEPT_WEIGHTS:
             self._stencils[number] = stencils
         return element, stencils
 
     def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
         """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element."""
-        if self.control_count * rows.shape[2] <= KEPT_WEIGHTS:
-            return rows @ self.child(number)[1]
-        # Nearly all weights of so many are zero.
-        rings, _ = self.base._rings
-        found = rings.table(number).matrix.T @ rows.reshape(-1, rows.shape[2]).T
-        return found.T.reshape(*rows.shape[:2], -1)
+        ring = self.base._ring
+        # Nearly all weights of very many are zero.
+        if isinstance(ring, RefinedFace) or self.control_count * rows.shape[2] > KEPT_WEIGHTS:
+            return ring.over_controls(rows, number)
+        return rows @ self.child(number)[1]
 
     def child_element(self, number: int) -> DividedElement:
         """One of the children."""
         if number not in self._children:
-            rings, ring = self.base._rings
-            self._children[number] = element_of(self.scheme, rings.signature(ring, number).sharpened(self._steady))
+            signature = self.base._ring.signature(number).sharpened(self._steady)
+            self._children[number] = element_of(self.scheme, signature)
         return self._children[number]
 
     @property
@@ -152,16 +151,23 @@ class DividedElement:
         return element_of(self.scheme, self.signature.sharpened(-self._steady)) if self._steady else self
 
     @property
-    def _rings(self) -> tuple[RefinedRings, int]:
-        """Refined one-rings, and which of them is this element's."""
+    def _ring(self) -> RefinedRing | RefinedFace:
+        """The refined one-ring."""
         if self._refined is None:
-            self._refined = refined_ring(self.scheme, self.signature), 0
+            near = window(self.scheme, self.signature)
+            alone = RefinedRing(refined_ring(self.scheme, near or self.signature), 0)
+            self._refined = alone if near is None else RefinedFace(self.scheme, self.signature, alone)
         return self._refined
 
     @cached_property
     def regular_count(self) -> int:
         """Number of regular pieces."""
         return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child in self.child_elements)
+
+    @cached_property
+    def tip_count(self) -> int:
+        """Number of pieces with an extraordinary point."""
+        return int(self.kind == PartKind.TIP) + sum(child.tip_count for child in self.child_elements)
 
     @cached_property
     def tips(self) -> tuple[Piece, ...]:
@@ -206,7 +212,7 @@ class DividedElement:
         for child in children:
             rows.append(np.array([[child.kind, child.turn, first[child.kind]]]))
             below.append(child._below + first[child._below[:, :1]] * np.array([0, 0, 1]))
-            first += [len(child._below)] * 2 + [child.regular_count, len(child.tips)]
+            first += [len(child._below)] * 2 + [child.regular_count, child.tip_count]
         return np.concatenate(rows + below)
 
     def coefficients(
@@ -237,13 +243,13 @@ class DividedElement:
             found[:] = form @ self.piece.stencils if len(found) else 0
             return found
         end = 0
-        for child, stencils in self.children:
+        for number, child in enumerate(self.child_elements):
             if child not in known:
                 known[child] = child.coefficients(form, np.float64, known)
             rows = known[child]
             begin, end = end, end + len(rows)
-            # Piece by piece, so that BLAS starts no threads: these would take longer to wait for each other.
-            np.matmul(rows, stencils, out=found[begin:end], casting="same_kind")
+            if len(rows):
+                found[begin:end] = self.over_controls(rows, number)
         return found
 
 
@@ -282,10 +288,12 @@ def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMe
         The result of the last call, as in `refined_together`.
     """
     bases = dict.fromkeys(element.base for element in elements if element.piece is None)
-    new = {base.signature: base for base in bases if base._refined is None}
-    found, mesh = refined_together(scheme, new, mesh)
-    for signature, refined in found.items():
-        new[signature]._refined = refined
+    new = [(base, window(scheme, base.signature)) for base in bases if base._refined is None]
+    found, mesh = refined_together(scheme, dict.fromkeys(near or base.signature for base, near in new), mesh)
+    for base, near in new:
+        refined = found.get(near or base.signature)
+        if refined is not None:
+            base._refined = refined if near is None else RefinedFace(scheme, base.signature, refined)
     return mesh
 
 

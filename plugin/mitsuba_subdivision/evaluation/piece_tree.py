@@ -138,12 +138,12 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
     block_count = 0
     # Nodes come in another order than tips.
     is_tip = np.flatnonzero(kinds == PartKind.TIP)
-    for node, tip in zip(is_tip[np.argsort(first[is_tip])].tolist(), element.tips, strict=True):
-        pieces, own, frames[node], levels[node] = _tip_pieces(scheme, tip, piece_levels)
+    for node, tip in zip(is_tip[np.argsort(first[is_tip])].tolist(), _tips(element, piece_levels), strict=True):
+        frames[node], levels[node] = tip.frame, tip.level_count
         first[node], first_block[node] = piece_count, block_count
-        maps.append(PieceMap(piece_count, None, pieces))
-        blocks.append(own)
-        piece_count, block_count = piece_count + len(pieces), block_count + len(own)
+        maps.append(PieceMap(piece_count, None, tip.pieces))
+        blocks.append(tip.blocks)
+        piece_count, block_count = piece_count + len(tip.pieces), block_count + len(tip.blocks)
     return PieceTree(
         kinds,
         turns,
@@ -157,9 +157,57 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
     )
 
 
-def _tip_pieces(scheme: Scheme, tip: Piece, piece_levels: int) -> tuple[FloatArray, FloatArray, FrameKind, int]:
-    """Pieces and blocks of a tip, its frame, and at which level it ends."""
-    patch, coordinates = tip.irregular_patch, tip.coordinates
+class _Tip(NamedTuple):
+    """What makes the polynomials of a tip.
+
+    Attributes
+    ----------
+    rows : (n, m, K) float64
+        Over control points: those of its pieces, then blocks.
+    second_eigenvector : (l, m) float64
+        What stands in the first blocks in place of weights of the first control point.
+    piece_count : int
+        Number of pieces.
+    frame : FrameKind
+    level_count : int
+        At which level it ends.
+    """
+
+    rows: FloatArray
+    second_eigenvector: FloatArray
+    piece_count: int
+    frame: FrameKind
+    level_count: int
+
+    @property
+    def pieces(self) -> FloatArray:
+        """As `PieceMap` has them; copied, as blocks are far larger."""
+        return self.rows[: self.piece_count].copy()
+
+    @property
+    def blocks(self) -> FloatArray:
+        """As `PieceTree` has them."""
+        found = self.rows[self.piece_count :].swapaxes(1, 2).copy()
+        found[: len(self.second_eigenvector), 0] = self.second_eigenvector
+        return found
+
+
+def _tips(element: DividedElement, piece_levels: int) -> list[_Tip]:
+    """All tips of an element, over its control points."""
+    if element.piece is not None:
+        return [] if element.piece.patch is None else [_tip(element.scheme, element.piece, piece_levels)]
+    return [
+        tip._replace(rows=element.over_controls(tip.rows, number))
+        for number, child in enumerate(element.child_elements)
+        for tip in _tips(child, piece_levels)
+    ]
+
+
+# Around vertices of high valence, tips take some megabytes, and many elements have the same.
+@lru_cache(maxsize=16)
+def _tip(scheme: Scheme, piece: Piece, piece_levels: int) -> _Tip:
+    """The tip that a piece is, over the control points of its element."""
+    patch, coordinates = piece.irregular_patch, piece.coordinates
     basis, polynomials = patch.basis, polynomial_basis(scheme)
     # The regular children's polynomials over the eigen-coordinates.
     rows: FloatArray = polynomials.matrix @ patch.eigen_children
@@ -180,11 +228,8 @@ def _tip_pieces(scheme: Scheme, tip: Piece, piece_levels: int) -> tuple[FloatArr
     if patch.contracts_unevenly:
         blocks.append(_by_level(rows, patch, float(basis.moduli[2]), levels))
         frame, second_eigenvector = FrameKind.UNEVEN, rows[:, :, 1]
-    found = (np.concatenate(blocks) @ coordinates).swapaxes(1, 2)
-    # In place of weights of the first control point.
-    level_blocks = found[: len(levels) * len(rows)]
-    level_blocks[:, 0] = np.tile(second_eigenvector, (len(levels), 1))
-    return by_level[:piece_count] @ coordinates, found, frame, level_count
+    found = np.concatenate([by_level[:piece_count], *blocks]) @ coordinates
+    return _Tip(found, np.tile(second_eigenvector, (len(levels), 1)), piece_count, frame, level_count)
 
 
 def _by_level(rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:

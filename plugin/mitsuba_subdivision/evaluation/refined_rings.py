@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,29 @@ FEWEST_TOGETHER = 3
 # One-rings with more control points are refined alone: together, the stencils of all refined vertices are made and
 # kept.
 MOST_CONTROLS_TOGETHER = 64
+
+
+class RefinedRing(NamedTuple):
+    """One of some refined one-rings."""
+
+    rings: RefinedRings
+    ring: int
+
+    def signature(self, number: int) -> Signature:
+        """Signature of a child."""
+        return self.rings.signature(self.ring, number)
+
+    def stencils(self, number: int) -> FloatArray:
+        """Control points of a child over those of the element, ``(K_child, K)``."""
+        return self.rings.stencils(self.ring, number)
+
+    def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
+        """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element.
+
+        The element must have been refined alone, as those of very many control points are.
+        """
+        found = self.rings.table(number).matrix.T @ rows.reshape(-1, rows.shape[2]).T
+        return found.T.reshape(*rows.shape[:2], -1)
 
 
 class RingPattern:
@@ -206,7 +230,7 @@ def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineM
 
 def refined_together(
     scheme: Scheme, signatures: Iterable[Signature], mesh: RingMesh | None
-) -> tuple[dict[Signature, tuple[RefinedRings, int]], RingMesh | None]:
+) -> tuple[dict[Signature, RefinedRing], RingMesh | None]:
     """One-rings of different signatures, refined together where that saves time.
 
     Parameters
@@ -217,7 +241,7 @@ def refined_together(
     Returns
     -------
     refined : dict
-        For signatures that were refined together, the refined one-rings and the index among these.
+        For signatures that were refined together, the refined one-ring of each.
     mesh : RingMesh or None
         For the next call.
     """
@@ -263,15 +287,14 @@ class RingMesh:
         """Whether there are as many one-rings of each signature."""
         return counts <= self.counts
 
-    def refined(self, signatures: list[Signature]) -> list[tuple[RefinedRings, int]]:
+    def refined(self, signatures: list[Signature]) -> list[RefinedRing]:
         """Refine one-rings together, for which there must be capacity.
 
         Returns
         -------
-        list of (RefinedRings, int)
-            Of each signature its refined one-rings, and which of them it is. In these, refined faces come in the order
-            in which they come when the one-ring is refined alone. The list is empty if the scheme numbers refined faces
-            in an order of its own.
+        list of RefinedRing
+            One for each signature. In these, refined faces come in the order in which they come when the one-ring is
+            refined alone. The list is empty if the scheme numbers refined faces in an order of its own.
         """
         used: Counter[Signature] = Counter()
         numbers = []
@@ -300,7 +323,7 @@ class RingMesh:
             )
             for each, (half_edges, _) in self._rings.items()
         }
-        return [(refined[each], number) for each, number in zip(smooth, numbers, strict=True)]
+        return [RefinedRing(refined[each], number) for each, number in zip(smooth, numbers, strict=True)]
 
     def _stencils(
         self, table: StencilTable, rings: dict[Signature, tuple[IntArray, IndexArray]]

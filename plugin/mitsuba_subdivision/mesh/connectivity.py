@@ -253,6 +253,11 @@ class Topology:
         return {}
 
     @cached_property
+    def large_fan_signatures(self) -> dict[int, Any]:
+        """The `Signature` of such a vertex, as far as `signature_at` has needed it."""
+        return {}
+
+    @cached_property
     def vertex_rules(self) -> NDArray[np.int8]:
         """``(n_v,)`` a `VertexRule` for each vertex."""
         return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules

@@ -43,7 +43,8 @@ class OneRing:
     topology : Topology
         The local mesh, which has a border. Half-edge 0 names the element; the element's own vertices come first.
     faces : tuple of (corner, turns)
-        For each local face, the corner of the element and the counter-clockwise turns about it that lead there.
+        For each local face, the corner of the element and the counter-clockwise turns about it that lead there. In
+        the order of the corners.
     slots : tuple of (local face, steps)
         For each local vertex, a local face and the steps along it from the half-edge where the walk arrived.
     cut_fans : list of [local vertex, local vertex, local vertex]
@@ -97,7 +98,7 @@ class OneRing:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
         if len(half_edges) <= FEW_ELEMENTS:
             # Around vertices of high valence few faces have the same signature.
-            kind: ElementKind = "face" if any(corner for corner, _ in self.faces) else "vertex"
+            kind: ElementKind = "face" if self.faces[-1][0] else "vertex"
             for number, half_edge in enumerate(half_edges.tolist()):
                 columns[:, number] = self.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
         else:

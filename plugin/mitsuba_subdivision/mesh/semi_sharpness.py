@@ -135,7 +135,8 @@ class FanSharpness(NamedTuple):
     @property
     def least_refined(self) -> float:
         """The least sharpness, after one refinement, of anything that is sharp; infinite where nothing is."""
-        refined = [each for sharpness, *ends in self.edges if sharpness for each in ends]
+        # Of very many edges, most are smooth or as sharp as others.
+        refined = [least for sharpness, *ends in set(self.edges) if sharpness for least in ends]
         refined += [each for sharpness, each, _ in self.across if sharpness]
         if self.vertex:
             refined.append(max(self.vertex - 1, 0.0))

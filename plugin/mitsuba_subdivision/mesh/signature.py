@@ -99,6 +99,23 @@ def fan_size(fan: Fan, turns: int) -> int:
     return fan[turns]
 
 
+class TurnedEdges(tuple[tuple[float, float, float], ...]):
+    """`FanSharpness.edges` of a closed fan as one of its faces sees them, which remember the fan.
+
+    Faces of a large fan have signatures of their own. So they find what they share.
+
+    Attributes
+    ----------
+    vertex : Signature
+        Of the vertex of the fan.
+    turn : int
+        Number of turns counter-clockwise from the first face of that signature to this one.
+    """
+
+    vertex: Signature
+    turn: int
+
+
 @dataclass(frozen=True, eq=False)
 class Signature:
     """Shape of a one-ring, as the half-edge that names the element sees it.
@@ -161,13 +178,13 @@ class Signature:
         """The same with everything sharp made sharper by one amount, or less sharp; exact, as sharpness is below 10."""
         if by == 0:
             return self
-        fans = (
-            _fan_with(fan, fan.sharpness.sharpened(by))
-            if isinstance(fan, TaggedFan) and fan.sharpness is not None
-            else fan
-            for fan in self.fans
-        )
-        return Signature(self.kind, tuple(fans))
+        if by not in self._sharpened:
+            self._sharpened[by] = Signature(self.kind, tuple(_sharpened(fan, by) for fan in self.fans))
+        return self._sharpened[by]
+
+    @cached_property
+    def _sharpened(self) -> dict[int, Signature]:
+        return {}
 
     def near(self) -> Signature:
         """The same without faces that are too far away to matter, see `TaggedFan.near`."""
@@ -196,9 +213,16 @@ class Signature:
         if self.kind == "face":
             return Signature("face", self.fans[corner:] + self.fans[:corner])
         fan = self.fans[0]
-        if isinstance(fan, TaggedFan):
-            raise TypeError("a vertex element with tags; expected one without, as only faces have borders and rules")
-        return Signature("vertex", (fan[corner:] + fan[:corner],))
+        if not isinstance(fan, TaggedFan):
+            return Signature("vertex", (fan[corner:] + fan[:corner],))
+        if not fan.is_closed:
+            raise TypeError("a vertex on a border; expected one amid faces, as another has a first and a last face")
+        sharpness = fan.sharpness
+        if sharpness is not None:
+            edges = TurnedEdges(sharpness.edges[corner:] + sharpness.edges[:corner])
+            edges.vertex, edges.turn = self, corner
+            sharpness = sharpness._replace(edges=edges)
+        return Signature("vertex", (fan._replace(ahead=fan.ahead[corner:] + fan.ahead[:corner], sharpness=sharpness),))
 
 
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
@@ -208,7 +232,21 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     semi = topology.semi_sharpness
     if semi is None:
         return smooth
-    return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
+    is_large = [kind == "face" and fan_is_closed(fan) and fan_face_count(fan) >= LARGE_FAN for fan in smooth.fans]
+    if not any(is_large):
+        return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
+    found = list(smooth.fans)
+    for corner, large in enumerate(is_large):
+        if large:
+            found[corner] = _turned_fan(topology, fans[corner][1])
+    small = [corner for corner, large in enumerate(is_large) if not large]
+    if small:
+        rest = Signature(kind, tuple(smooth.fans[corner] for corner in small))
+        around = half_edges_around([fans[corner] for corner in small])
+        sharp = with_sharpness(rest, FanSharpnessRows(topology, around[None], semi), 0)
+        for corner, fan in zip(small, sharp.fans, strict=True):
+            found[corner] = fan
+    return _with_fans(smooth, found)
 
 
 # The half-edges at which the faces of a `TaggedFan` begin: those behind, then those ahead.
@@ -325,12 +363,34 @@ class FanSharpnessRows:
 def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
     """Signature of one of the elements of ``rows``, given its signature without semi-sharp features."""
     fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
-    found = Signature(
-        smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
-    )
+    return _with_fans(smooth, [fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans])
+
+
+def _with_fans(smooth: Signature, fans: list[Fan]) -> Signature:
+    """The signature of some fans, given that without semi-sharp features."""
+    found = Signature(smooth.kind, tuple(fans))
     # Caches the result of `smoothed`.
     vars(found)["_smoothed"] = smooth
     return found
+
+
+def _turned_fan(topology: Topology, ahead: list[int]) -> Fan:
+    """A large closed fan as the face of the first of some half-edges around sees it, made of that of the vertex."""
+    vertex = int(topology.face_vertices[ahead[0]])
+    around, _ = topology.large_fans[vertex]
+    if vertex not in topology.large_fan_signatures:
+        topology.large_fan_signatures[vertex] = signature_at(topology, around[0], "vertex")
+    return topology.large_fan_signatures[vertex].rotated(around.index(ahead[0])).fans[0]
+
+
+def _sharpened(fan: Fan, by: int) -> Fan:
+    """The same fan with everything sharp made sharper."""
+    if not isinstance(fan, TaggedFan) or fan.sharpness is None:
+        return fan
+    edges = fan.sharpness.edges
+    if isinstance(edges, TurnedEdges):
+        return edges.vertex.sharpened(by).rotated(edges.turn).fans[0]
+    return _fan_with(fan, fan.sharpness.sharpened(by))
 
 
 def _across(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:

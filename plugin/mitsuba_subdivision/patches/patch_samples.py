@@ -17,8 +17,10 @@ from .patch_table import PatchTable
 
 # Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
 CHUNK = 32768
-# And of at most this many classes, whose pieces are prepared at once.
+# And of at most this many classes, whose pieces are prepared at once; of fewer in fans of very many faces, where the
+# weights of a part over the one-ring are many.
 CLASSES = 512
+WEIGHTS = 1 << 24
 # Of tips; that leaves a 64th of each to eigen-coordinates.
 PIECE_LEVELS = 3
 
@@ -65,7 +67,7 @@ class PatchSampler:
         piece_levels = PIECE_LEVELS if is_usual else 0
         # Sorted by class, a run of samples has few new classes, and few control points.
         order = np.argsort(class_index.astype(np.min_scalar_type(len(self.patches.classes))), kind="stable")
-        for at in counted(_runs(class_index[order], order), "Evaluated patches"):
+        for at in counted(_runs(class_index[order], order, self.patches.control_counts), "Evaluated patches"):
             of_class = class_index[at]
             pieces, element = self.patches.elements_of(of_class, piece_levels)
             last = self.patches.control_counts[of_class] - 1
@@ -106,9 +108,11 @@ class PatchSampler:
         return self._values.take(self.patches.rings.take(index), axis=0)
 
 
-def _runs(class_index: IntArray, order: IntArray) -> list[IntArray]:
+def _runs(class_index: IntArray, order: IntArray, control_counts: IntArray) -> list[IntArray]:
     """Samples in runs of at most `CHUNK`, of at most `CLASSES` classes; given in the order of these."""
-    number = np.cumsum(class_index[1:] != class_index[:-1]) // CLASSES if len(order) > 1 else np.empty(0, np.int64)
-    cuts = np.flatnonzero(number[1:] != number[:-1]) + 2 if len(number) else number
-    runs = np.split(order, cuts) if len(order) else []
+    weights = np.maximum(control_counts[class_index] ** 2, WEIGHTS // CLASSES)
+    weights[1:][class_index[1:] == class_index[:-1]] = 0
+    # The number of the run in which each sample's class begins.
+    number = (np.cumsum(weights) - 1) // WEIGHTS
+    runs = np.split(order, np.flatnonzero(np.diff(number)) + 1) if len(order) else []
     return [part for run in runs for part in np.split(run, range(CHUNK, len(run), CHUNK))]

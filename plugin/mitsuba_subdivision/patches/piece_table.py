@@ -114,7 +114,7 @@ class PieceTable:
         # All at once, as they share most of their data.
         elements = divided_elements(table.scheme, [each.signature for each in table.classes])
         packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
-        tip_counts = np.array([len(element.tips) for element in elements])
+        tip_counts = np.array([element.tip_count for element in elements])
         bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * int((tip_counts * counts).sum())
         if bytes_of_level:
             piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..cage import ControlCage
+from ..evaluation.divided_element import divided_elements
+from ..evaluation.polynomial_basis import polynomial_basis
 from ..mesh.connectivity import VertexRule
 from ..mesh.signature import NEAR_FACES
+from ..patches import PatchTable
 from ..schemes.scheme import Scheme
 from ..schemes.scheme_members import optional_member
 from ..tessellation.memory import SMALL, available_memory
@@ -18,8 +21,14 @@ PAIR_BYTES = {"face": 65, "vertex": 300}
 # The same in all where every face has an eigenbasis of its own: at the end of a crease, and on borders under schemes
 # without `has_local_borders`. Measured: 3,300 to 4,300; more, as the time grows faster, to minutes from 500 faces on.
 OWN_BASES_BYTES = 6000
-# The same in all where edges or the vertex are semi-sharp, so that every face has stencils of its own.
-OWN_STENCIL_BYTES = 1500
+# The same in all where edges or the vertex are semi-sharp, so that every face has stencils of its own. Measured: 250 to
+# 470. Much more where the faces do not share the fan's refinement, as by Chaikin's method.
+OWN_STENCIL_BYTES = 350
+UNSHARED_STENCIL_BYTES = 1200
+# Pieces and blocks of a tip, in regular pieces: three at each level down to single precision around vertices of high
+# valence. And how many copies of the polynomials of all pieces there are while a kernel is made. Measured.
+PIECES_OF_TIP = 3 * 37
+PIECE_COPIES = 2.7
 # Eigenbases that need more take minutes.
 MOST_BYTES = 8 << 30
 
@@ -46,7 +55,9 @@ def require_moderate_valences(cage: ControlCage, scheme: Scheme) -> None:
         if optional_member(scheme, "has_local_borders"):
             is_near = is_border & (t.vertex_rules != VertexRule.DART) & ~is_semi_sharp
             face_count[is_near] = np.minimum(face_count[is_near], NEAR_FACES)
-        own_bytes = OWN_BASES_BYTES * is_border + OWN_STENCIL_BYTES * is_semi_sharp
+        is_shared = optional_member(scheme, "crease_method") != "chaikin"
+        stencil_bytes = OWN_STENCIL_BYTES if is_shared else UNSHARED_STENCIL_BYTES
+        own_bytes = OWN_BASES_BYTES * is_border + stencil_bytes * is_semi_sharp
     at_vertices = (pair + own_bytes) * (width * face_count) ** 2
     # The centre of a polygon becomes a vertex.
     at_faces = pair * (width * t.face_sizes.astype(np.float64)) ** 2
@@ -73,4 +84,40 @@ def require_moderate_valences(cage: ControlCage, scheme: Scheme) -> None:
     raise MemoryError(
         f"{what}; the limit surface around it needs about {needed / 1e9:.3g} GB, and at most {available / 1e9:.3g} GB "
         f"are used; {advice}"
+    )
+
+
+def require_memory_for_pieces(cage: ControlCage, patches: PatchTable) -> None:
+    """Check that the polynomials of all pieces fit into memory; those of each class are over all of its one-ring.
+
+    Parameters
+    ----------
+    cage : ControlCage
+    patches : PatchTable
+        Of this cage.
+
+    Raises
+    ------
+    MemoryError
+        If not; names the vertex in whose fan most of the memory is needed.
+    """
+    refined = patches.refined
+    table = patches if refined is None else refined.table
+    elements = divided_elements(table.scheme, [each.signature for each in table.classes])
+    counts = np.array([each.regular_count + PIECES_OF_TIP * each.tip_count for each in elements])
+    weights = counts * table.control_counts * len(polynomial_basis(table.scheme).powers)
+    needed = PIECE_COPIES * weights.sum() * np.float64().itemsize
+    available = MOST_BYTES if needed <= SMALL else min(MOST_BYTES, available_memory() or MOST_BYTES)
+    if needed <= available:
+        return
+    largest = table.classes[int(weights.argmax())]
+    corner = largest.corners[:1] if refined is None else refined.corners(largest)[:1]
+    t, half_edge = patches.topology, int(patches.half_edges(corner)[0])
+    around = t.face_vertices[t.face_offsets[t.face[half_edge]] : t.face_offsets[t.face[half_edge] + 1]]
+    vertex = int(around[t.vertex_face_count[around].argmax()])
+    where = cage.source.at_vertex(int(cage.cut_mesh.vertex[vertex]))
+    raise MemoryError(
+        f"{where} has {t.vertex_face_count[vertex]} faces, and pieces of {len(elements)} classes of faces need about "
+        f"{needed / 1e9:.3g} GB in a kernel, of which at most {available / 1e9:.3g} GB are used; divide it into "
+        "several vertices, or do without exact shading"
     )

@@ -21,7 +21,7 @@ from ..schemes import Scheme
 from ..schemes.domain import FloatArray
 from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives
-from .high_valence import require_moderate_valences
+from .high_valence import require_memory_for_pieces, require_moderate_valences
 from .samples import SurfaceSamples
 
 if TYPE_CHECKING:
@@ -447,8 +447,11 @@ class LimitSurface:
         ------
         SchemeError
             As `bounds`.
+        MemoryError
+            If the pieces of so many classes of patches do not fit into memory.
         """
         if evaluator not in self._pieces:
+            require_memory_for_pieces(self.cage, self.patches)
             levels = {"piece_levels": 0} if evaluator == "stam" else {}
             control_of_vertex, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
             self._pieces[evaluator] = patches.PieceTable.build(self.patches, control_of_vertex, count, **levels)
