@@ -139,8 +139,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         (
             (
                 "evaluation/divided_element.py",
-                "self._refined = refined_ring(self.scheme, self.signature), 0",
-                "self._refined = refined_ring(self.scheme, self.signature), -1",
+                "alone = RefinedRing(refined_ring(self.scheme, near or self.signature), 0)",
+                "alone = RefinedRing(refined_ring(self.scheme, near or self.signature), -1)",
             ),
             ("files/joined_meshes.py", "return values[0]", "return values[ 1]"),
             (
