@@ -241,6 +241,23 @@ def test_parts_said_to_curve_one_way_do(np_rng):
     assert np.count_nonzero(found) > 0.3 * np.count_nonzero(curves_one_way)
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e-19, 1e-21, 1e-30, 1e-40, 0])
+def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound(scale):
+    """At a curve in place of a surface, however much of the other tangent rounding leaves; in single precision."""
+    basis = BernsteinBasis(SQUARE, 3)
+    u, _ = (basis.indices / 3).T
+    curve = np.stack([u, 0 * u, u**3], axis=1)[..., None]
+    by_u, by_v = basis.derivatives
+    matrices = [by_u, by_v, by_u @ by_u, by_u @ by_v, by_v @ by_v]
+    found = [np.einsum("ab,bxt->axt", each, curve).astype(np.float32) for each in matrices]
+    found[1][:] = np.float32(scale) * np.array([0, 0, 1])[:, None]
+    tangents = TangentCone.of(found[0]), TangentCone.of(found[1])
+    form = Criterion(Measure.CHORD, 1e-3).form(found, tangents, NormalCone.of(*tangents), 4)
+    whole = np.sqrt(np.square(found[2]).sum(axis=1).max(axis=0))
+    assert (form[0] <= np.float32(1 + 1e-6) * whole / 8).all()
+    assert (form[0] > 0).all()
+
+
 @pytest.mark.parametrize("direction", [None, np.array([0.6, 0.0, -0.8])], ids=["perspective", "orthographic"])
 def test_an_outline_in_view_is_noticed(direction, np_rng):
     """Where one point and normal of a part face the sensor and others face away; and hardly where none do."""

@@ -193,9 +193,10 @@ class Criterion:
         # Distance from the surface: along its normals, and a little more where the difference has a tangential part, as
         # the surface has curved away there; at most the whole difference.
         longest = [dot(d, d).max(axis=0) for d in second]
-        slip = 1 + _slip(tangents, np.max(longest, axis=0))
-        # Where the surface degenerates to a curve, neither the normal part nor the tangential excess is known.
-        with np.errstate(invalid="ignore"):
+        # Where the surface degenerates to a curve, neither the normal part nor the tangential excess is known; rounding
+        # may leave a tangent that nearly vanishes, and an excess beyond single precision.
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            slip = 1 + _slip(tangents, np.max(longest, axis=0))
             sizes = [
                 np.fmin(slip * cone.along(d, most), np.sqrt(most)) for d, most in zip(second, longest, strict=True)
             ]
@@ -248,5 +249,4 @@ def _slip(tangents: tuple[TangentCone, TangentCone], longest: FloatArray) -> Flo
         Largest squared second derivative.
     """
     shortest = np.minimum(tangents[0].shortest, tangents[1].shortest)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)
+    return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)
