@@ -6,9 +6,10 @@ The stage that the page of speed has is the Open Chess Set of https://github.com
 there by itself. PYTHON is one that has Blender as a module, `pip install bpy==5.0.1`; without it Cycles is left out.
 Both sides have the same camera with its depth of field, all processors, paths as long, the stage's lights, the picture
 of its first dome and no denoiser, and subdivide the same meshes: those of Catmull-Clark. Cycles has triangles of a
-pixel, and a sky in place of the studio or of a dome without a picture; materials that it cannot read are plain. All run
-in processes of their own that take turns. What they import at first is a stage of its own; what reads USD is imported
-then by Blender, and as it reads here. Compiled kernels are in Dr.Jit's cache. Times are the best of the repeats.
+pixel, and a sky in place of the studio or of a dome without a picture; materials that it cannot read are plain. With
+``--grey`` both sides render the stage without its materials. All run in processes of their own that take turns. What
+they import at first is a stage of its own; what reads USD is imported then by Blender, and as it reads here. Compiled
+kernels are in Dr.Jit's cache. Times are the best of the repeats.
 """
 
 from __future__ import annotations
@@ -39,6 +40,13 @@ def main(arguments=None):
     if options.process:
         print(json.dumps(_own(options)))
         return
+    with tempfile.TemporaryDirectory() as folder:
+        if options.grey:
+            options.stage = _without_materials(options.stage.resolve(), Path(folder) / "grey.usda")
+        _compare(options)
+
+
+def _compare(options):
     sides = {shading: [sys.executable, __file__, "--process", shading] for shading in SHADINGS}
     if reason := _no_cycles(options.cycles):
         print(f"Cycles: left out, {reason}")
@@ -54,8 +62,30 @@ def _parsed(arguments):
     parser.add_argument("--size", nargs=2, type=int, default=(640, 480))
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--grey", action="store_true", help="leave out the materials, on both sides")
     parser.add_argument("--process", choices=SHADINGS, help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
+
+
+def _without_materials(path, copy):
+    """A stage that has all of another one but its materials, except in prototypes."""
+    from pxr import Sdf, Usd, UsdShade, UsdUtils
+
+    # It takes what USD says of MaterialX documents, which it cannot open.
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    layer, given = Sdf.Layer.CreateNew(str(copy)), Sdf.Layer.FindOrOpen(str(path))
+    # Metadata of a stage are those of its root layer.
+    for key in given.pseudoRoot.ListInfoKeys():
+        layer.pseudoRoot.SetInfo(key, given.pseudoRoot.GetInfo(key))
+    layer.subLayerPaths[:] = [str(path)]
+    stage = Usd.Stage.Open(layer)
+    for prim in stage.Traverse():
+        UsdShade.MaterialBindingAPI(prim).UnbindAllBindings()
+    for prim in [each for each in stage.Traverse() if each.IsA(UsdShade.Material)]:
+        prim.SetActive(False)
+    layer.Save()
+    del delegate
+    return copy
 
 
 def _no_cycles(python):
