@@ -93,8 +93,8 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray
         found &= ~folded | (_normal_sines(rates, groups, axis, folded) < 1)
     if rates.criterion.outline is not None:
         # A border may be a silhouette for any normals.
-        cone = NormalCone(axis, _normal_sines(rates, groups, axis, np.logical_not(tiles.sides.any(axis=1))))
-        higher = np.where(~found & (cone.sine < 1), rates.limit(tiles, lower, upper, cone), -1.0)
+        cone = NormalCone(axis, _normal_sines(rates, groups, axis, ~(found | tiles.sides.any(axis=1))))
+        higher = np.where(cone.sine < 1, rates.limit(tiles, lower, upper, cone), -1.0)
         found |= fit_within(rates.scheme, higher, parts)
     may_curve = found & ~fits & tiles.sides.any(axis=1)
     if may_curve.any():
