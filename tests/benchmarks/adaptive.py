@@ -1,13 +1,14 @@
 """Adaptive tessellations of models, against uniform ones in the same process.
 
-python tests/benchmarks/adaptive.py MODEL.. [--schemes catmull_clark loop] [--errors 1 1e-3 1e-4] [--rate 1]
+python tests/benchmarks/adaptive.py MODEL.. [--schemes catmull_clark loop] [--errors 1 1e-3 outlines] [--rate 1]
 
 For each model, scheme and error, in a process of its own: triangles, seconds of processor time, the least of three, and
 the most memory that the process has taken beyond what it took before, once for a uniform tessellation and once for an
 adaptive one whose triangles are no further from the surface than the error, in parts of the model's size. Both are
 counted from prepared patches to points, normals and triangles; what uniform and adaptive have in common, as the classes
-of patches, is made before. An error of 1 asks for the fewest triangles that the cage allows. A stage of USD is
-tessellated mesh by mesh, and its rows are sums.
+of patches, is made before. An error of 1 asks for the fewest triangles that the cage allows; "outlines" is what
+pictures with exact shading ask for: outlines within a tenth of a pixel, where the model is 640 pixels large. A stage of
+USD is tessellated mesh by mesh, and its rows are sums.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
+OUTLINES = "outlines"
 HEADER = "model, scheme, error         faces   uniform             s    MB   adaptive            s    MB   us/triangle"
 
 
@@ -43,10 +45,14 @@ def _parsed(arguments):
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("models", nargs="*", type=Path, metavar="MODEL", help="OBJ, PLY or USD files")
     parser.add_argument("--schemes", nargs="+", default=["catmull_clark"])
-    parser.add_argument("--errors", nargs="+", type=float, default=[1.0, 1e-3, 1e-4])
+    parser.add_argument("--errors", nargs="+", type=_error, default=[1.0, 1e-3, 1e-4, OUTLINES])
     parser.add_argument("--rate", type=int, default=1, help="of the uniform tessellation (default: 1)")
     parser.add_argument("--process", help=argparse.SUPPRESS)
     return parser.parse_args(arguments)
+
+
+def _error(word):
+    return word if word == OUTLINES else float(word)
 
 
 def _row(model, scheme, error, rate):
@@ -58,33 +64,45 @@ def _row(model, scheme, error, rate):
             [sys.executable, __file__, "--process", words], capture_output=True, text=True, check=False
         )
         if done.returncode:
-            return f"{model.name}, {scheme}, {error:g}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
+            return f"{model.name}, {scheme}, {_shown(error)}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
         found.append(json.loads(done.stdout))
     uniform, adaptive = found
     sides = "".join(f"{each['triangles']:10,} {each['seconds']:12.2f} {each['memory']:5.0f}   " for each in found)
-    name = f"{model.name}, {scheme}, {error:g}"
+    name = f"{model.name}, {scheme}, {_shown(error)}"
     beyond = adaptive["seconds"] - 2 * uniform["seconds"] if rate == 1 else adaptive["seconds"]
     return f"{name:27} {adaptive['faces']:6,} {sides}{1e6 * max(0, beyond) / adaptive['triangles']:8.2f}"
 
 
+def _shown(error):
+    return error if error == OUTLINES else f"{error:g}"
+
+
+def _criterion(cage, error):
+    """The criterion of an error."""
+    from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
+
+    size = np.linalg.norm(np.ptp(cage.positions, axis=0))
+    if error != OUTLINES:
+        return Criterion(Measure.CHORD, error * size)
+    distance, pixels = 2.0, 640
+    eye = cage.positions.mean(axis=0) + distance * size * np.array([0.6, 0.48, 0.64])
+    sensor = Sensor(eye, 1 / (distance * pixels))
+    return Criterion(Measure.CHORD, 0.1, sensor, sensor)
+
+
 def _measured(model, scheme, error, rate, kind):
     from mitsuba_subdivision import LimitSurface
-    from mitsuba_subdivision.tessellation import Criterion, Measure
 
     faces = triangles = 0
     seconds, memory = 0.0, 0
     for cage in _cages(Path(model)):
         surface = LimitSurface(cage, scheme)
-        size = np.linalg.norm(np.ptp(cage.positions, axis=0))
         # Classes are found once for all tessellations.
         assert surface.patches.classes
         taken, before = [], _peak()
         for _ in range(3):
             start = time.process_time()
-            if kind == "uniform":
-                table = surface.sampling(rate)
-            else:
-                table = surface.adaptive_sampling(Criterion(Measure.CHORD, error * size))
+            table = surface.sampling(rate) if kind == "uniform" else surface.adaptive_sampling(_criterion(cage, error))
             table.apply(cage.positions)
             count = len(table.triangles)
             taken.append(time.process_time() - start)
