@@ -86,31 +86,38 @@ def test_controls_of_every_patch_are_its_one_ring(surface):
         np.testing.assert_array_equal(table.controls[at], vertex[patch_class.controls])
 
 
-def test_patches_have_the_trees_of_their_classes_and_packets_of_their_own(surface):
+def test_patches_have_the_trees_of_their_classes_and_pieces_of_their_own(surface):
     table, patch, end, row = surface.pieces(), 0, 0, 0
     packets = -(-3 * len(polynomial_basis(surface.scheme).powers) // 4)
+    ring_end = packets * int(table.classes[:, 1] @ table.classes[:, 4])
     for columns, patch_class in zip(table.classes.tolist(), surface.patches.classes, strict=True):
-        _, count, control_count, first_packet, size, ring = columns
+        _, count, control_count, first_piece, size, first_ring, ring = columns
         tree = piece_tree(surface.scheme, patch_class.signature)
         assert ring == (control_count if len(tree.blocks) else 0)
-        assert (first_packet, size) == (end, ring + tree.piece_count * packets)
+        assert (first_piece, size) == (end, tree.piece_count)
         start, begins = table.patch_starts[patch : patch + count].T.astype(int)
         np.testing.assert_array_equal(start, end + size * np.arange(count))
+        if ring:
+            assert first_ring == ring_end
+            np.testing.assert_array_equal(table.rings[patch : patch + count], ring_end + ring * np.arange(count))
         assert (begins == begins[0]).all()
         nodes = table.nodes[begins[0] :][: len(tree.kinds)].astype(int)
         np.testing.assert_array_equal(nodes[:, 0] & KINDS, tree.kinds)
         np.testing.assert_array_equal(nodes[:, 0] // TURN, tree.turns)
         is_leaf = tree.kinds >= PartKind.REGULAR
         np.testing.assert_array_equal(nodes[~is_leaf, 1], begins[0] + tree.first[~is_leaf])
-        np.testing.assert_array_equal(nodes[is_leaf, 1], ring + packets * tree.first[is_leaf])
+        np.testing.assert_array_equal(nodes[is_leaf, 1], tree.first[is_leaf])
         np.testing.assert_array_equal(nodes[:, 2], row + tree.first_block * control_count)
         np.testing.assert_array_equal(nodes[:, 3] & FRAMES, tree.frames)
         np.testing.assert_array_equal(nodes[:, 3] // LEVEL & LEVELS, tree.levels)
         assert (nodes[:, 3] // CONTROL == control_count).all()
         rows = len(tree.blocks) * control_count
         np.testing.assert_array_equal(table.weights[row : row + rows], tree.blocks.reshape(-1, table.weights.shape[1]))
-        patch, end, row = patch + count, end + count * size, row + rows
-    assert (patch, end, row) == (len(table.patch_starts), table.packet_count, len(table.weights))
+        patch, end, ring_end, row = patch + count, end + count * size, ring_end + count * ring, row + rows
+    assert (patch, row) == (len(table.patch_starts), len(table.weights))
+    # Whole pieces.
+    assert table.packet_count % packets == 0
+    assert 0 <= table.packet_count - ring_end < packets
 
 
 def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory(monkeypatch):

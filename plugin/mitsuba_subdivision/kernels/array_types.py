@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..mesh.shared import Content, Shared, SharedArray
 from .alignment import aligned
-from .types import FloatBuffer, Index, IndexBuffer, Mask, Vector3
+from .types import Float, FloatBuffer, Index, IndexBuffer, Mask, Vector3
 
 # For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
@@ -69,6 +69,11 @@ class ArrayTypes:
         return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array2u, arrays.Array4u)
 
     @property
+    def _many(self) -> type:
+        """Arrays of any number of floats."""
+        return getattr(sys.modules[self.float.__module__], "ArrayXf64" if self.is_double else "ArrayXf")
+
+    @property
     def matrix4(self) -> type:
         """Matrices of four rows and columns."""
         name = "Matrix4f64" if self.is_double else "Matrix4f"
@@ -112,6 +117,15 @@ class ArrayTypes:
             return kind(buffer[index])
         size = dr.size_v(kind)
         return kind(buffer[size * index : size * (index + 1)])
+
+    def row(self, buffer: FloatBuffer, size: int, index: Index, active: Mask = True) -> list[Float]:
+        """Gather a row of as many numbers from an array of such rows; more than one.
+
+        In one operation, which reads them in the largest packets that the backend has.
+        """
+        if self.is_jit:
+            return [*dr.gather(self._many, buffer, index, active, shape=(size, dr.width(index)))]
+        return buffer[size * index : size * (index + 1)].tolist() if active else [0.0] * size
 
     def padded(self, flat: FloatBuffer) -> FloatBuffer:
         """Pad flat 3-vectors to four components, for packet loads."""

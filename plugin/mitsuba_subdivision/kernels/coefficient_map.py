@@ -56,28 +56,28 @@ class CoefficientMap:
         table = self._table
         if table.refinement is not None:
             points = table.refinement @ points
-        found = np.zeros((table.packet_count, PACKET))
-        for maps, (first, count, control_count, packet, size, ring) in zip(
+        found, of_piece = np.zeros((table.packet_count, PACKET)), table.packets_of_piece
+        for maps, (first, count, control_count, first_piece, piece_count, first_ring, ring) in zip(
             table.maps, table.classes.astype(np.int64), strict=True
         ):
             controls = points[table.controls[first : first + count * control_count].reshape(control_count, count)]
-            own = found[packet : packet + count * size].reshape(count, size, PACKET)
             # Sums are relative to the first control point, to lose fewer digits.
             relative = controls - controls[0]
             if ring:
-                own[:, :ring, :3] = relative.swapaxes(0, 1)
+                own = found[first_ring:][: count * ring].reshape(count, ring, PACKET)
+                own[..., :3] = relative.swapaxes(0, 1)
                 own[:, 0, :3] = controls[0]
             relative = relative.reshape(control_count, -1)
-            for first_piece, stencils, pieces in maps:
-                piece_count, monomial_count, _ = pieces.shape
+            own = found[of_piece * first_piece :][: of_piece * count * piece_count]
+            own = own.reshape(count, piece_count, PACKET * of_piece)
+            for begin, stencils, pieces in maps:
+                own_count, monomial_count, _ = pieces.shape
                 parts = relative if stencils is None else stencils @ relative
-                made = pieces.reshape(piece_count * monomial_count, -1) @ parts
-                coefficients = made.reshape(piece_count, monomial_count, count, 3).transpose(2, 0, 1, 3)
-                packets = piece_packets(monomial_count)
-                rows = own[:, ring + first_piece * packets :][:, : piece_count * packets]
-                rows = rows.reshape(count, piece_count, PACKET * packets)
-                rows[:, :, : 3 * monomial_count] = coefficients.reshape(count, piece_count, -1)
-                rows[:, :, :3] += controls[0][:, None]
+                made = pieces.reshape(own_count * monomial_count, -1) @ parts
+                coefficients = made.reshape(own_count, monomial_count, count, 3).transpose(2, 0, 1, 3)
+                rows = own[:, begin : begin + own_count]
+                rows[..., : 3 * monomial_count] = coefficients.reshape(count, own_count, -1)
+                rows[..., :3] += controls[0][:, None]
         return found.ravel()
 
     def apply(self, points: FloatBuffer) -> FloatBuffer:
@@ -150,32 +150,32 @@ class _Steps:
         self.refinement = None if refinement is None else WeightedValues.shared(refinement, types.float)
         controls = table.controls
         monomial_count = next((maps[0].pieces.shape[1] for maps in table.maps if maps), 1)
-        of_piece = piece_packets(monomial_count)
+        of_piece = table.packets_of_piece
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
         self.point_count = self.refined_count
         # Control points of parts follow all others.
-        for maps, (first, count, control_count, packet, size, ring) in zip(
+        for maps, (first, count, control_count, first_piece, piece_count, _, _) in zip(
             table.maps, table.classes.tolist(), strict=True
         ):
-            for first_piece, stencils, weights in maps:
+            for begin, stencils, weights in maps:
                 own_first, own_count, is_part = first, control_count, stencils is not None
                 if stencils is not None:
                     own_first, own_count = self.point_count, len(stencils)
                     parts.add(stencils[:, None], first, count, control_count, self.point_count, count, 1)
                     self.point_count += count * own_count
-                to = packet + ring + first_piece * of_piece
-                pieces.add(weights, own_first, count, own_count, to, of_piece, size, is_part=is_part)
+                to, step = of_piece * (first_piece + begin), of_piece * piece_count
+                pieces.add(weights, own_first, count, own_count, to, of_piece, step, is_part=is_part)
         # Not aligned, and so not copied, because kernels only gather from it.
         listed = types.index(controls)
         self.parts, self.pieces = (each.rows(types, listed) if each.added else None for each in (parts, pieces))
         self.rings = None
-        if table.classes[:, 5].any():
+        if table.classes[:, 6].any():
             rings = []
-            for first, n, k, packet, size, ring in table.classes.tolist():
+            for first, n, k, _, _, first_ring, ring in table.classes.tolist():
                 if ring:
                     own = controls[first : first + n * k].reshape(k, n).T
                     origin = np.where(np.arange(k) == 0, NOTHING, own[:, :1])
-                    rings.append(np.stack([own, origin, packet + size * np.arange(n)[:, None] + np.arange(k)]))
+                    rings.append(np.stack([own, origin, first_ring + np.arange(n * k).reshape(n, k)]))
             self.rings = tuple(types.indices(*(each[i].ravel() for each in rings)) for i in range(3))
 
 
@@ -262,7 +262,7 @@ class _Rows:
         self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: IndexBuffer
     ) -> None:
         self._types, self._width, self._controls = types, width, controls
-        self._row_packets = weights.shape[1] // PACKET
+        self._row_size = weights.shape[1]
         lane_count = columns[:, 0]
         self._count = int(lane_count.sum())
         # Lanes of a block are consecutive, so that they read the same weights.
@@ -294,8 +294,8 @@ class _Rows:
         """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
         types = self._types
         control, control_count, row, packet = self._lanes()
-        packets = [types.fetch(types.vector4, gradient, packet + i) for i in range(piece_packets(self._width))]
-        numbers = [number for each in packets for number in each]
+        of_lane = piece_packets(self._width)
+        numbers = types.row(gradient, PACKET * of_lane, packet // of_lane)
         vectors = [types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self._width)]
 
         def add(k):
@@ -326,9 +326,7 @@ class _Rows:
 
     def _row(self, row: Index) -> list:
         """A row of weights, one for each vector."""
-        types, count = self._types, self._row_packets
-        packets = (types.fetch(types.vector4, self._weights, row * count + i) for i in range(count))
-        return [weight for packet in packets for weight in packet][: self._width]
+        return self._types.row(self._weights, self._row_size, row)[: self._width]
 
 
 class _Coefficients(dr.CustomOp):

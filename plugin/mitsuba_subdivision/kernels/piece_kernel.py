@@ -30,7 +30,6 @@ from ..patches.piece_table import (
     PATCH_CORNER,
     TURN,
     WHOLE,
-    piece_packets,
 )
 from .array_types import ArrayTypes
 from .domain_map import distances, in_child, turn_matrix, turned
@@ -311,7 +310,7 @@ class PieceKernel:
         self.first_term = FirstTerm(basis.matrix.T.tolist(), self.monomials) if use_stam else None
         self.walk = ElementWalk(table, types)
         self._count = len(basis.powers)
-        self._packets, self._row_packets = piece_packets(self._count), -(-self._count // PACKET)
+        self._numbers, self._row_size = PACKET * table.packets_of_piece, -(-self._count // PACKET) * PACKET
         self._piece_levels = table.piece_levels
         self._patch_starts, self._nodes = types.indices(table.patch_starts), types.indices(table.nodes)
         kinds = table.nodes[:, 0] & KINDS
@@ -319,8 +318,9 @@ class PieceKernel:
         self._has_tips = bool((kinds == _TIP).any())
         self._has_frames = bool((table.nodes[:, 3] & FRAMES).any())
         if self._has_tips:
-            padding = self._row_packets * PACKET - self._count
+            padding = self._row_size - self._count
             self._weights = types.floats(np.pad(table.weights, ((0, 0), (0, padding))))
+            self._rings = types.indices(table.rings)
         self._is_split = table.refinement is not None
 
     @classmethod
@@ -365,25 +365,26 @@ class PieceKernel:
         if self._is_split:
             code, u, v, scale, quarter = self._split(half_edge, row, u, v, active)
         turn = code // PATCH_CORNER & CORNERS
-        start, node = types.fetch(types.index2, self._patch_starts, code // PATCH, active)
+        patch = code // PATCH
+        first_piece, node = types.fetch(types.index2, self._patch_starts, patch, active)
         if self._is_divided:
             node, turn, u, v, scale = self._leaf(node, turn, u, v, scale, active)
         kind, first, block_row, ends = types.fetch(types.index4, self._nodes, node, active)
         turn = (turn + kind // TURN) % domain.corner_count
         u, v = turned(domain, u, v, turn)
-        packet, is_piece, tip = start + first, active, None
+        number, is_piece, tip = first_piece + first, active, None
         if self._has_tips:
             is_tip = (kind & KINDS) == _TIP
             level, block, u, v, scale = self._at_level(is_tip, ends // LEVEL & LEVELS, u, v, scale)
-            packet += block * self._packets
+            number += block
             is_deep = active & is_tip & (level >= self._piece_levels)
             is_piece = active & (is_deep == False)  # noqa: E712 - an array
-            tip = self._tip(start, block_row, ends, level, block, is_deep)
+            tip = self._tip(patch, block_row, ends, level, block, is_deep)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(
             self,
             buffer,
-            self._coefficients(buffer, packet, is_piece, size),
+            self._coefficients(buffer, number, is_piece, size),
             u - self.centre[0],
             v - self.centre[1],
             (a * scale, b * scale, c * scale, d * scale),
@@ -398,15 +399,11 @@ class PieceKernel:
 
     def weights(self, row: Index, active: Mask = True) -> list:
         """A row of the blocks, one number for each monomial."""
-        types, count = self.types, self._row_packets
-        packets = (types.fetch(types.vector4, self._weights, row * count + i, active) for i in range(count))
-        return [weight for packet in packets for weight in packet][: self._count]
+        return self.types.row(self._weights, self._row_size, row, active)[: self._count]
 
-    def _coefficients(self, buffer: FloatBuffer, packet: Index, active: Mask, size: int) -> list[list[Float]]:
-        """Coefficients of a piece, by its first packet, of each coordinate."""
-        types = self.types
-        packets = (types.fetch(types.vector4, buffer, packet + i, active) for i in range(self._packets))
-        numbers = [number for each in packets for number in each]
+    def _coefficients(self, buffer: FloatBuffer, piece: Index, active: Mask, size: int) -> list[list[Float]]:
+        """Coefficients of a piece, by its number, of each coordinate."""
+        numbers = self.types.row(buffer, self._numbers, piece, active)
         return [numbers[i : 3 * self._count : 3] for i in range(size)]
 
     def _split(
@@ -499,13 +496,14 @@ class PieceKernel:
             dr.select(is_child, scale * inner_scale, scale),
         )
 
-    def _tip(self, start: Index, block_row: Index, ends: Index, level: Index, block: Index, is_deep: Mask) -> Tip:
+    def _tip(self, patch: Index, block_row: Index, ends: Index, level: Index, block: Index, is_deep: Mask) -> Tip:
         """What is summed at deeper levels; ``ends`` is the last column of `PieceTable.nodes`."""
         types = self.types
         frame, level_count, control_count = ends & FRAMES, ends // LEVEL & LEVELS, ends // CONTROL
         deeper = block - LEVEL_PIECES * self._piece_levels
+        ring = types.fetch(types.index, self._rings, patch, is_deep)
         own = Tip(
-            dr.select(is_deep, control_count, types.index(0)), start, dr.fma(deeper, control_count, block_row), None
+            dr.select(is_deep, control_count, types.index(0)), ring, dr.fma(deeper, control_count, block_row), None
         )
         if not self._has_frames:
             return own

@@ -44,9 +44,9 @@ class PieceTable:
 
     An element is named by one of its half-edges, and parameters are seen from there, as in `PatchSampler.evaluate`.
 
-    *Coefficients* depend on the control points: for each patch, in packets of four numbers, the control points of its
-    one-ring if the patch has tips, each padded to a packet and all but the first relative to that; then the polynomials
-    of its pieces, three numbers for each monomial, padded to whole packets.
+    *Coefficients* depend on the control points: the polynomials of the pieces of all patches, three numbers for each
+    monomial, padded to whole packets of four; then for each patch with tips the control points of its one-ring, each
+    padded to a packet and all but the first relative to that; padded to whole pieces.
 
     Attributes
     ----------
@@ -55,16 +55,18 @@ class PieceTable:
     piece_levels : int
         Number of levels of tips that are pieces.
     patch_starts : (p, 2) uint32
-        Of each patch its first packet of coefficients, and its first node.
+        Of each patch its first piece and its first node.
+    rings : (p,) uint32
+        First packet of the control points of each patch; any number for patches without tips.
     nodes : (n, 4) uint32
-        `PieceTree.kinds` plus `TURN` times the turn; first child, or first packet of the piece, counted from the
-        patch's own; first row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
+        `PieceTree.kinds` plus `TURN` times the turn; first child, or the piece, counted from the patch's first; first
+        row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
         `CONTROL` times the number of control points in the one-ring.
     trees : tuple of PieceTree
         Of each class.
-    classes : (c, 6) uint32
+    classes : (c, 7) uint32
         Of each class the index of its first control in ``controls``, its numbers of patches and of controls, its first
-        packet, how many packets each patch has, and how many of these are for control points.
+        piece, how many pieces each patch has, its first packet of control points, and how many of these each patch has.
     controls : (n,) uint32
         `PatchTable.controls`, as indices of control values; of refined ones if there is a ``refinement``.
     refinement : (n, control_count) sparse array or None
@@ -75,6 +77,7 @@ class PieceTable:
     control_count: int
     piece_levels: int
     patch_starts: NDArray[np.uint32]
+    rings: NDArray[np.uint32]
     nodes: NDArray[np.uint32]
     trees: tuple[PieceTree, ...]
     classes: NDArray[np.uint32]
@@ -122,24 +125,29 @@ class PieceTable:
         trees = [piece_tree(table.scheme, signature, piece_levels) for signature in signatures]
         has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
         rings = has_ring * np.array([each.controls.shape[1] for each in table.classes])
-        sizes = rings + np.array([tree.piece_count for tree in trees]) * packets_of_piece
+        sizes = np.array([tree.piece_count for tree in trees])
         controls, refinement = patches.control_rows(control_of_vertex, control_count)
-        first_packets = ragged.starts(sizes * counts)
+        first_pieces = ragged.starts(sizes * counts)
         first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
+        first_rings = packets_of_piece * int((sizes * counts).sum()) + ragged.starts(rings * counts)
         classes = [
-            (each.first_control, *each.controls.shape, packet, size, ring)
-            for each, packet, size, ring in zip(table.classes, first_packets, sizes, rings, strict=True)
+            (each.first_control, *each.controls.shape, *columns)
+            for each, *columns in zip(table.classes, first_pieces, sizes, first_rings, rings, strict=True)
         ]
         starts = [
-            np.stack([packet + size * np.arange(count), np.full(count, node)], axis=1)
-            for packet, size, count, node in zip(first_packets, sizes, counts, first_nodes, strict=True)
+            np.stack([piece + size * np.arange(count), np.full(count, node)], axis=1)
+            for piece, size, count, node in zip(first_pieces, sizes, counts, first_nodes, strict=True)
+        ]
+        rings_of_patches = [
+            first + ring * np.arange(count) for first, ring, count in zip(first_rings, rings, counts, strict=True)
         ]
         return cls(
             patches,
             control_count,
             piece_levels,
             np.concatenate(starts).astype(np.uint32),
-            _joined_nodes(trees, [each.controls.shape[1] for each in table.classes], rings, packets_of_piece),
+            np.concatenate(rings_of_patches).astype(np.uint32),
+            _joined_nodes(trees, [each.controls.shape[1] for each in table.classes]),
             tuple(trees),
             np.array(classes, dtype=np.uint32),
             controls,
@@ -183,9 +191,17 @@ class PieceTable:
         return found
 
     @property
+    def packets_of_piece(self) -> int:
+        """Packets of a piece's coefficients."""
+        return piece_packets(len(polynomial_basis(self.patches.scheme).powers))
+
+    @property
     def packet_count(self) -> int:
         """Number of packets of all coefficients."""
-        return int((self.classes[:, 1].astype(np.int64) * self.classes[:, 4]).sum())
+        _, patches, _, _, pieces, _, rings = self.classes.astype(np.int64).T
+        of_piece = self.packets_of_piece
+        count = int((patches * (of_piece * pieces + rings)).sum())
+        return count + -count % of_piece
 
 
 _TABLES: Shared[PieceTable] = Shared()
@@ -196,14 +212,11 @@ def piece_packets(monomial_count: int) -> int:
     return -(-3 * monomial_count // PACKET)
 
 
-def _joined_nodes(
-    trees: list[PieceTree], control_counts: list[int], rings: IntArray, packets_of_piece: int
-) -> NDArray[np.uint32]:
+def _joined_nodes(trees: list[PieceTree], control_counts: list[int]) -> NDArray[np.uint32]:
     """`PieceTable.nodes`."""
     nodes, first_node, first_row = [], 0, 0
-    for tree, control_count, ring in zip(trees, control_counts, rings, strict=True):
-        is_leaf = tree.kinds >= PartKind.REGULAR
-        first = np.where(is_leaf, ring + tree.first * packets_of_piece, tree.first + first_node)
+    for tree, control_count in zip(trees, control_counts, strict=True):
+        first = np.where(tree.kinds >= PartKind.REGULAR, tree.first, tree.first + first_node)
         ends = tree.frames + LEVEL * tree.levels + CONTROL * control_count
         rows = first_row + tree.first_block * control_count
         nodes.append(np.stack([tree.kinds + TURN * tree.turns, first, rows, ends], axis=1))
