@@ -318,8 +318,7 @@ class PieceKernel:
         self._has_tips = bool((kinds == _TIP).any())
         self._has_frames = bool((table.nodes[:, 3] & FRAMES).any())
         if self._has_tips:
-            padding = self._row_size - self._count
-            self._weights = types.floats(np.pad(table.weights, ((0, 0), (0, padding))))
+            self._weights = types.floats(table.weights(self._row_size, np.float64 if types.is_double else np.float32))
             self._rings = types.indices(table.rings)
         self._is_split = table.refinement is not None
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from ..evaluation.divided_element import PartKind, divided_elements
 from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, PieceMap, PieceTree, piece_tree
@@ -159,10 +159,17 @@ class PieceTable:
         """`PieceTree.maps` of each class."""
         return [tree.maps for tree in self.trees]
 
-    @property
-    def weights(self) -> FloatArray:
-        """``(w, m)`` blocks of all classes, one row for each control point; made at each call, as kernels keep them."""
-        return np.concatenate([tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in self.trees])
+    def weights(self, size: int, dtype: DTypeLike = np.float64) -> FloatArray:
+        """``(w, size)`` blocks of all classes, one row for each control point, padded with zeros.
+
+        Made at each call, as kernels keep them.
+        """
+        found = np.zeros((sum(tree.blocks.shape[0] * tree.blocks.shape[1] for tree in self.trees), size), dtype)
+        end = 0
+        for rows in (tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in self.trees):
+            begin, end = end, end + len(rows)
+            found[begin:end, : rows.shape[1]] = rows
+        return found
 
     @property
     def half_edges(self) -> NDArray[np.uint32]:
