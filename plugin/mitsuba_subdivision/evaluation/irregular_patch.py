@@ -174,6 +174,13 @@ class IrregularPatch:
         """Whether one direction contracts more slowly than all others, as on borders."""
         return self.basis.moduli[2] < self.basis.moduli[1] * (1 - CLUSTER_WIDTH)
 
+    def regular_child(self, number: int, level: int) -> FloatArray:
+        """``(R, K)`` control points of a regular child at a level, ``P_k Ā Aⁿ``, without the `basis`."""
+        found = self.structure.children[number - 1].T
+        for _ in range(level):
+            found = self.structure.table.matrix.T @ found
+        return found.T
+
     def coordinates(self, control_points: FloatArray, evaluator: Evaluator) -> FloatArray:
         """The factors of `rows`: control points C of ``(.., K, 3)``, or their eigen-coordinates ``V⁻¹ C``."""
         if evaluator == "power":
