@@ -372,7 +372,7 @@ class LocatedSamples:
 
 
 def _most_gathered(group: PieceGroup) -> int:
-    """How many weights of samples in pieces of a group are gathered at once."""
+    """For how many samples in pieces of a group weights are gathered at once."""
     return min(GATHERED, max(1, GATHERED_WEIGHTS // group.coordinates[0].size))
 
 

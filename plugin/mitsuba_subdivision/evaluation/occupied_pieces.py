@@ -39,6 +39,9 @@ CANCELLED = 1 / 16
 NO_CHILD = -1
 # Parts with more control points, as around vertices of high valence, have no weights of their own: see `_Part`.
 MANY_CONTROLS = 128
+# Levels that are regular pieces at darts of high valence, where an eigenbasis takes a time that grows with the cube of
+# the valence: at the last, derivatives lose a digit.
+OWN_BASIS_LEVELS = 6
 # Pieces of more weights are not copied for each sample: tips around vertices of high valence.
 LARGE_PIECE = 1 << 18
 
@@ -450,7 +453,8 @@ class OccupiedPieces:
         if number > 0:
             weights = part.regular_child(number)
             return self._add_piece(Piece(inner, weights, None, weights.shape[1]), level)
-        if level + 1 < self._piece_levels:
+        has_own_basis = piece.irregular_patch.structure.shared_limit is not None
+        if level + 1 < (OWN_BASIS_LEVELS if has_own_basis else self._piece_levels):
             return self._add_part(part.next_level(), inner, PartKind.DIVIDED, turn=turn)
         return self._add_piece(piece if part.above is None else part.above[0].whole_piece(piece, piece.domain))
 
