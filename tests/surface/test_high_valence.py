@@ -40,11 +40,18 @@ def test_a_vertex_of_too_high_a_valence_is_named(scheme):
 
 
 @pytest.mark.parametrize(
-    ("count", "sharpness", "where"), [(600, 10, "at the end of a crease"), (3000, 2.5, "and something semi-sharp")]
+    ("count", "sharpness", "where"), [(3000, 10, "at the end of a crease"), (3000, 2.5, "and something semi-sharp")]
 )
 def test_a_fan_whose_faces_have_weights_of_their_own_is_refused_sooner(count, sharpness, where):
     with pytest.raises(MemoryError, match=rf"vertex {count} has {count} faces {where}; .* GB .*several vertices"):
         LimitSurface(pyramid(count, creases=[[count, 0, sharpness]]), "catmull_clark").tessellate(1)
+
+
+def test_bases_of_all_faces_at_the_end_of_a_crease_are_refused_sooner():
+    surface = LimitSurface(pyramid(700, creases=[[700, 0, 10]]), "catmull_clark")
+    assert np.isfinite(surface.evaluate(5, [[0.5, 0.25]]).n).all()
+    with pytest.raises(MemoryError, match=r"vertex 700 has 700 faces at the end of a crease; .* GB .*several vertices"):
+        surface.bounds()
 
 
 @pytest.mark.core
