@@ -138,9 +138,9 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         " a polygon is closed if its mirror image is, and one place has one row of values",
         (
             (
-                "evaluation/divided_element.py",
-                "alone = RefinedRing(refined_ring(self.scheme, near or self.signature), 0)",
-                "alone = RefinedRing(refined_ring(self.scheme, near or self.signature), -1)",
+                "evaluation/refined_fans.py",
+                "alone = RefinedRing(refined_ring(scheme, near or signature), 0)",
+                "alone = RefinedRing(refined_ring(scheme, near or signature), -1)",
             ),
             ("files/joined_meshes.py", "return values[0]", "return values[ 1]"),
             (

@@ -6,10 +6,12 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.refined_fans import RefinedFace, window
 from mitsuba_subdivision.evaluation.refined_rings import refined_ring
-from mitsuba_subdivision.mesh.signature import LARGE_FAN
+from mitsuba_subdivision.mesh.signature import BESIDE, LARGE_FAN, NEAR_FACES, fan_face_count, long_fan, window_of
 from reference.refined_cages import tagged
 
 VALENCE = LARGE_FAN + 5
+# Of a fan that a crease cuts open.
+LONG = NEAR_FACES + 6
 # Roundings of sums of the same weights in another order.
 ROUNDED = 1e-15
 # Above 3, where refinements that only lower the sharpness are left out.
@@ -18,10 +20,10 @@ HIGH = 4.5
 
 def wheel(corners, sharpness):
     """A vertex amid triangles, quadrilaterals or both, with spokes of some sharpness, and faces around all of these."""
-    sizes = [corners if corners else 3 + (i % 3 == 0) for i in range(VALENCE)]
+    sizes = [corners if corners else 3 + (i % 3 == 0) for i in range(len(sharpness))]
     ring_count = sum(size - 2 for size in sizes)
     begins = np.cumsum([0, *(size - 2 for size in sizes)])
-    ring = [[*range(begins[i], begins[i + 1] + 1)] for i in range(VALENCE)]
+    ring = [[*range(begins[i], begins[i + 1] + 1)] for i in range(len(sharpness))]
     ring[-1][-1] = 0
     faces = [[2 * ring_count, *each] for each in ring]
     outer = [[i, ring_count + i, ring_count + (i + 1) % ring_count, (i + 1) % ring_count] for i in range(ring_count)]
@@ -42,6 +44,9 @@ def sharp_spokes(kind, rng):
         "one": np.eye(VALENCE)[2] * 2.5,
         "high": np.eye(VALENCE)[1] * HIGH + np.eye(VALENCE)[9] * HIGH,
         "all": np.round(rng.uniform(0, 4, VALENCE), 2),
+        "dart": np.eye(LONG)[2] * 10,
+        "semi-sharp dart": np.eye(LONG)[2] * 10 + np.eye(LONG)[5] * 2.5,
+        "semi-sharp side": np.eye(2 * LONG)[0] * 10 + np.eye(2 * LONG)[LONG] * 10 + np.eye(2 * LONG)[5] * 2.5,
     }[kind]
 
 
@@ -53,7 +58,13 @@ def parts(element, most_depth):
             yield from parts(element.child_element(number), most_depth - 1)
 
 
-@pytest.mark.parametrize("kind", ["none", "one", "high", "all"])
+def is_at_crease(signature):
+    """Whether a crease cuts the window."""
+    corner = long_fan(signature)
+    return corner is not None and fan_face_count(window_of(signature.fans[corner])) <= 2 * BESIDE
+
+
+@pytest.mark.parametrize("kind", ["none", "one", "high", "all", "dart", "semi-sharp dart", "semi-sharp side"])
 @pytest.mark.parametrize(
     ("scheme", "corners"), [("catmull_clark", 3), ("catmull_clark", 4), ("catmull_clark", 0), ("loop", 3)]
 )
@@ -61,7 +72,8 @@ def test_children_are_those_of_the_whole_one_ring(scheme, corners, kind, np_rng)
     surface = LimitSurface(wheel(corners, sharp_spokes(kind, np_rng)), scheme)
     at_fan = [each.signature for each in surface.patches.classes if window(surface.scheme, each.signature) is not None]
     assert at_fan
-    for signature in at_fan[::7]:
+    at_crease = [signature for signature in at_fan if is_at_crease(signature)]
+    for signature in at_crease + at_fan[:: 7 if len(at_fan) < LONG else 29]:
         for element in parts(element_of(surface.scheme, signature), 3):
             whole, ring = refined_ring(surface.scheme, element.base.signature), element.base._ring
             assert isinstance(ring, RefinedFace)

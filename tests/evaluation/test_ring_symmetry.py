@@ -12,7 +12,7 @@ from mitsuba_subdivision.evaluation.ring_symmetry import LEAST_VALENCE, fan_ring
 from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from mitsuba_subdivision.mesh.one_ring import one_ring
-from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
+from mitsuba_subdivision.mesh.signature import NEAR_FACES, Signature, TaggedFan
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
 
 pytestmark = pytest.mark.core
@@ -108,14 +108,20 @@ def test_faces_of_an_open_fan_share_the_basis_of_its_ring(scheme, rule, valence)
             np.testing.assert_allclose(*projections, rtol=0, atol=SAME_SPACE)
 
 
-def fan_signature(scheme, rule):
+def fan_signature(scheme, rule, ahead=30, behind=9):
     size, rest = scheme.regular_face_size, isolated_signature(scheme, 3).fans[1:]
-    return Signature("face", (TaggedFan((size,) * 30, (size,) * 9, rule), *rest))
+    return Signature("face", (TaggedFan((size,) * ahead, (size,) * behind, rule), *rest))
 
 
 HIGH_VALENCES = [
     *((scheme, isolated_signature(scheme, valence)) for scheme in SCHEMES for valence in (39, 40)),
     *((scheme, fan_signature(scheme, rule)) for scheme in SCHEMES[:2] for rule in VertexRule),
+    # Of so many faces that they share the fan's refinement and its limit.
+    *(
+        (scheme, fan_signature(scheme, VertexRule.DART, NEAR_FACES + 6 - behind, behind))
+        for scheme in SCHEMES[:2]
+        for behind in (1, 40)
+    ),
 ]
 
 

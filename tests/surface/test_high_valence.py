@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.evaluation import occupied_pieces
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
 from mitsuba_subdivision.patches import patch_samples, patch_table
 from mitsuba_subdivision.schemes import CatmullClark, Loop
@@ -39,11 +40,18 @@ def test_a_vertex_of_too_high_a_valence_is_named(scheme):
 
 
 @pytest.mark.parametrize(
-    ("count", "sharpness", "where"), [(600, 10, "at the end of a crease"), (3000, 2.5, "and something semi-sharp")]
+    ("count", "sharpness", "where"), [(3000, 10, "at the end of a crease"), (3000, 2.5, "and something semi-sharp")]
 )
 def test_a_fan_whose_faces_have_weights_of_their_own_is_refused_sooner(count, sharpness, where):
     with pytest.raises(MemoryError, match=rf"vertex {count} has {count} faces {where}; .* GB .*several vertices"):
         LimitSurface(pyramid(count, creases=[[count, 0, sharpness]]), "catmull_clark").tessellate(1)
+
+
+def test_bases_of_all_faces_at_the_end_of_a_crease_are_refused_sooner():
+    surface = LimitSurface(pyramid(700, creases=[[700, 0, 10]]), "catmull_clark")
+    assert np.isfinite(surface.evaluate(5, [[0.5, 0.25]]).n).all()
+    with pytest.raises(MemoryError, match=r"vertex 700 has 700 faces at the end of a crease; .* GB .*several vertices"):
+        surface.bounds()
 
 
 @pytest.mark.core
@@ -70,6 +78,27 @@ def test_samples_on_a_fan_are_those_of_its_faces_one_after_the_other(monkeypatch
     apart = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
     np.testing.assert_allclose(apart.p, together.p, rtol=0, atol=ROUNDED_POINT)
     np.testing.assert_allclose(apart.n, together.n, rtol=0, atol=ROUNDED_NORMAL)
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
+@pytest.mark.parametrize("tags", [{}, {"creases": [[60, 0, 2.5]]}, {"creases": [[60, 0, 10]]}, {"corners": [[60, 10]]}])
+@pytest.mark.parametrize("derivatives", [1, 2])
+def test_weights_found_from_the_piece_upwards_are_those_found_downwards(scheme, tags, derivatives, monkeypatch, np_rng):
+    """Parts of many control points have no weights of their own, and large pieces are not copied for each sample."""
+    cage = pyramid(60, **tags)
+    faces, uv = np.repeat(np.arange(60), 5), np_rng.random((300, 2)) * 0.5 ** np_rng.integers(1, 9, (300, 1))
+    monkeypatch.setattr(patch_table, "KEPT_BYTES", -1)
+    samples = []
+    for many, large, gathered in ((1 << 20, 1 << 40, 1 << 22), (0, 0, 1)):
+        monkeypatch.setattr(occupied_pieces, "MANY_CONTROLS", many)
+        monkeypatch.setattr(occupied_pieces, "LARGE_PIECE", large)
+        monkeypatch.setattr("mitsuba_subdivision.evaluation.element.GATHERED_WEIGHTS", gathered)
+        samples.append(LimitSurface(cage, scheme).evaluate(faces, uv, derivatives=derivatives))
+    downwards, upwards = samples
+    np.testing.assert_array_equal(upwards.level, downwards.level)
+    np.testing.assert_allclose(upwards.p, downwards.p, rtol=0, atol=ROUNDED_POINT)
+    np.testing.assert_allclose(upwards.n, downwards.n, rtol=0, atol=ROUNDED_NORMAL)
+    np.testing.assert_allclose(upwards.dp_du, downwards.dp_du, rtol=ROUNDED, atol=ROUNDED)
 
 
 @SCHEMES

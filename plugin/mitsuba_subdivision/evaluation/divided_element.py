@@ -33,8 +33,8 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from ..schemes.scheme_members import optional_member
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_fans import RefinedFace, window
-from .refined_rings import RefinedRing, RingMesh, refined_ring, refined_together, ring_pattern
+from .refined_fans import RefinedFace, child_domains, refined_element, window
+from .refined_rings import RefinedRing, RingMesh, refined_together
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
@@ -101,7 +101,7 @@ class DividedElement:
         SchemeError
             If the scheme divides domains in a way of its own.
         """
-        found = ring_pattern(self.scheme, self.signature.smoothed).domains
+        found = child_domains(self.scheme, self.signature)
         expected = (IDENTITY,) if len(found) == 1 else self.scheme.domain.children
         if len(found) != len(expected) or not all(a.is_same(b) for a, b in zip(found, expected, strict=True)):
             raise SchemeError(
@@ -154,9 +154,7 @@ class DividedElement:
     def _ring(self) -> RefinedRing | RefinedFace:
         """The refined one-ring."""
         if self._refined is None:
-            near = window(self.scheme, self.signature)
-            alone = RefinedRing(refined_ring(self.scheme, near or self.signature), 0)
-            self._refined = alone if near is None else RefinedFace(self.scheme, self.signature, alone)
+            self._refined = refined_element(self.scheme, self.signature)
         return self._refined
 
     @cached_property

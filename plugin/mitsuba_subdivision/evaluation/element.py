@@ -26,6 +26,8 @@ KEPT_WEIGHTS = 1 << 13
 # processor's cache. Powers of two would put the columns of an array into the same few lines of it.
 RUN = 1000
 GATHERED = 500
+# Around vertices of high valence a sample has many weights: at most so many are gathered at once, 32 MB.
+GATHERED_WEIGHTS = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ def evaluate_elements(
     values, origin = np.empty((size, width, count), dtype=dtype), np.zeros((width, count), dtype=dtype)
     scale, level, bounds = np.empty((2, count), dtype), np.empty(count, np.int64), np.empty((2, count), dtype)
     frames: list[tuple[slice, FloatArray]] = []
-    buffer = np.empty(GATHERED * max((group.coordinates[0].size for group in pieces.groups), default=0))
+    buffer = np.empty(max((_most_gathered(group) * group.coordinates[0].size for group in pieces.groups), default=0))
     for patch, run in located.runs():
         rows = located.rows(patch, run, evaluator, dtype, derivatives)
         scale[:, run], level[run] = rows.derivative_scale, rows.level
@@ -119,7 +121,8 @@ def evaluate_elements(
                 origin[:, own] = points[0].T[:width]
                 points -= points[0].copy()
             points = points.swapaxes(0, 1)
-            weights = group.weights(every[:, within], located.index[own], evaluator, buffer)
+            which = located.index_in(group, own)
+            weights = group.weights(every[:, within], which, evaluator, buffer)
             found = (weights @ points).transpose(1, 2, 0)[:, :width]
             values[..., own] = found[:size]
             if rows.frame is not None:
@@ -127,7 +130,7 @@ def evaluate_elements(
             if derivatives == 2 and width == 3:
                 coordinates = None
                 if patch is not None and evaluator == "stabilized":
-                    coordinates = group.coordinates[located.index[own]] @ points[..., :3]
+                    coordinates = group.coordinates[which] @ points[..., :3]
                 curvature = _curvature(patch, located.uv[:, own].T, found[:size], coordinates)
                 samples.curvature[:, into[own]] = curvature
     values[0] += origin
@@ -234,7 +237,7 @@ def _stencils(
         rows = located.rows(patch, run, "stabilized", frame.dtype, derivatives)
         scale[:, run] = rows.derivative_scale
         for group, at, within in located.groups(run):
-            coordinates = group.coordinates[located.index[at]]
+            coordinates = group.coordinates[located.index_in(group, at)]
             values[..., at] = (rows.rows[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
             frame[..., at] = (rows.tangents[:, within].swapaxes(0, 1) @ coordinates).transpose(1, 2, 0)
     frame[:], values[1:3] = _by_uv(frame, located.jacobian), _by_uv(values[1:3], located.jacobian) * scale[0]
@@ -318,10 +321,21 @@ class LocatedSamples:
             yield self.pieces.groups[self.group[run.start]].patch, run
 
     def groups(self, run: slice) -> Iterator[tuple[PieceGroup, slice, slice]]:
-        """At most `GATHERED` samples of a run in pieces of the same group, and where they are in the run."""
-        for within in _runs(self.group[run], GATHERED):
-            at = slice(run.start + within.start, run.start + within.stop)
-            yield self.pieces.groups[self.group[at.start]], at, within
+        """At most `GATHERED` samples of a run in pieces of the same group, and where they are in the run.
+
+        They lie in the same piece, if the group's are large.
+        """
+        for of_group in _runs(self.group[run], RUN):
+            group = self.pieces.groups[self.group[run.start + of_group.start]]
+            keys = self.part if group.is_large else self.group
+            at_group = slice(run.start + of_group.start, run.start + of_group.stop)
+            for own in _runs(keys[at_group], GATHERED if group.is_large else _most_gathered(group)):
+                within = slice(of_group.start + own.start, of_group.start + own.stop)
+                yield group, slice(run.start + within.start, run.start + within.stop), within
+
+    def index_in(self, group: PieceGroup, at: slice) -> IntArray:
+        """Which piece of its group each sample lies in, of those that `groups` gives; only the first if all are one."""
+        return self.index[at][:1] if group.is_large else self.index[at]
 
     def rows(
         self, patch: IrregularPatch | None, run: slice, evaluator: Evaluator, dtype: np.dtype, derivatives: int
@@ -353,8 +367,13 @@ class LocatedSamples:
         for patch, run in self.runs():
             frame = self.rows(patch, run, evaluator, dtype, 1).tangents
             for group, at, within in self.groups(run):
-                found[:, at] = group.absolute_weights(frame[:, within], self.index[at])
+                found[:, at] = group.absolute_weights(frame[:, within], self.index_in(group, at))
         return _by_uv(found, np.abs(self.jacobian.astype(dtype)))
+
+
+def _most_gathered(group: PieceGroup) -> int:
+    """For how many samples in pieces of a group weights are gathered at once."""
+    return min(GATHERED, max(1, GATHERED_WEIGHTS // group.coordinates[0].size))
 
 
 def _runs(keys: IntArray, length: int) -> Iterator[slice]:

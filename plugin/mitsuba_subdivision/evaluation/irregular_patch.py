@@ -51,6 +51,18 @@ MANY_CONTROLS = 256
 FLOAT32_SIZE = 2.0**-24
 
 
+class SharedLimit:
+    """The limit at a point that many faces have in common, once it has been found for one of them.
+
+    Attributes
+    ----------
+    of_ring : ((3, r) float64, (2, r) float64), or None
+        `IrregularPatch.limit_in_ring` over the points of the ring, in the order of `fan_ring`.
+    """
+
+    of_ring: tuple[FloatArray, FloatArray] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class IrregularStructure:
     """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
@@ -71,6 +83,11 @@ class IrregularStructure:
     slots: IntArray
     table: StencilTable
     children: FloatArray
+
+    @property
+    def shared_limit(self) -> SharedLimit | None:
+        """The limit at the point, if others have the same."""
+        return None
 
     @property
     def matrix(self) -> FloatArray:
@@ -152,6 +169,21 @@ class IrregularPatch:
             Absolute weights that the frame is a sum of.
         None if the valence is small, and at corners amid faces.
         """
+        shared = self.structure.shared_limit
+        if shared is None or (ring := fan_ring(self.structure.signature)) is None:
+            return self._own_limit()
+        order = self.structure.order_of(ring)
+        if shared.of_ring is None:
+            found = self._own_limit()
+            if found is None:
+                return None
+            shared.of_ring = found[0][:, order], found[1][:, order]
+        stencils, magnitude = np.zeros((3, len(self.structure.slots))), np.zeros((2, len(self.structure.slots)))
+        stencils[:, order], magnitude[:, order] = shared.of_ring
+        return stencils, magnitude
+
+    def _own_limit(self) -> tuple[FloatArray, FloatArray] | None:
+        """`limit_in_ring`, found for this face."""
         try:
             leading = _leading(self.structure)
         except EigenbasisError as error:
@@ -173,6 +205,13 @@ class IrregularPatch:
     def contracts_unevenly(self) -> bool:
         """Whether one direction contracts more slowly than all others, as on borders."""
         return self.basis.moduli[2] < self.basis.moduli[1] * (1 - CLUSTER_WIDTH)
+
+    def regular_child(self, number: int, level: int) -> FloatArray:
+        """``(R, K)`` control points of a regular child at a level, ``P_k Ā Aⁿ``, without the `basis`."""
+        found, step = self.structure.children[number - 1].T, self.structure.table.matrix.T
+        for _ in range(level):
+            found = step @ found
+        return found.T
 
     def coordinates(self, control_points: FloatArray, evaluator: Evaluator) -> FloatArray:
         """The factors of `rows`: control points C of ``(.., K, 3)``, or their eigen-coordinates ``V⁻¹ C``."""

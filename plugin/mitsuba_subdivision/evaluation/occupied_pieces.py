@@ -37,6 +37,13 @@ from .refined_rings import RingMesh
 CANCELLED = 1 / 16
 # In place of a child in which no sample has lain.
 NO_CHILD = -1
+# Parts with more control points, as around vertices of high valence, have no weights of their own: see `_Part`.
+MANY_CONTROLS = 128
+# Levels that are regular pieces at darts of high valence, where an eigenbasis takes a time that grows with the cube of
+# the valence: at the last, derivatives lose a digit.
+OWN_BASIS_LEVELS = 6
+# Pieces of more weights are not copied for each sample: tips around vertices of high valence.
+LARGE_PIECE = 1 << 18
 
 
 class GrowingColumns:
@@ -106,6 +113,10 @@ class PieceGroup:
         return self._weights["stencils" if self.patch is None else "coordinates"]
 
     @property
+    def is_large(self) -> bool:
+        return int(np.prod(self.stencils.shape[1:])) > LARGE_PIECE
+
+    @property
     def byte_count(self) -> int:
         return self.stencils.nbytes + (0 if self.patch is None else self.coordinates.nbytes)
 
@@ -123,7 +134,7 @@ class PieceGroup:
         rows : (d, s, K_piece)
             Of `IrregularPatch.rows`, or of the regular basis.
         which : (s,) int64
-            Piece of each sample.
+            Piece of each sample, or (1,) of all if pieces are large.
         evaluator : "power" | "stam" | "stabilized" | "limit"
         buffer : (n,) float64
             To gather stencils in: fresh memory takes several times as long.
@@ -132,6 +143,9 @@ class PieceGroup:
         if self._order is not None:
             return rows
         source = self.stencils if evaluator == "power" else self.coordinates
+        if self.is_large:
+            found = rows.reshape(-1, rows.shape[2]) @ source[which[0]]
+            return found.reshape(*rows.shape[:2], -1).astype(rows.dtype, copy=False)
         stencils = buffer[: len(which) * source[0].size].reshape(len(which), *source.shape[1:])
         # Without checks of the indices, which would allocate memory.
         source.take(which, axis=0, out=stencils, mode="clip")
@@ -157,7 +171,7 @@ class PieceGroup:
         frame : (2, s, K_piece)
             Rows over the pieces' coordinates.
         which : (s,) int64
-            Piece of each sample.
+            Piece of each sample, or (1,) of all.
         """
         sums = np.abs(self.stencils[which]).sum(axis=2).astype(frame.dtype)
         if self.patch is None:
@@ -172,26 +186,92 @@ class PieceGroup:
 class _Part:
     """A part that may be divided further.
 
+    Weights of a part with many control points are a large matrix, and those of the next part would be a product of two.
+    So such a part has none, and rows over its control points go upwards, from part to part, by sparse products.
+
     Attributes
     ----------
     source : DividedElement or Piece
         The part's own element; or the irregular piece of the whole element that it is a level of.
     weights : (K_part, K) float64, or None
-        Its control points, or eigen-coordinates, over the element's one-ring; None for the element itself.
+        Its control points, or eigen-coordinates, over the element's one-ring. None for the element itself, and for many
+        control points.
     depth : int
         Number of refinements that made it: of the element, or of the first part without semi-sharp features. Or the
         level.
+    above : (_Part, int), or None
+        The part that it is a child of, and its number among the children; or that which the piece is, and 0. Only where
+        there are many control points.
     """
 
     source: DividedElement | Piece
     weights: FloatArray | None = None
     depth: int = 0
+    above: tuple[_Part, int] | None = None
 
     @property
     def byte_count(self) -> int:
+        if self.above is not None:
+            return 0
         return (0 if self.weights is None else self.weights.nbytes) + (
             self.source.stencils.nbytes if isinstance(self.source, Piece) else 0
         )
+
+    def child(self, element: DividedElement, number: int) -> _Part:
+        """The part that is a child of an element, which is this part."""
+        below = element.child_element(number)
+        is_less_sharp = element.signature.is_semi_sharp and not below.signature.is_semi_sharp
+        depth = 0 if is_less_sharp else self.depth + 1
+        if below.control_count > MANY_CONTROLS:
+            return _Part(below, None, depth, (self, number))
+        return _Part(below, self.over_element(element.child(number)[1]), depth)
+
+    def tip(self, piece: Piece, domain: AffineMap) -> _Part:
+        """The first level of an irregular piece, which is this part; ``domain`` is the piece's, from the element's."""
+        if len(piece.weights) > MANY_CONTROLS:
+            own = Piece(domain, piece.weights, piece.patch, piece.control_count)
+            return _Part(own, above=(self, 0))
+        whole = self.whole_piece(piece, domain)
+        return _Part(whole, whole.coordinates)
+
+    def whole_piece(self, piece: Piece, domain: AffineMap) -> Piece:
+        """A piece, which is this part, over the control points of the element."""
+        stencils = self.over_element(piece.stencils)
+        return Piece(domain, stencils, piece.patch, stencils.shape[1])
+
+    def regular_child(self, number: int) -> FloatArray:
+        """``(R, K)`` control points of one of the regular pieces of a level."""
+        patch = self.piece.irregular_patch
+        if self.weights is not None:
+            return patch.eigen_children[number - 1] @ self.weights
+        return self.over_element(patch.regular_child(number, self.depth))
+
+    def next_level(self) -> _Part:
+        """The level after this one."""
+        if self.weights is None:
+            return _Part(self.source, None, self.depth + 1, self.above)
+        weights = self.piece.irregular_patch.basis.block_matrix() @ self.weights
+        return _Part(self.source, weights, self.depth + 1)
+
+    @property
+    def piece(self) -> Piece:
+        """The piece that the part is a level of."""
+        if not isinstance(self.source, Piece):
+            raise TypeError("an element; expected a level around an extraordinary point")
+        return self.source
+
+    def over_element(self, rows: FloatArray) -> FloatArray:
+        """Rows over the part's control points, or eigen-coordinates if it has weights, as weights ``(n, K)``."""
+        if self.weights is not None:
+            return rows @ self.weights
+        if self.above is None:
+            return rows
+        part, number = self.above
+        if isinstance(part.source, Piece):
+            raise TypeError("a level of a piece; expected an element")
+        if isinstance(self.source, Piece):
+            return part.over_element(self.source.scattered(rows))
+        return part.over_element(part.source.over_controls(rows[None], number)[0])
 
 
 class OccupiedPieces:
@@ -333,11 +413,8 @@ class OccupiedPieces:
                 found = self._add_level_child(part, turned, self._domain(index), turn)
                 self.parts["children"][index, number] = found
                 continue
-            element, stencils = part.source.child(number)
-            is_less_sharp = part.source.signature.is_semi_sharp and not element.signature.is_semi_sharp
-            weights = stencils if part.weights is None else stencils @ part.weights
             domain = part.source.domains[number] @ self._domain(index)
-            new.append((_Part(element, weights, 0 if is_less_sharp else part.depth + 1), domain))
+            new.append((part.child(part.source, number), domain))
             of_elements.append((index, number))
         for (index, number), found in zip(of_elements, self._add(new), strict=True):
             self.parts["children"][index, number] = found
@@ -361,29 +438,25 @@ class OccupiedPieces:
                     raise not_isolated(self.scheme, element.signature, most)
                 found.append(self._add_part(part, domain, element.kind))
                 continue
-            stencils = element.piece.stencils if part.weights is None else element.piece.stencils @ part.weights
-            piece = Piece(element.piece.domain @ domain, stencils, element.piece.patch, stencils.shape[1])
-            if piece.patch is None or not self._piece_levels:
-                found.append(self._add_piece(piece))
+            of_piece = element.piece.domain @ domain
+            if element.piece.patch is None or not self._piece_levels:
+                found.append(self._add_piece(part.whole_piece(element.piece, of_piece)))
             else:
-                tip = _Part(piece, piece.coordinates)
+                tip = part.tip(element.piece, of_piece)
                 found.append(self._add_part(tip, domain, PartKind.DIVIDED, turn=element.turn))
         return found
 
     def _add_level_child(self, part: _Part, number: int, domain: AffineMap, turn: int) -> int:
         """Add a child of a level around an extraordinary point; ``domain`` and ``turn`` as the level's row has them."""
-        piece, level = part.source, part.depth
-        if not isinstance(piece, Piece) or part.weights is None:
-            raise TypeError(f"a part of {type(piece).__name__}; expected a level around an extraordinary point")
-        patch = piece.irregular_patch
+        piece, level = part.piece, part.depth
         inner = self.scheme.domain.children[number] @ (domain if level else piece.domain)
         if number > 0:
-            weights = patch.eigen_children[number - 1] @ part.weights
+            weights = part.regular_child(number)
             return self._add_piece(Piece(inner, weights, None, weights.shape[1]), level)
-        if level + 1 == self._piece_levels:
-            return self._add_piece(piece)
-        smaller = patch.basis.block_matrix() @ part.weights
-        return self._add_part(_Part(piece, smaller, level + 1), inner, PartKind.DIVIDED, turn=turn)
+        has_own_basis = piece.irregular_patch.structure.shared_limit is not None
+        if level + 1 < (OWN_BASIS_LEVELS if has_own_basis else self._piece_levels):
+            return self._add_part(part.next_level(), inner, PartKind.DIVIDED, turn=turn)
+        return self._add_piece(piece if part.above is None else part.above[0].whole_piece(piece, piece.domain))
 
     def _add_piece(self, piece: Piece, level: int = 0) -> int:
         rows, columns = piece.stencils.shape

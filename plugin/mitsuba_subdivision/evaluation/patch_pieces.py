@@ -16,8 +16,9 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from ..schemes.scheme_members import optional_member
 from ..schemes.stencil_table import StencilTable
-from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
-from .refined_rings import refined_ring, ring_pattern
+from .irregular_patch import IrregularPatch, IrregularStructure, SharedLimit, irregular_patch
+from .refined_fans import RefinedFace, child_domains, refined_element
+from .refined_rings import RefinedRing
 
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
@@ -153,6 +154,8 @@ def rotation_count(scheme: Scheme, signature: Signature) -> int:
 def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
     """Control points of an element, in the order in which they come when the element is named by a later corner."""
     ring = one_ring(signature)
+    if corner == 0:
+        return np.arange(ring.vertex_count)
     half_edge = 0
     for _ in range(corner):
         half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn(half_edge))
@@ -168,29 +171,90 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     # Its other corners are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
         return None
-    if len(ring_pattern(scheme, signature.smoothed).domains) != len(scheme.domain.children):
+    if len(child_domains(scheme, signature)) != len(scheme.domain.children):
         return None
-    rings = refined_ring(scheme, signature)
-    if rings.signature(0, 0) != signature:
+    rings = refined_element(scheme, signature)
+    if rings.signature(0) != signature:
         return None
-    children = []
+    lattices = []
     for number in range(1, len(scheme.domain.children)):
-        lattice = lattice_stencils(scheme, rings.signature(0, number))
+        lattice = lattice_stencils(scheme, rings.signature(number))
         if lattice is None:
             return None
-        children.append(lattice @ rings.stencils(0, number))
-    table, found = rings.table(0), np.stack(children)
-    slots = np.arange(table.row_count)
-    if (merged := _merged_slots(signature)) is not None:
-        kept, dropped = merged
-        slots = slots[slots != dropped]
+        lattices.append(lattice)
+    children = _RegularChildren(signature, rings, lattices)
+    if isinstance(rings, RefinedFace):
+        return SharedStructure(children, rings)
+    return IrregularStructure(signature, children.slots, children.table, children.stencils)
+
+
+class _RegularChildren:
+    """What `IrregularStructure` has of a refined one-ring.
+
+    Parameters
+    ----------
+    signature : Signature
+    rings : RefinedRing or RefinedFace
+    lattices : list of (R, K_child) float64
+        `lattice_stencils` of the regular children.
+    """
+
+    def __init__(self, signature: Signature, rings: RefinedRing | RefinedFace, lattices: list[FloatArray]) -> None:
+        self.signature, self._rings, self._lattices = signature, rings, lattices
+        self._merged = _merged_slots(signature)
+        self.slots = np.arange(one_ring(signature.smoothed).vertex_count)
+        if self._merged is not None:
+            self.slots = np.delete(self.slots, self._merged[1])
+
+    @property
+    def stencils(self) -> FloatArray:
+        lattices = enumerate(self._lattices, start=1)
+        found = np.stack([lattice @ self._rings.stencils(number) for number, lattice in lattices])
+        if self._merged is None:
+            return found
+        kept, dropped = self._merged
         found[..., kept] += found[..., dropped]
-        found = found[..., slots]
-        number_of = np.searchsorted(slots, np.arange(table.row_count))
-        columns = number_of[np.where(table.columns == dropped, kept, table.columns)]
-        own = table.rows != dropped
-        table = StencilTable(len(slots), len(slots), number_of[table.rows[own]], columns[own], table.weights[own])
-    return IrregularStructure(signature, slots, table, found)
+        return found[..., self.slots]
+
+    @property
+    def table(self) -> StencilTable:
+        found, slots = self._rings.table(0), self.slots
+        if self._merged is None:
+            return found
+        kept, dropped = self._merged
+        number_of = np.searchsorted(slots, np.arange(found.row_count))
+        columns = number_of[np.where(found.columns == dropped, kept, found.columns)]
+        own = found.rows != dropped
+        return StencilTable(len(slots), len(slots), number_of[found.rows[own]], columns[own], found.weights[own])
+
+
+class SharedStructure(IrregularStructure):
+    """Subdivision matrices of a face at a large fan that is refined for all faces together.
+
+    They are made anew each time: kept, those of all faces would take memory that grows with the square of their number.
+
+    Parameters
+    ----------
+    children : _RegularChildren
+    rings : RefinedFace
+    """
+
+    def __init__(self, children: _RegularChildren, rings: RefinedFace) -> None:
+        vars(self).update(signature=children.signature, slots=children.slots)
+        self._children, self._rings = children, rings
+
+    @property
+    def table(self) -> StencilTable:
+        return self._children.table
+
+    @property
+    def children(self) -> FloatArray:
+        return self._children.stencils
+
+    @property
+    def shared_limit(self) -> SharedLimit | None:
+        fan = self.signature.fans[0]
+        return self._rings.limit if isinstance(fan, TaggedFan) and fan.rule == VertexRule.DART else None
 
 
 def _merged_slots(signature: Signature) -> tuple[int, int] | None:

@@ -52,6 +52,10 @@ class RefinedRing(NamedTuple):
         """Control points of a child over those of the element, ``(K_child, K)``."""
         return self.rings.stencils(self.ring, number)
 
+    def table(self, number: int) -> StencilTable:
+        """`stencils` of a child of an element that was refined alone."""
+        return self.rings.table(number)
+
     def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
         """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element.
 

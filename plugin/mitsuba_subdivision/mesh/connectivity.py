@@ -253,6 +253,11 @@ class Topology:
         return {}
 
     @cached_property
+    def long_fan_rings(self) -> dict[int, IntArray]:
+        """`fan_points` of fans that are not closed, by their most clockwise half-edge, as far as they were needed."""
+        return {}
+
+    @cached_property
     def large_fan_signatures(self) -> dict[int, Any]:
         """The `Signature` of such a vertex, as far as `signature_at` has needed it."""
         return {}

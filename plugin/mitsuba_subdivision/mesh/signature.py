@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
+from . import ragged
 from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
 from .semi_sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
 
@@ -25,6 +26,9 @@ Number = TypeVar("Number", int, IntArray)
 NEAR_FACES = 64
 # Fans of so many faces are walked around once for all of these.
 LARGE_FAN = 32
+# Faces on each side of an element in the *window* of a fan: no refined vertex of the element's children depends on
+# others, but for the vertex of the fan and those around it.
+BESIDE = 2
 
 
 class TaggedFan(NamedTuple):
@@ -97,6 +101,38 @@ def fan_size(fan: Fan, turns: int) -> int:
     if isinstance(fan, TaggedFan):
         return fan.ahead[turns] if turns >= 0 else fan.behind[-1 - turns]
     return fan[turns]
+
+
+def window_of(fan: Fan) -> TaggedFan:
+    """A large fan cut down to the faces beside an element, whose outer edges become borders."""
+    if not isinstance(fan, TaggedFan):
+        return TaggedFan(fan[: 1 + BESIDE], fan[: -1 - BESIDE : -1])
+    if fan.is_closed:
+        ahead, behind = fan.ahead[: 1 + BESIDE], fan.ahead[: -1 - BESIDE : -1]
+    else:
+        ahead, behind = fan.ahead[: 1 + BESIDE], fan.behind[:BESIDE]
+    sharpness = fan.sharpness
+    if sharpness is not None:
+        every = sharpness.edges
+        first = 0 if fan.is_closed else len(fan.behind)
+        edges = tuple(every[first + turns] for turns in range(-len(behind), len(ahead)))
+        sharpness = None if set(edges) == {SMOOTH_EDGE} else FanSharpness(edges, 0.0, ())
+    return TaggedFan(ahead, behind, sharpness=sharpness)
+
+
+def long_fan(signature: Signature) -> int | None:
+    """The corner of a face at a fan of very many faces that is not closed, where all of these matter; None if not one.
+
+    Such fans are those of darts, and semi-sharp ones.
+    """
+    if signature.kind != "face":
+        return None
+    found = [
+        corner
+        for corner, fan in enumerate(signature.fans)
+        if isinstance(fan, TaggedFan) and not fan.is_closed and fan_face_count(fan) > NEAR_FACES
+    ]
+    return found[0] if len(found) == 1 else None
 
 
 class TurnedEdges(tuple[tuple[float, float, float], ...]):
@@ -288,6 +324,22 @@ def _fan_half_edges(topology: Topology, turn: Walk, turn_back: Walk, half_edge: 
     if len(behind) + len(ahead) >= LARGE_FAN:
         topology.large_fans[vertex] = behind[::-1] + ahead, closed
     return behind, ahead
+
+
+def fan_points(topology: Topology, half_edges: list[int]) -> tuple[IntArray, IntArray]:
+    """The *ring* of the vertex of a fan, given its half-edges, counter-clockwise, and the first point of each face.
+
+    The ring is the vertex, and then the points of each face, from the end of its first edge to before that of its last.
+    In a fan that is not closed, the end of its last edge follows.
+    """
+    around = np.array(half_edges)
+    faces = topology.face_of(around)
+    first, counts = topology.face_offsets[faces], topology.face_sizes[faces] - 2
+    face = np.repeat(np.arange(len(faces)), counts)
+    steps = 1 + ragged.index_in_row(counts)
+    at = first[face] + (around[face] - first[face] + steps) % (counts[face] + 2)
+    last = topology.preceding(around[-1:]) if int(topology.turn(half_edges[-1])) < 0 else around[:0]
+    return topology.face_vertices[np.concatenate([around[:1], at, last])], 1 + ragged.starts(counts)
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:

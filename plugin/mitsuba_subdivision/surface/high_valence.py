@@ -18,13 +18,15 @@ from ..tessellation.memory import SMALL, available_memory
 # Measured at valences of 200 to 1,600 under all schemes, those below of 200 to 800; Doo-Sabin's rules are matrices
 # themselves.
 PAIR_BYTES = {"face": 65, "vertex": 300}
-# The same in all where every face has an eigenbasis of its own: at the end of a crease, and on borders under schemes
-# without `has_local_borders`. Measured: 3,300 to 4,300; more, as the time grows faster, to minutes from 500 faces on.
-OWN_BASES_BYTES = 6000
-# The same in all where edges or the vertex are semi-sharp, so that every face has stencils of its own. Measured: 250 to
-# 470. Much more where the faces do not share the fan's refinement, as by Chaikin's method.
+# The same in all where every face has stencils of its own, and the fan is refined for all of them: at the end of a
+# crease, and where edges or the vertex are semi-sharp. Measured: 210 to 470.
 OWN_STENCIL_BYTES = 350
+# Where the faces do not share the fan's refinement, as by Chaikin's method.
 UNSHARED_STENCIL_BYTES = 1200
+# Where every face has an eigenbasis of its own: on borders that are semi-sharp, on all of them under schemes without
+# `has_local_borders`, and at the end of a crease, where all pieces are needed. Measured: 3,300 to 4,300; more, as the
+# time grows faster, to minutes from 500 faces on.
+OWN_BASES_BYTES = 6000
 # Pieces and blocks of a tip, in regular pieces: three at each level down to single precision around vertices of high
 # valence. And how many copies of the polynomials of all pieces there are while a kernel is made. Measured.
 PIECES_OF_TIP = 3 * 37
@@ -33,13 +35,15 @@ PIECE_COPIES = 2.7
 MOST_BYTES = 8 << 30
 
 
-def require_moderate_valences(cage: ControlCage, scheme: Scheme) -> None:
+def require_moderate_valences(cage: ControlCage, scheme: Scheme, *, needs_bases: bool = False) -> None:
     """Check that the weights around every vertex and every face fit into memory.
 
     Parameters
     ----------
     cage : ControlCage
     scheme : Scheme
+    needs_bases : bool
+        Whether an eigenbasis is needed for every face, also where samples need none, at the end of a crease.
 
     Raises
     ------
@@ -52,12 +56,15 @@ def require_moderate_valences(cage: ControlCage, scheme: Scheme) -> None:
     face_count, own_bytes = t.vertex_face_count.astype(np.float64), np.zeros(t.vertex_count)
     if scheme.element == "face":
         is_border, is_semi_sharp = t.is_border_vertex, t.is_semi_sharp_vertex
+        is_dart, is_shared = t.vertex_rules == VertexRule.DART, np.zeros(t.vertex_count, dtype=bool)
         if optional_member(scheme, "has_local_borders"):
-            is_near = is_border & (t.vertex_rules != VertexRule.DART) & ~is_semi_sharp
+            is_near = is_border & ~is_dart & ~is_semi_sharp
             face_count[is_near] = np.minimum(face_count[is_near], NEAR_FACES)
-        is_shared = optional_member(scheme, "crease_method") != "chaikin"
-        stencil_bytes = OWN_STENCIL_BYTES if is_shared else UNSHARED_STENCIL_BYTES
-        own_bytes = OWN_BASES_BYTES * is_border + stencil_bytes * is_semi_sharp
+            is_shared = ~is_border if needs_bases else is_dart | ~is_border
+            if optional_member(scheme, "crease_method") == "chaikin":
+                is_shared &= ~is_semi_sharp
+        unshared_bytes = OWN_BASES_BYTES * is_border + UNSHARED_STENCIL_BYTES * is_semi_sharp
+        own_bytes = np.where(is_shared, OWN_STENCIL_BYTES * (is_border | is_semi_sharp), unshared_bytes)
     at_vertices = (pair + own_bytes) * (width * face_count) ** 2
     # The centre of a polygon becomes a vertex.
     at_faces = pair * (width * t.face_sizes.astype(np.float64)) ** 2

@@ -405,6 +405,7 @@ class LimitSurface:
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
+        require_moderate_valences(self.cage, self.scheme, needs_bases=True)
         return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
@@ -532,6 +533,7 @@ class LimitSurface:
             If parts of the surface need more than ``max_rate`` for the criterion, and are coarser. A criterion for
             outlines causes none.
         """
+        require_moderate_valences(self.cage, self.scheme, needs_bases=True)
         points = self.cage.positions if control_points is None else control_points
         return tessellation.adaptive_table(
             self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate, self.cage.source.name
