@@ -167,7 +167,9 @@ def _cut(
     rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]
 ) -> Iterator[tuple[Tiles, FloatArray | None]]:
     """Tiles of all patches: those with rates; and those that lie in pieces, with Bernstein coefficients over them."""
-    waiting: list[_Undecided] = []
+    whole: list[_Undecided] = []
+    # Few tiles of each block are divided again: those of many blocks together.
+    parts: list[_Undecided] = []
     for tiles, patches in blocks:
         rest = patches
         if optional_member(rates.scheme, "has_convex_rules"):
@@ -175,19 +177,23 @@ def _cut(
             yield tiles[is_flat], None
             rest = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
         pieces, undecided = _parts_of_patches(rates, tiles, rest)
-        waiting.append(undecided)
         yield pieces
+        whole.append(undecided)
         # Their control points live on in the list only, which gives them up when it is divided.
         del undecided, rest
-        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, waiting)
-    yield from _divided_to(0, rates, waiting)
+        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, whole, parts)
+        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, parts, parts)
+    yield from _divided_to(0, rates, whole, parts)
+    yield from _divided_to(0, rates, parts, parts)
 
 
-def _divided_to(most: int, rates: TileRates, waiting: list[_Undecided]) -> Iterator[tuple[Tiles, FloatArray | None]]:
-    """Divide the tiles that wait, until no more than so many do: those that are decided, as `_cut`."""
+def _divided_to(
+    most: int, rates: TileRates, waiting: list[_Undecided], parts: list[_Undecided]
+) -> Iterator[tuple[Tiles, FloatArray | None]]:
+    """Divide the tiles that wait until no more than so many do; decided ones as `_cut`, others are added to a list."""
     while sum(len(tiles) for tiles, _ in waiting) > most:
         *found, undecided = _divided(rates, *_taken(waiting))
-        waiting.append(undecided)
+        parts.append(undecided)
         yield from found
 
 
