@@ -23,6 +23,7 @@ def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
         return have_flat_rings(rates, tiles, groups)
 
     monkeypatch.setattr(tile_choice, "PATCHES_AT_ONCE", most)
+    monkeypatch.setattr(tile_choice, "TILES_AT_ONCE", most)
     monkeypatch.setattr(tile_choice, "have_flat_rings", counted)
     np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)
     assert set(sizes[:-1]) == {most}

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
-from .cones import cross, dot
+from .cones import dot
 from .criterion import Criterion, Measure
 from .patch_frames import PatchFrames
 
@@ -33,18 +33,19 @@ def feature_edges(
     if criterion.measure is Measure.EDGE:
         return np.zeros(t.half_edge_count, dtype=bool)
     # Of the elements beside each edge.
-    sums = np.stack([np.bincount(names, x) for x in _normals(patches, points).take(t.face, axis=1)])
-    is_fold = (np.bincount(names) != 2) | (np.square(sums).sum(axis=0) < 2 + 2 * FOLDED)
+    squares = sum(np.square(np.bincount(names, x.take(t.face))) for x in _normals(patches, points))
+    is_fold = (np.bincount(names) != 2) | (squares < 2 + 2 * FOLDED)
     return is_fold[names] | ((t.twin < 0) & (criterion.outline is not None))
 
 
 def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
     """``(3, n_e)`` about which way elements face: unit vectors, or zero."""
     t = patches.topology
-    start = np.ascontiguousarray(points.T).take(t.face_vertices, axis=1)
-    found: FloatArray = np.stack(
-        [np.bincount(t.face, x, t.face_count) for x in cross(start, start.take(t.next, axis=1))]
-    )
+    found: FloatArray = np.empty((3, t.face_count))
+    for axis in range(3):
+        # Of each half-edge's ends, along the two other axes.
+        y, z = (points[:, (axis + step) % 3].take(t.face_vertices) for step in (1, 2))
+        found[axis] = np.bincount(t.face, y * z.take(t.next) - z * y.take(t.next), t.face_count)
     if patches.scheme.element == "vertex":
         of_corner, t = found[:, t.face_of(patches.half_edge_of_corner)], patches.elements
         found = np.stack([np.bincount(t.face, x, t.face_count) for x in of_corner])

@@ -24,24 +24,30 @@ FOLDED = 1e-6
 
 
 class PatchGroup(NamedTuple):
-    """Patches of a class, each as one tile.
+    """One-rings of one class.
 
     Attributes
     ----------
     signature : Signature
     at : (n,) int64
-        Which of some tiles they are.
+        The tile that each is of.
     points : (K, 3, n) float64
         Control points.
+    slots : (K,) int64 or None
+        The vertices of a one-ring that these are; None if they are all.
     """
 
     signature: Signature
     at: IntArray
     points: FloatArray
+    slots: IntArray | None = None
 
     def chosen(self, which: NDArray[np.bool_]) -> PatchGroup:
-        """Some of the patches."""
-        return self if which.all() else self._replace(at=self.at[which], points=self.points[..., which])
+        """Some of them."""
+        if which.all():
+            return self
+        chosen = np.flatnonzero(which)
+        return self._replace(at=self.at[chosen], points=self.points.take(chosen, axis=2))
 
 
 def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) -> NDArray[np.bool_]:
@@ -50,36 +56,33 @@ def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) ->
     Most patches of a dense cage are, and need no further test.
     """
     count = len(tiles)
-    lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((4, 3, count))
+    corners, extent = np.empty((4, 3, count)), np.empty(count)
     for each in groups:
-        lower[:, each.at], upper[:, each.at] = each.points.min(axis=0), each.points.max(axis=0)
         # The diagonals of a face: the element, or a face beside a vertex element.
         topology = one_ring(each.signature.smoothed).topology
         size = int(topology.face_sizes[0])
         corners[..., each.at] = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
+    lower, upper = _boxes(groups, count)
     limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
     fits = np.linalg.norm(upper - lower, axis=0) <= limit
     if rates.criterion.measure is Measure.EDGE:
         return fits
     axis = axis_across(corners)
-    may_be_flat = axis.any(axis=0) & ~fits & ~tiles.sides.any(axis=1)
     for each in groups:
-        extent = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
-        flat = each.chosen(may_be_flat[each.at] & (extent <= limit[each.at]))
-        fits[flat.at] = ~_are_folded(flat.signature, flat.points, axis[:, flat.at])
-    return fits
+        extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
+    may_be_flat = axis.any(axis=0) & ~fits & ~tiles.sides.any(axis=1) & (extent <= limit)
+    return fits | (may_be_flat & ~_are_folded(groups, axis, may_be_flat))
 
 
 def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray[np.bool_]:
     """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along feature edges."""
-    count, m = len(tiles), rates.domain.corner_count
-    lower, upper, corners = np.empty((3, count)), np.empty((3, count)), np.empty((m, 3, count))
-    axis, folded = np.empty((3, count)), np.empty(count, dtype=bool)
-    for each in groups:
-        ring, own = each.tile.one_ring_points(each.values), times(each.tile.corners, each.values)
-        lower[:, each.owner], upper[:, each.owner] = ring.min(axis=0), ring.max(axis=0)
-        corners[..., each.owner], axis[:, each.owner] = own, axis_across(own)
-        folded[each.owner] = _are_folded(each.tile.signature, ring, axis[:, each.owner], each.tile.slots)
+    count, corners = len(tiles), np.empty((rates.domain.corner_count, 3, len(tiles)))
+    rings = []
+    for own, points, at, _ in groups:
+        rings.append(PatchGroup(own.signature, at, own.one_ring_points(points), own.slots))
+        corners[..., at] = times(own.corners, points)
+    lower, upper = _boxes(rings, count)
+    axis = axis_across(corners)
     limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
     if rates.criterion.measure is Measure.EDGE:
         return fit_within(rates.scheme, limit, groups)
@@ -88,7 +91,7 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray
     fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & bool(optional_member(rates.scheme, "has_convex_rules"))
     has_normal = axis.any(axis=0)
     found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
-    folded &= found & ~fits
+    folded = _are_folded(rings, axis, found & ~fits)
     if folded.any():
         found &= ~folded | (_normal_sines(rates, groups, axis, folded) < 1)
     if rates.criterion.outline is not None:
@@ -102,27 +105,41 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray
     return found
 
 
-def _are_folded(
-    signature: Signature, points: FloatArray, axis: FloatArray, slots: IntArray | None = None
-) -> NDArray[np.bool_]:
-    """``(t,)`` whether control faces of one-rings ``(K, 3, t)`` face opposite ways, seen along axes ``(3, t)``.
+def _boxes(groups: list[PatchGroup], count: int) -> tuple[FloatArray, FloatArray]:
+    """Least and largest coordinates ``(3, t)`` of the control points of each one-ring."""
+    lower, upper = np.empty((3, count)), np.empty((3, count))
+    for each in groups:
+        lower[:, each.at], upper[:, each.at] = each.points.min(axis=0), each.points.max(axis=0)
+    return lower, upper
+
+
+def _are_folded(groups: list[PatchGroup], axis: FloatArray, are_asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """``(t,)`` whether control faces of some one-rings face opposite ways, seen along axes ``(3, t)``.
 
     Such a surface has silhouettes along its folds, and not only along edges of the cage. At a dart, where one vertex of
     the ring is left out as it equals another, so are its faces.
     """
-    t, (first, second) = one_ring(signature.smoothed).topology, _normals_to(axis)
-    # The diagonals of each face; of triangles, two sides.
-    quarters = t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4
-    vertices = t.face_vertices[quarters]
-    if slots is not None:
-        number = np.full(t.vertex_count, -1)
-        number[slots] = np.arange(len(slots))
-        vertices = number[vertices]
-    a, b, c, d = vertices[:, (vertices >= 0).all(axis=0)]
-    x, y = dot(points, first), dot(points, second)
-    areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
-    folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
-    return folded
+    found = np.zeros(len(are_asked), dtype=bool)
+    asked = np.flatnonzero(are_asked)
+    across = np.empty((2, 3, len(are_asked)))
+    across[..., asked] = _normals_to(axis[:, asked])
+    for each in groups:
+        own = each.chosen(are_asked[each.at])
+        if not len(own.at):
+            continue
+        t = one_ring(own.signature.smoothed).topology
+        # The diagonals of each face; of triangles, two sides.
+        quarters = t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4
+        vertices = t.face_vertices[quarters]
+        if own.slots is not None:
+            number = np.full(t.vertex_count, -1)
+            number[own.slots] = np.arange(len(own.slots))
+            vertices = number[vertices]
+        a, b, c, d = vertices[:, (vertices >= 0).all(axis=0)]
+        x, y = (dot(own.points, along) for along in across[..., own.at])
+        areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
+        found[own.at] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
+    return found
 
 
 def _normal_sines(
@@ -134,15 +151,19 @@ def _normal_sines(
     less than on these.
     """
     found = np.ones(axis.shape[1])
+    # Those of all tiles together, as tiles of many kinds are few of each.
+    owners, coefficients = [], []
     for each in groups:
-        on = are_asked[each.owner]
-        if not on.any() or each.tile.pieces is None:
-            continue
-        own, pieces = each.chosen(on), each.tile.pieces
-        coefficients = times(pieces.reshape(-1, pieces.shape[2]), own.values)
-        by_coefficient = coefficients.reshape(-1, len(rates.basis.indices), *coefficients.shape[1:]).swapaxes(0, 1)
-        by_coefficient = np.ascontiguousarray(by_coefficient)
-        found[own.owner] = rates.normal_sines(by_coefficient, axis[:, own.owner]).max(axis=0)
+        pieces, on = each.tile.pieces, are_asked[each.owner]
+        if pieces is not None and on.any():
+            own = each.chosen(on)
+            of_pieces = times(pieces.reshape(-1, pieces.shape[2]), own.values).reshape(*pieces.shape[:2], 3, -1)
+            coefficients.append(of_pieces.transpose(1, 2, 0, 3).reshape(pieces.shape[1], 3, -1))
+            owners.append(np.tile(own.owner, len(pieces)))
+    if owners:
+        owner = np.concatenate(owners)
+        found[owner] = 0
+        np.maximum.at(found, owner, rates.normal_sines(np.concatenate(coefficients, axis=2), axis[:, owner]))
     return found
 
 

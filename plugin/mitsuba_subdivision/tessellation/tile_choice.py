@@ -12,7 +12,8 @@ from ..cage.errors import warn
 from ..evaluation.bernstein import times
 from ..evaluation.divided_element import divided_elements
 from ..evaluation.divided_tile import part_of_tile
-from ..mesh.connectivity import IntArray
+from ..mesh import ragged
+from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -22,13 +23,18 @@ from .criterion import Criterion
 from .feature_edges import feature_edges, sides_on
 from .flat_tiles import PatchGroup, are_flat, have_flat_rings
 from .patch_frames import PatchFrames
-from .spans import joined
+from .spans import joined, sort
 from .tile_extents import TileParts, alike
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
-# Number of patches, or of tiles in pieces, processed together, which bounds temporary memory.
-PATCHES_AT_ONCE = 1 << 14
+# Number of patches that are divided together, and of tiles in pieces whose rates are chosen together. They bound
+# temporary memory; fewer would take more time.
+PATCHES_AT_ONCE, TILES_AT_ONCE = 1 << 12, 1 << 13
+
+# Tiles that lie in pieces, with Bernstein coefficients ``(b, 3, t)`` over them; and others, with their control points.
+_Pieces = tuple[Tiles, FloatArray]
+_Undecided = tuple[Tiles, list[TileParts]]
 
 
 def choose_tiles(
@@ -161,115 +167,156 @@ def _cut(
     rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]
 ) -> Iterator[tuple[Tiles, FloatArray | None]]:
     """Tiles of all patches: those with rates; and those that lie in pieces, with Bernstein coefficients over them."""
+    whole: list[_Undecided] = []
+    # Few tiles of each block are divided again: those of many blocks together.
+    parts: list[_Undecided] = []
     for tiles, patches in blocks:
         rest = patches
         if optional_member(rates.scheme, "has_convex_rules"):
             is_flat = have_flat_rings(rates, tiles, patches)
             yield tiles[is_flat], None
             rest = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
-        flat, pieces, coefficients = _divided(rates, tiles, rest)
-        yield flat, None
-        yield pieces, coefficients
+        pieces, undecided = _parts_of_patches(rates, tiles, rest)
+        yield pieces
+        whole.append(undecided)
+        # Their control points live on in the list only, which gives them up when it is divided.
+        del undecided, rest
+        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, whole, parts)
+        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, parts, parts)
+    yield from _divided_to(0, rates, whole, parts)
+    yield from _divided_to(0, rates, parts, parts)
+
+
+def _divided_to(
+    most: int, rates: TileRates, waiting: list[_Undecided], parts: list[_Undecided]
+) -> Iterator[tuple[Tiles, FloatArray | None]]:
+    """Divide the tiles that wait until no more than so many do; decided ones as `_cut`, others are added to a list."""
+    while sum(len(tiles) for tiles, _ in waiting) > most:
+        *found, undecided = _divided(rates, *_taken(waiting))
+        parts.append(undecided)
+        yield from found
 
 
 def _in_runs(cut: Iterable[tuple[Tiles, FloatArray | None]]) -> Iterator[tuple[Tiles, FloatArray | None]]:
-    """The same tiles, those in pieces in runs of `PATCHES_AT_ONCE`: most blocks have few, and each run takes time."""
-    waiting: list[tuple[Tiles, FloatArray]] = []
+    """The same tiles, those in pieces in runs of `TILES_AT_ONCE`: most blocks have few, and each run takes time."""
+    waiting: list[_Pieces] = []
     for tiles, coefficients in cut:
         if coefficients is None:
             yield tiles, None
             continue
         waiting.append((tiles, coefficients))
-        if sum(len(each) for each, _ in waiting) >= PATCHES_AT_ONCE:
+        if sum(len(each) for each, _ in waiting) >= TILES_AT_ONCE:
             yield from _runs(waiting)
-            waiting = []
     yield from _runs(waiting)
 
 
-def _runs(pieces: list[tuple[Tiles, FloatArray]]) -> Iterator[tuple[Tiles, FloatArray]]:
-    if pieces:
-        tiles = Tiles.joined([each for each, _ in pieces])
-        coefficients = np.concatenate([each for _, each in pieces], axis=2)
-        for begin in range(0, len(tiles), PATCHES_AT_ONCE):
-            run = slice(begin, begin + PATCHES_AT_ONCE)
+def _runs(waiting: list[_Pieces]) -> Iterator[_Pieces]:
+    """All tiles of a list, which is left empty."""
+    if waiting:
+        tiles = Tiles.joined([each for each, _ in waiting])
+        coefficients = np.concatenate([each for _, each in waiting], axis=2)
+        waiting.clear()
+        for begin in range(0, len(tiles), TILES_AT_ONCE):
+            run = slice(begin, begin + TILES_AT_ONCE)
             yield tiles[run], coefficients[..., run]
 
 
-def _divided(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple[Tiles, Tiles, FloatArray]:
-    """Divide patches until each tile lies in a piece, or is so flat that one pair of triangles suffices.
-
-    Returns
-    -------
-    flat, pieces : Tiles
-    coefficients : (b, 3, t) float64
-        Bernstein coefficients over the tiles that lie in pieces.
-    """
-    scheme = rates.scheme
-    flat: list[Tiles] = [tiles[:0]]
-    pieces: list[tuple[Tiles, FloatArray]] = [(tiles[:0], np.empty((len(rates.basis.indices), 3, 0)))]
-    waiting: list[TileParts] = []
-    for each, element in zip(patches, divided_elements(scheme, [own.signature for own in patches]), strict=True):
+def _parts_of_patches(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple[_Pieces, _Undecided]:
+    """Patches, each as one tile: those that are pieces, and those that are not."""
+    pieces, parts = [], []
+    for each, element in zip(patches, divided_elements(rates.scheme, [own.signature for own in patches]), strict=True):
         every = np.eye(element.control_count)
         tile, rows = part_of_tile(element, every)
         points = each.points if rows is every else times(rows, each.points)
         if tile is None:
-            pieces.append((tiles[each.at], points))
+            pieces.append((each.at, points))
         else:
-            waiting.append(TileParts(tile, points, each.at))
-    while waiting:
-        tiles, waiting = _numbered(tiles, alike(waiting))
-        # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
-        is_done = are_flat(rates, tiles, waiting) | (tiles.depth >= DEEPEST - 1)
-        flat.append(tiles[is_done])
-        is_last = rates.most(tiles) == 1
-        for group in waiting:
-            if group.tile.is_self_similar:
-                is_last[group.owner] = False
-        coarse = tiles[is_last & ~is_done]
-        # More than one, and how many more is not known.
-        flat.append(replace(coarse, rates=2 * coarse.rates))
-        is_done |= is_last
-        index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
-        children = [tiles.child(number, scheme.domain) for number in range(4)]
-        halvings = np.concatenate([each.halvings for each in children])
-        divided, waiting = waiting, []
-        of_pieces, coefficients = [], []
-        for group in divided:
-            if is_done[group.owner].all():
+            parts.append(TileParts(tile, points, each.at))
+    return _in_pieces(rates, tiles, pieces), _numbered(tiles, parts)
+
+
+def _divided(
+    rates: TileRates, tiles: Tiles, parts: list[TileParts]
+) -> tuple[tuple[Tiles, None], tuple[Tiles, None], _Pieces, _Undecided]:
+    """Divide tiles once, but for those so flat that one pair of triangles suffices.
+
+    Returns
+    -------
+    flat, coarse : Tiles
+        Tiles that are flat, and those that may not be divided.
+    pieces : tuple of Tiles and (b, 3, t) float64
+        Tiles that lie in a piece, and Bernstein coefficients over these.
+    undecided : tuple of Tiles and list of TileParts
+        All others.
+    """
+    # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
+    is_done = are_flat(rates, tiles, parts) | (tiles.depth >= DEEPEST - 1)
+    flat = tiles[is_done]
+    is_last = rates.most(tiles) == 1
+    for group in parts:
+        if group.tile.is_self_similar:
+            is_last[group.owner] = False
+    coarse = tiles[is_last & ~is_done]
+    is_done |= is_last
+    index, tiles = np.cumsum(~is_done) - 1, tiles[~is_done]
+    children = [tiles.child(number, rates.domain) for number in range(4)]
+    halvings = np.concatenate([each.halvings for each in children])
+    pieces: list[tuple[IntArray, FloatArray]] = []
+    undecided = []
+    for group in parts:
+        if is_done[group.owner].all():
+            continue
+        rest = group.chosen(~is_done[group.owner])
+        parents = index[rest.owner]
+        for number, (tile, rows) in enumerate(group.tile.children):
+            at, points = number * len(tiles) + parents, times(rows, rest.values)
+            if tile is None:
+                pieces.append((at, points))
                 continue
-            rest = group.chosen(~is_done[group.owner])
-            parents = index[rest.owner]
-            for number, (tile, rows) in enumerate(group.tile.children):
-                at, points = number * len(tiles) + parents, times(rows, rest.values)
-                if tile is None:
-                    of_pieces.append(at)
-                    coefficients.append(points)
-                    continue
-                if tile is group.tile:
-                    # Each ring around an extraordinary point may have as many segments as the one around it.
-                    halvings[at] = tiles.halvings[parents]
-                waiting.append(TileParts(tile, points, at))
-        tiles = replace(Tiles.joined(children), halvings=halvings)
-        if of_pieces:
-            pieces.append((tiles[np.concatenate(of_pieces)], np.concatenate(coefficients, axis=2)))
-    in_pieces = Tiles.joined([each for each, _ in pieces])
-    return Tiles.joined(flat), in_pieces, np.concatenate([each for _, each in pieces], axis=2)
+            if tile is group.tile:
+                # Each ring around an extraordinary point may have as many segments as the one around it.
+                halvings[at] = tiles.halvings[parents]
+            undecided.append(TileParts(tile, points, at))
+    tiles = replace(Tiles.joined(children), halvings=halvings)
+    # More than one segment, and how many more is not known.
+    coarse = replace(coarse, rates=2 * coarse.rates)
+    return (flat, None), (coarse, None), _in_pieces(rates, tiles, pieces), _numbered(tiles, undecided)
+
+
+def _in_pieces(rates: TileRates, tiles: Tiles, pieces: list[tuple[IntArray, FloatArray]]) -> _Pieces:
+    """Some of the tiles, with their coefficients."""
+    at = np.concatenate([np.empty(0, dtype=np.int64), *(own for own, _ in pieces)])
+    none = np.empty((len(rates.basis.indices), 3, 0))
+    return tiles[at], np.concatenate([none, *(coefficients for _, coefficients in pieces)], axis=2)
+
+
+def _taken(waiting: list[_Undecided]) -> _Undecided:
+    """All tiles of a list together, which is left empty."""
+    first = ragged.starts(np.array([len(tiles) for tiles, _ in waiting]))
+    parts = [
+        part._replace(owner=begin + part.owner)
+        for begin, (_, own) in zip(first.tolist(), waiting, strict=True)
+        for part in own
+    ]
+    tiles = Tiles.joined([own for own, _ in waiting])
+    waiting.clear()
+    return _numbered(tiles, alike(parts))
 
 
 def _numbered(tiles: Tiles, groups: list[TileParts]) -> tuple[Tiles, list[TileParts]]:
     """The tiles of some groups only, one group after the other."""
     ends = np.cumsum([len(group.owner) for group in groups]).tolist()
-    chosen = tiles[np.concatenate([group.owner for group in groups])]
+    chosen = tiles[np.concatenate([np.empty(0, dtype=np.int64), *(group.owner for group in groups)])]
     return chosen, [
         group._replace(owner=np.arange(end - len(group.owner), end)) for group, end in zip(groups, ends, strict=True)
     ]
 
 
-def _order(tiles: Tiles) -> IntArray:
+def _order(tiles: Tiles) -> IndexArray:
     """Tiles in the order of their patches' corners, and so of the elements, along a curve of Morton's."""
     depth = int(tiles.depth.max(initial=0))
     u, v = (_interleaved(axis.astype(np.int64) << (depth - tiles.depth)) for axis in tiles.origin.T)
-    return np.argsort(joined(tiles.corner, (u | v << 1) << 1 | tiles.is_flipped, 2 * depth + 1), kind="stable")
+    return sort(joined(tiles.corner, (u | v << 1) << 1 | tiles.is_flipped, 2 * depth + 1))
 
 
 def _interleaved(values: IntArray) -> IntArray:

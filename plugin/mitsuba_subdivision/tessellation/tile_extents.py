@@ -54,7 +54,10 @@ class TileParts(NamedTuple):
 
     def chosen(self, which: NDArray[np.bool_]) -> TileParts:
         """Some of the parts."""
-        return self if which.all() else self._replace(values=self.values[..., which], owner=self.owner[which])
+        if which.all():
+            return self
+        chosen = np.flatnonzero(which)
+        return self._replace(values=self.values.take(chosen, axis=2), owner=self.owner[chosen])
 
 
 def alike(parts: list[TileParts]) -> list[TileParts]:
@@ -103,14 +106,16 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
     for division in range(MOST_DIVISIONS[is_convex]):
         is_last = division == MOST_DIVISIONS[is_convex] - 1
         levels = LEVELS_TOGETHER[division] if division < len(LEVELS_TOGETHER) else LATER_TOGETHER
-        below: list[tuple[TileParts, _Child, FloatArray]] = []
+        # With boxes around their control points.
+        below: list[tuple[TileParts, _Child, FloatArray, FloatArray]] = []
         for part in alike(waiting):
             divided = _divided(scheme, part.tile, part.side, levels if part.side is None else CURVES_TOGETHER)
             found = times(divided.rows, part.values)
             points.add(part.owner, found[: divided.point_count])
             if divided.hull_count > divided.point_count:
                 hulls.add(part.owner, found[divided.point_count : divided.hull_count])
-            below += [(part, child, found[child.ring]) for child in divided.children]
+            for child in divided.children:
+                below.append((part, child, found[child.ring].min(axis=0), found[child.ring].max(axis=0)))
         low, high = points.box()
         size = np.linalg.norm(np.maximum(0, high - low), axis=0)
         # Margin within which parts keep a tile's extent below its limit; negative if its points exceed it already.
@@ -118,18 +123,16 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
         low, high = np.where(slack >= 0, low - slack, np.inf), np.where(slack >= 0, high + slack, -np.inf)
         if not below:
             break
-        owner = np.concatenate([part.owner for part, _, _ in below])
+        owner = np.concatenate([part.owner for part, *_ in below])
         is_left = slack[owner] >= 0
         if is_convex or is_last:
-            ring_low, ring_high = (
-                np.concatenate([f(ring, axis=0) for *_, ring in below], axis=1) for f in (np.min, np.max)
-            )
+            ring_low, ring_high = (np.concatenate(each, axis=1) for each in list(zip(*below, strict=True))[2:])
             is_near = ((ring_low >= low[:, owner]) & (ring_high <= high[:, owner])).all(axis=0)
             is_done = is_left & (is_near | is_last)
             hulls.add_boxes(owner[is_done], ring_low[:, is_done], ring_high[:, is_done])
             is_left &= ~is_done
-        waiting, ends = [], np.cumsum([len(part.owner) for part, _, _ in below])
-        for (part, child, _), chosen in zip(below, np.split(is_left, ends[:-1]), strict=True):
+        waiting, ends = [], np.cumsum([len(part.owner) for part, *_ in below])
+        for (part, child, *_), chosen in zip(below, np.split(is_left, ends[:-1]), strict=True):
             at = np.flatnonzero(chosen)
             if len(at):
                 values = times(child.rows, part.values.take(at, axis=2))

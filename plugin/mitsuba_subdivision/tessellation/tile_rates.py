@@ -21,7 +21,7 @@ from .patch_frames import PatchFrames
 from .tiles import UNIT, Tiles
 
 # Parts of tiles are looked at so many at once, whose derivatives stay in a core's cache.
-PARTS_AT_ONCE = 1 << 12
+PARTS_AT_ONCE = 1 << 11
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
 # Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
@@ -155,8 +155,13 @@ class TileRates:
 
         One where normals are not known to lead to one side of the planes across the axes.
         """
-        tangents = [TangentCone.of(times(derivative, coefficients)) for derivative in self.basis.derivatives]
-        return NormalCone.of(*tangents).around(axis).sine
+        found = np.empty(axis.shape[1])
+        for begin in range(0, len(found), PARTS_AT_ONCE):
+            tiles = slice(begin, begin + PARTS_AT_ONCE)
+            own = np.ascontiguousarray(coefficients[..., tiles])
+            tangents = [TangentCone.of(times(derivative, own)) for derivative in self.basis.derivatives]
+            found[tiles] = NormalCone.of(*tangents).around(axis[:, tiles]).sine
+        return found
 
     def most(self, tiles: Tiles) -> IntArray:
         """``(t,)`` the highest rates that tiles may have."""
