@@ -418,3 +418,15 @@ def test_surfaces_of_the_stage_look_as_they_should(tmp_path):
     path = stage(tmp_path, SKY + CAMERA + LOOKS % "" + bound(), red=text)
     picture = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), [0.25, 0.5, 0.75], rtol=0.02)
+
+
+@pytest.mark.parametrize("color", [(0.25, 0.5, 0.75), None])
+def test_a_material_of_the_mesh_s_colour_is_black_where_the_mesh_has_none(tmp_path, color):
+    inputs = '<input name="base_color" type="color3" nodename="tone" />' + value("specular", "float", "0")
+    text = surface(inputs, graph='<geomcolor name="tone" type="color3" />')
+    square = (
+        bound() if color is None else bound().replace(SQUARE, SQUARE + f"color3f[] primvars:displayColor = [{color}]")
+    )
+    path = stage(tmp_path, SKY + CAMERA + LOOKS % "" + square, red=text)
+    picture = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
+    np.testing.assert_allclose(picture.mean(axis=(0, 1)), color or (0, 0, 0), rtol=0.02)
