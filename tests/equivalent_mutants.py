@@ -64,6 +64,16 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "return paired(self.edge_names.__getitem__, self.half_edge_count,"
                 " int(self.edge_names.max(initial=0)) + 2)",
             ),
+            (
+                "kernels/apply_weights.py",
+                "if first < index and (is_product or (count > FEW_SAMPLES and is_other_size)):",
+                "if first < index and (is_product or (count >= FEW_SAMPLES and is_other_size)):",
+            ),
+            (
+                "tessellation/uniform.py",
+                "step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))",
+                "step = max(1, WEIGHTS_TOGETHER // (3 + len(uv) * most))",
+            ),
         ),
     ),
     (
@@ -87,10 +97,16 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "if self._first is not None and self._first[0] == number:",
                 "if self._first is not None and self._first[ 1] == number:",
             ),
+            (
+                "shapes/exact_shading.py",
+                "return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))",
+                "return dr.select(dr.squared_norm(seen) >= 0, seen, vector3(dr.detach(si.n)))",
+            ),
         ),
     ),
     (
-        "values that no one reads: masked, overwritten, or of a loop over nothing",
+        "values that no one reads: masked, overwritten, of a loop over nothing, an entry more of a copied table, or the"
+        " file of memory that has none",
         (
             (
                 "evaluation/equations.py",
@@ -128,6 +144,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "schemes/crease_masks.py",
                 "twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]",
                 "twin_refined = semi.edges_refined[np.maximum(t.twin, -1)]",
+            ),
+            ("shapes/mitsuba_3_9_hook/interaction_hook.py", "_BEFORE = 2", "_BEFORE = 3"),
+            (
+                "shapes/mitsuba_3_9_hook/machine_code.py",
+                "address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)",
+                "address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, +1, 0)",
             ),
         ),
     ),
@@ -189,10 +211,16 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "size, length = maps.shape[-1], max(1, PARTS_AT_ONCE // maps.shape[2])",
                 "size, length = maps.shape[+1], max(1, PARTS_AT_ONCE // maps.shape[2])",
             ),
+            (
+                "shapes/displaced_vertices.py",
+                "self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]",
+                "self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[ -1] for each in values]",
+            ),
         ),
     ),
     (
-        "another name for the same thing: keys stay as distinct, and what is below zero counts as smooth",
+        "another name for the same thing: keys stay as distinct, what is below zero counts as smooth, and both sides of"
+        " an edge run along it the same way",
         (
             (
                 "mesh/manifold.py",
@@ -216,10 +244,15 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))",
                 "sharpness = Sharpness(np.where(seam, INFINITE, -1.0), np.zeros(topology.vertex_count))",
             ),
+            (
+                "tessellation/patch_frames.py",
+                "edge, is_backward = lower, lower != every",
+                "edge, is_backward = lower, lower == every",
+            ),
         ),
     ),
     (
-        "a difference within rounding, or a tie of two results that are both right",
+        "a difference within rounding, a tie of two results that are both right, or a factor of zero",
         (
             ("mesh/refinement_differences.py", "DECIMALS = 12", "DECIMALS = 13"),
             ("patches/area_samples.py", "ROUNDED = 1 + 1e-9", "ROUNDED = 1 - 1e-9"),
@@ -241,11 +274,23 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "bend = np.where(is_newton[slides], bend, flat + damped[slides])",
                 "bend = np.where(is_newton[slides], bend, flat - damped[slides])",
             ),
+            (
+                "kernels/nearest_location.py",
+                "inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)",
+                "inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 1)",
+            ),
+            (
+                "shapes/moving_vertices.py",
+                "return placed(positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix),"
+                " types.vector3)",
+                "return placed(positions, normals, matrix if not dr.is_jit_v(matrix) else types.matrix4(matrix),"
+                " types.vector3)",
+            ),
         ),
     ),
     (
-        "a probe or a step among many as good: any power checks a basis, any places a linear function, and steps of"
-        " either sign shrink until one leads nearer",
+        "a probe or a step among many as good: any power checks a basis, any places a linear function or a"
+        " texture's kind, and steps of either sign shrink until one leads nearer",
         (
             ("evaluation/eigenbasis.py", "POWER = 20", "POWER = 19"),
             ("evaluation/ring_symmetry.py", "PROBES_OF_FACE = 2", "PROBES_OF_FACE = 1"),
@@ -260,6 +305,7 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "self.part = np.where(improves, 1, self.part * SHORTER)",
                 "self.part = np.where(improves, 2, self.part * SHORTER)",
             ),
+            ("shapes/heights.py", "middle = self._interaction(0.5, 0.5)", "middle = self._interaction( 1.5, 0.5)"),
         ),
     ),
     (
