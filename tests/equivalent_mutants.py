@@ -216,6 +216,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]",
                 "self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[ -1] for each in values]",
             ),
+            (
+                "tessellation/memory.py",
+                "is_whole = refined is None and patches.is_whole[patches.elements.face_of(patch_class.corners[:1])][0]",
+                "is_whole = refined is None and patches.is_whole[patches.elements.face_of("
+                "patch_class.corners[: 2])][0]",
+            ),
         ),
     ),
     (
@@ -248,6 +254,16 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "tessellation/patch_frames.py",
                 "edge, is_backward = lower, lower != every",
                 "edge, is_backward = lower, lower == every",
+            ),
+            (
+                "tessellation/spans.py",
+                "point, of_point = ranked(joined(point, of_points, 32))",
+                "point, of_point = ranked(joined(point, of_points, 33))",
+            ),
+            (
+                "tessellation/stitching.py",
+                "width = int(most.max(initial=0)) + 2",
+                "width = int(most.max(initial=0)) + 1",
             ),
         ),
     ),
