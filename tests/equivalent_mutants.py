@@ -74,6 +74,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))",
                 "step = max(1, WEIGHTS_TOGETHER // (3 + len(uv) * most))",
             ),
+            ("evaluation/irregular_patch.py", "MANY_CONTROLS = 256", "MANY_CONTROLS = 255"),
+            ("patches/element_bounds.py", "@lru_cache(maxsize=64)", "@lru_cache(maxsize= 63)"),
         ),
     ),
     (
@@ -150,6 +152,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "shapes/mitsuba_3_9_hook/machine_code.py",
                 "address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)",
                 "address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, +1, 0)",
+            ),
+            (
+                "evaluation/equations.py",
+                "ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)",
+                "ratios = np.where(kept, basis.eigenvalues / base, -1).astype(real)",
             ),
         ),
     ),
@@ -301,6 +308,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 " types.vector3)",
                 "return placed(positions, normals, matrix if not dr.is_jit_v(matrix) else types.matrix4(matrix),"
                 " types.vector3)",
+            ),
+            (
+                "patches/nearest_in_piece.py",
+                "return step * np.minimum(part, 1)[:, None], is_newton & (part >= 1)",
+                "return step * np.minimum(part, 1)[:, None], is_newton & (part > 1)",
             ),
         ),
     ),
