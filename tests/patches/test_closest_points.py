@@ -25,6 +25,8 @@ COUNT = 6
 ROUNDED = 1e-13
 # Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
+# Of areas: sums over pieces in another order.
+AREA = 1e-12
 # Of parameters: the same steps, but for rounding of sums over other numbers of points.
 DESCENT = 1e-12
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
@@ -187,8 +189,9 @@ def test_elements_that_are_divided_when_needed_change_nothing(name, np_rng, monk
     expected = surface.closest_point(points)
     monkeypatch.setattr(polynomial_pieces, "MOST_PIECES", 1)
     monkeypatch.setattr(polynomial_pieces, "DIVISIONS", 1)
-    found = LimitSurface(surface.cage).closest_point(points)
-    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
+    later = LimitSurface(surface.cage)
+    np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
+    assert later.area() == pytest.approx(surface.area(), rel=AREA)
 
 
 def test_descents_are_the_same_in_every_unit_of_length(np_rng):
