@@ -76,6 +76,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
             ),
             ("evaluation/irregular_patch.py", "MANY_CONTROLS = 256", "MANY_CONTROLS = 255"),
             ("patches/element_bounds.py", "@lru_cache(maxsize=64)", "@lru_cache(maxsize= 63)"),
+            ("patches/patch_table.py", "KEPT_BYTES = 1 << 25", "KEPT_BYTES = 2 << 25"),
+            ("patches/one_ring_codes.py", "elif count > FEW_CODES:", "elif count < FEW_CODES:"),
         ),
     ),
     (
@@ -313,6 +315,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "patches/nearest_in_piece.py",
                 "return step * np.minimum(part, 1)[:, None], is_newton & (part >= 1)",
                 "return step * np.minimum(part, 1)[:, None], is_newton & (part > 1)",
+            ),
+            (
+                "patches/surface_area.py",
+                "rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)",
+                "rough = sum(float(_measured(part, ORDERS[0])[ 0].sum()) for part in parts)",
             ),
         ),
     ),
