@@ -18,8 +18,8 @@ from mitsuba_subdivision.images.compare import compare, relmse
 from mitsuba_subdivision.images.flip_tier import flip, flip_exposures
 from mitsuba_subdivision.images.image import Image
 from mitsuba_subdivision.images.panel import Panel
-from mitsuba_subdivision.images.png import srgb
-from mitsuba_subdivision.images.probe_tier import normal_angle
+from mitsuba_subdivision.images.png import colours, srgb
+from mitsuba_subdivision.images.probe_tier import _ANGLE_DECADES, normal_angle
 from mitsuba_subdivision.images.report import write_report
 from mitsuba_subdivision.images.tier import Status, TierResult
 from mitsuba_subdivision.images.tiers import TIERS, Tier
@@ -229,6 +229,38 @@ def test_silhouettes_do_not_count(reference, np_rng):
     assert compare(reference, random_image(np_rng, probe=changed_probe(normal=normal)), ["probe"]).exit_status == 0
 
 
+def test_normals_count_from_the_third_pixel_beside_one_of_another_shape(reference, np_rng):
+    """It and the four pixels beside it are a silhouette, and the eight neighbours of these do not count either."""
+    silhouette = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]
+    for y, x in np.argwhere(np.ones((7, 7))) - 3:
+        normal, shape = dome().normal.copy(), dome().shape.copy()
+        shape[16, 16] = 2**32 - 1
+        normal[16 + y, 16 + x] *= -1
+        found = compare(reference, random_image(np_rng, probe=changed_probe(normal=normal, shape=shape)), ["probe"])
+        is_near = any(max(abs(y - b), abs(x - a)) <= 1 for b, a in silhouette)
+        assert found.tier("probe").status is (Status.PASS if is_near else Status.FAIL), (y, x)
+
+
+def test_the_worst_normal_is_none_at_a_silhouette(reference, np_rng):
+    """Its own is turned more than one in the middle."""
+    normal, probe = dome().normal.copy(), dome()
+    y, x = np.argwhere(probe.hit)[0]
+    normal[y, x], normal[16, 12] = -normal[y, x], normal[16, 12] @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    loose = LIMITS.with_values({"angle_p999": 180})
+    found = compare(reference, random_image(np_rng, probe=changed_probe(normal=normal)), ["probe"], loose)
+    assert "degrees between normals, maximum" in found.tier("probe").lines[0]
+    assert (found.worst.x, found.worst.y) == (12, 16)
+
+
+def test_colours_of_angles_are_even_over_decades(reference):
+    low, high = _ANGLE_DECADES
+    angles = 10.0 ** np.arange(low - 2, high + 2)[None]
+    result = TierResult("probe", Status.FAIL, [], {}, None, {"angle": angles})
+    (panel,) = TIERS["probe"].panels(reference, reference, result)
+    expected = np.clip((np.arange(low - 2, high + 2) - low) / (high - low), 0, 1)
+    np.testing.assert_array_equal(panel.pixels[0], colours(expected, panel.colour_map))
+
+
 def test_the_worst_pixel_names_both_values_and_the_surface(reference, np_rng):
     found = compare(reference, random_image(np_rng, probe=changed_probe(normal=rotated(1.0))))
     assert found.worst.shown_by == "probe"
@@ -331,6 +363,7 @@ UNUSABLE = {
     'tier "tile" cannot run: the reference has no': lambda a: compare(replace(a, estimate=None), a, ["tile"]),
     'tier "paired" cannot run': lambda a: compare(a, replace(a, paired=None, estimate=None), ["paired"]),
     'unknown tolerance "angle"': lambda a: compare(replace(a, metadata={"tolerances": {"angle": 1}}), a),
+    'tolerance "alpha" is 0; expected a probability between': lambda a: LIMITS.with_values({"alpha": 0}),  # noqa: ARG005
     'tolerance "alpha" is 1': lambda a: LIMITS.with_values({"alpha": 1}),  # noqa: ARG005
     '"flip_mean" is nan': lambda a: LIMITS.with_values({"flip_mean": math.nan}),  # noqa: ARG005
 }

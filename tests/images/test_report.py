@@ -1,6 +1,9 @@
 """The report, read as a page and looked at in a browser."""
 
+import base64
+import io
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -12,7 +15,7 @@ from images.random_images import random_image, truth
 from mitsuba_subdivision.images.compare import compare
 from mitsuba_subdivision.images.exr import read_channels
 from mitsuba_subdivision.images.panel import relative_panel
-from mitsuba_subdivision.images.png import colours, png_bytes, srgb
+from mitsuba_subdivision.images.png import MAPS, colours, png_bytes, srgb
 from mitsuba_subdivision.images.report import write_index, write_report
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -74,6 +77,36 @@ def test_the_page_has_every_panel_and_runs_nothing(tmp_path, failed):
     assert "script" not in reader.tags
     assert reader.links == ["comparison.json", "maps.exr"]
     assert "rect" in reader.tags
+
+
+def pictures(page, pattern):
+    """Pictures in a page whose element begins with a pattern, as arrays."""
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    found = re.findall(rf"{pattern}'data:image/png;base64,([^']*)'", page.read_text())
+    return [np.round(255 * pyplot.imread(io.BytesIO(base64.b64decode(each)))[..., :3]) for each in found]
+
+
+def test_equal_pictures_are_shown_alike_with_white_for_the_brightest(tmp_path, failed):
+    reference, test = pictures(write_report(tmp_path, compare(failed.reference, failed.reference)), "<image href=")[:2]
+    np.testing.assert_array_equal(reference, test)
+    is_brightest = failed.reference.pixels.max(axis=2) >= np.percentile(failed.reference.pixels, 99.5)
+    assert (reference[is_brightest].max(axis=1) == 255).all()
+    assert reference.min() < 200
+
+
+def test_legends_run_from_the_colour_of_one_end_to_that_of_the_other(tmp_path, failed):
+    bars = pictures(write_report(tmp_path, failed), "<img src=")
+    ends = [colours(np.array([0.0, 1.0]), name) for name in MAPS]
+    assert bars
+    for bar in bars:
+        assert any(np.array_equal(bar[0, [0, -1]], each) for each in ends)
+
+
+def test_the_page_speaks_of_a_worst_pixel_where_there_is_one(tmp_path, failed):
+    same = compare(failed.reference, failed.reference)
+    for comparison, is_marked in ((failed, True), (same, False)):
+        page = write_report(tmp_path, comparison).read_text()
+        assert ("Dashed circle: worst pixel" in page) == ("<circle" in page) == is_marked
 
 
 def test_names_are_escaped(tmp_path, failed):
