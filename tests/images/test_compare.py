@@ -161,6 +161,23 @@ def test_more_scenes_ask_for_more_evidence(reference, np_rng):
     assert limits[1] == pytest.approx(limits[0] / 10, rel=2e-3)
 
 
+@pytest.mark.parametrize(("batches", "is_told"), [(25, False), (26, True)])
+def test_a_reference_needs_16_times_the_samples(reference, np_rng, batches, is_told):
+    """It has 400 batches."""
+    lines = compare(reference, random_image(np_rng, batches), ["tile"]).tier("tile").lines
+    assert any("the reference has less than 16 times the samples" in line for line in lines) == is_told
+
+
+def test_colours_of_evidence_are_even_up_to_the_most(reference):
+    evidence = np.linspace(0, 40, 9)[None]
+    maps = {"z": 0 * evidence, "evidence": evidence}
+    _, panel = TIERS["tile"].panels(
+        reference, reference, TierResult("tile", Status.PASS, [], {"failing": []}, None, maps)
+    )
+    assert panel.ends == ("0", "40")
+    np.testing.assert_array_equal(panel.pixels, colours(evidence / 40, panel.colour_map))
+
+
 BAD = {"nan": np.nan, "infinite": np.inf}
 
 

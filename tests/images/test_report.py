@@ -109,6 +109,11 @@ def test_the_page_speaks_of_a_worst_pixel_where_there_is_one(tmp_path, failed):
         assert ("Dashed circle: worst pixel" in page) == ("<circle" in page) == is_marked
 
 
+def test_the_circle_is_around_the_middle_of_the_worst_pixel(tmp_path, failed):
+    centres = re.findall(r"<circle cx=(\S+) cy=(\S+) ", write_report(tmp_path, failed).read_text())
+    assert {(float(x), float(y)) for x, y in centres} == {(failed.worst.x + 0.5, failed.worst.y + 0.5)}
+
+
 def test_names_are_escaped(tmp_path, failed):
     assert "test &lt;1&gt;" in write_report(tmp_path, failed).read_text()
 
