@@ -78,6 +78,7 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
             ("patches/element_bounds.py", "@lru_cache(maxsize=64)", "@lru_cache(maxsize= 63)"),
             ("patches/patch_table.py", "KEPT_BYTES = 1 << 25", "KEPT_BYTES = 2 << 25"),
             ("patches/one_ring_codes.py", "elif count > FEW_CODES:", "elif count < FEW_CODES:"),
+            ("patches/closest_points.py", "MOST_CONVEX_HALVINGS = 3", "MOST_CONVEX_HALVINGS = 2"),
         ),
     ),
     (
@@ -105,6 +106,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "shapes/exact_shading.py",
                 "return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))",
                 "return dr.select(dr.squared_norm(seen) >= 0, seen, vector3(dr.detach(si.n)))",
+            ),
+            (
+                "files/ply_header.py",
+                "if offset + column_type.itemsize > len(content):",
+                "if offset + column_type.itemsize >= len(content):",
             ),
         ),
     ),
