@@ -166,6 +166,7 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)",
                 "ratios = np.where(kept, basis.eigenvalues / base, -1).astype(real)",
             ),
+            ("mesh/one_ring.py", "inside = twins >= 0", "inside = twins >= 1"),
         ),
     ),
     (
@@ -279,6 +280,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "tessellation/stitching.py",
                 "width = int(most.max(initial=0)) + 2",
                 "width = int(most.max(initial=0)) + 1",
+            ),
+            (
+                "mesh/seams.py",
+                "is_down = t.face_vertices[start] > t.face_vertices[end]",
+                "is_down = t.face_vertices[start] < t.face_vertices[end]",
             ),
         ),
     ),
