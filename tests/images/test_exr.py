@@ -32,6 +32,12 @@ def test_the_same_image_gives_the_same_bytes(tmp_path, np_rng):
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
+def test_the_order_of_metadata_does_not_change_the_bytes(tmp_path):
+    for name, metadata in (("a.exr", {"x": 1, "y": {"u": 2, "v": 3}}), ("b.exr", {"y": {"v": 3, "u": 2}, "x": 1})):
+        write_exr(tmp_path / name, PIXELS, metadata)
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
 def test_numbers_in_the_metadata_keep_their_digits(tmp_path):
     write_exr(tmp_path / "a.exr", PIXELS, {"x": 0.01})
     assert read_channels(tmp_path / "a.exr")[1] == {"x": 0.01}

@@ -114,6 +114,19 @@ def test_the_circle_is_around_the_middle_of_the_worst_pixel(tmp_path, failed):
     assert {(float(x), float(y)) for x, y in centres} == {(failed.worst.x + 0.5, failed.worst.y + 0.5)}
 
 
+def test_no_outline_of_a_tile_is_below_one_of_a_larger_tile(tmp_path, failed):
+    sides = [(8, 4, 1), (16, 16, -3), (16, 4, 2), (12, 16, 4), (16, 16, 2)]
+    tiles = [{"x": 0, "y": 0, "width": width, "height": height, "channel": "R", "z": z} for width, height, z in sides]
+    numbers = {**failed.tier("tile").numbers, "failing": tiles}
+    results = [replace(each, numbers=numbers) if each.name == "tile" else each for each in failed.tiers]
+    page = write_report(tmp_path, replace(failed, tiers=results)).read_text()
+    figure = next(each for each in page.split("<figure>") if "<h2>z-score" in each)
+    shown = [tuple(map(int, each)) for each in re.findall(r"<rect x=0 y=0 width=(\d+) height=(\d+)>", figure)]
+    assert shown == [(16, 16), (12, 16), (16, 4), (8, 4)]
+    # Of two channels of one tile, the one that is further from noise.
+    assert "16 &times; 16, R, z = -3.0" in figure
+
+
 def test_names_are_escaped(tmp_path, failed):
     assert "test &lt;1&gt;" in write_report(tmp_path, failed).read_text()
 

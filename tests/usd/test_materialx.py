@@ -421,7 +421,7 @@ def test_surfaces_of_the_stage_look_as_they_should(tmp_path):
 
 
 @pytest.mark.parametrize("color", [(0.25, 0.5, 0.75), None])
-def test_a_material_of_the_mesh_s_colour_is_black_where_the_mesh_has_none(tmp_path, color):
+def test_a_material_that_asks_for_colours_of_the_mesh_is_black_where_it_has_none(tmp_path, color):
     inputs = '<input name="base_color" type="color3" nodename="tone" />' + value("specular", "float", "0")
     text = surface(inputs, graph='<geomcolor name="tone" type="color3" />')
     square = (
