@@ -265,6 +265,8 @@ def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters():
     metal = {"metallic": 1.0, "base_color": COLOR, "roughness": 0.5, "anisotropy_strength": 0.5}
     bsdf = entry(look("gltf_pbr", **metal))[0]["bsdf"]
     assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(0.25 + 0.75 * 0.25), pytest.approx(0.25))
+    bsdf = entry(look("gltf_pbr", **{**metal, "anisotropy_strength": 1.0}))[0]["bsdf"]
+    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(1), pytest.approx(0.25))
     metal = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
     skew, notes = entry(look("standard_surface", **metal))
     assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
