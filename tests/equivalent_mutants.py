@@ -115,8 +115,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         ),
     ),
     (
-        "values that no one reads: masked, overwritten, of a loop over nothing, an entry more of a copied table, or the"
-        " file of memory that has none",
+        "values that no one reads: masked, overwritten, of a loop over nothing, an entry more of a copied table, the"
+        " file of memory that has none, or a default that schemas or models of surfaces always replace",
         (
             (
                 "evaluation/equations.py",
@@ -167,6 +167,16 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "ratios = np.where(kept, basis.eigenvalues / base, -1).astype(real)",
             ),
             ("mesh/one_ring.py", "inside = twins >= 0", "inside = twins >= 1"),
+            (
+                "usd/polygons.py",
+                'radius, half = number("radius", 1.0), number("height", 2.0) / 2',
+                'radius, half = number("radius", 2.0), number("height", 2.0) / 2',
+            ),
+            (
+                "usd/surface_models.py",
+                '"base_color": [0.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.',
+                '"base_color": [ 1.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.',
+            ),
         ),
     ),
     (
@@ -333,6 +343,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)",
                 "rough = sum(float(_measured(part, ORDERS[0])[ 0].sum()) for part in parts)",
             ),
+            (
+                "shapes/cage_files.py",
+                "if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:",
+                "if abs(clock.time_ns() - found.st_mtime_ns) <= SETTLED:",
+            ),
         ),
     ),
     (
@@ -353,6 +368,11 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "self.part = np.where(improves, 2, self.part * SHORTER)",
             ),
             ("shapes/heights.py", "middle = self._interaction(0.5, 0.5)", "middle = self._interaction( 1.5, 0.5)"),
+            (
+                "shapes/mitsuba_3_9_hook/hook_trial.py",
+                'mesh = Triangle("triangle", vertex_count=3, face_count=1)',
+                'mesh = Triangle("triangle", vertex_count=3, face_count= 2)',
+            ),
         ),
     ),
     (
