@@ -64,6 +64,21 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "return paired(self.edge_names.__getitem__, self.half_edge_count,"
                 " int(self.edge_names.max(initial=0)) + 2)",
             ),
+            (
+                "kernels/apply_weights.py",
+                "if first < index and (is_product or (count > FEW_SAMPLES and is_other_size)):",
+                "if first < index and (is_product or (count >= FEW_SAMPLES and is_other_size)):",
+            ),
+            (
+                "tessellation/uniform.py",
+                "step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))",
+                "step = max(1, WEIGHTS_TOGETHER // (3 + len(uv) * most))",
+            ),
+            ("evaluation/irregular_patch.py", "MANY_CONTROLS = 256", "MANY_CONTROLS = 255"),
+            ("patches/element_bounds.py", "@lru_cache(maxsize=64)", "@lru_cache(maxsize= 63)"),
+            ("patches/patch_table.py", "KEPT_BYTES = 1 << 25", "KEPT_BYTES = 2 << 25"),
+            ("patches/one_ring_codes.py", "elif count > FEW_CODES:", "elif count < FEW_CODES:"),
+            ("patches/closest_points.py", "MOST_CONVEX_HALVINGS = 3", "MOST_CONVEX_HALVINGS = 2"),
         ),
     ),
     (
@@ -87,10 +102,21 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "if self._first is not None and self._first[0] == number:",
                 "if self._first is not None and self._first[ 1] == number:",
             ),
+            (
+                "shapes/exact_shading.py",
+                "return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))",
+                "return dr.select(dr.squared_norm(seen) >= 0, seen, vector3(dr.detach(si.n)))",
+            ),
+            (
+                "files/ply_header.py",
+                "if offset + column_type.itemsize > len(content):",
+                "if offset + column_type.itemsize >= len(content):",
+            ),
         ),
     ),
     (
-        "values that no one reads: masked, overwritten, or of a loop over nothing",
+        "values that no one reads: masked, overwritten, of a loop over nothing, an entry more of a copied table, the"
+        " file of memory that has none, or a default that schemas or models of surfaces always replace",
         (
             (
                 "evaluation/equations.py",
@@ -128,6 +154,28 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "schemes/crease_masks.py",
                 "twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]",
                 "twin_refined = semi.edges_refined[np.maximum(t.twin, -1)]",
+            ),
+            ("shapes/mitsuba_3_9_hook/interaction_hook.py", "_BEFORE = 2", "_BEFORE = 3"),
+            (
+                "shapes/mitsuba_3_9_hook/machine_code.py",
+                "address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)",
+                "address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, +1, 0)",
+            ),
+            (
+                "evaluation/equations.py",
+                "ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)",
+                "ratios = np.where(kept, basis.eigenvalues / base, -1).astype(real)",
+            ),
+            ("mesh/one_ring.py", "inside = twins >= 0", "inside = twins >= 1"),
+            (
+                "usd/polygons.py",
+                'radius, half = number("radius", 1.0), number("height", 2.0) / 2',
+                'radius, half = number("radius", 2.0), number("height", 2.0) / 2',
+            ),
+            (
+                "usd/surface_models.py",
+                '"base_color": [0.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.',
+                '"base_color": [ 1.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.',
             ),
         ),
     ),
@@ -189,10 +237,22 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "size, length = maps.shape[-1], max(1, PARTS_AT_ONCE // maps.shape[2])",
                 "size, length = maps.shape[+1], max(1, PARTS_AT_ONCE // maps.shape[2])",
             ),
+            (
+                "shapes/displaced_vertices.py",
+                "self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]",
+                "self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[ -1] for each in values]",
+            ),
+            (
+                "tessellation/memory.py",
+                "is_whole = refined is None and patches.is_whole[patches.elements.face_of(patch_class.corners[:1])][0]",
+                "is_whole = refined is None and patches.is_whole[patches.elements.face_of("
+                "patch_class.corners[: 2])][0]",
+            ),
         ),
     ),
     (
-        "another name for the same thing: keys stay as distinct, and what is below zero counts as smooth",
+        "another name for the same thing: keys stay as distinct, what is below zero counts as smooth, and both sides of"
+        " an edge run along it the same way",
         (
             (
                 "mesh/manifold.py",
@@ -216,10 +276,30 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))",
                 "sharpness = Sharpness(np.where(seam, INFINITE, -1.0), np.zeros(topology.vertex_count))",
             ),
+            (
+                "tessellation/patch_frames.py",
+                "edge, is_backward = lower, lower != every",
+                "edge, is_backward = lower, lower == every",
+            ),
+            (
+                "tessellation/spans.py",
+                "point, of_point = ranked(joined(point, of_points, 32))",
+                "point, of_point = ranked(joined(point, of_points, 33))",
+            ),
+            (
+                "tessellation/stitching.py",
+                "width = int(most.max(initial=0)) + 2",
+                "width = int(most.max(initial=0)) + 1",
+            ),
+            (
+                "mesh/seams.py",
+                "is_down = t.face_vertices[start] > t.face_vertices[end]",
+                "is_down = t.face_vertices[start] < t.face_vertices[end]",
+            ),
         ),
     ),
     (
-        "a difference within rounding, or a tie of two results that are both right",
+        "a difference within rounding, a tie of two results that are both right, or a factor of zero",
         (
             ("mesh/refinement_differences.py", "DECIMALS = 12", "DECIMALS = 13"),
             ("patches/area_samples.py", "ROUNDED = 1 + 1e-9", "ROUNDED = 1 - 1e-9"),
@@ -241,11 +321,38 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "bend = np.where(is_newton[slides], bend, flat + damped[slides])",
                 "bend = np.where(is_newton[slides], bend, flat - damped[slides])",
             ),
+            (
+                "kernels/nearest_location.py",
+                "inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)",
+                "inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 1)",
+            ),
+            (
+                "shapes/moving_vertices.py",
+                "return placed(positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix),"
+                " types.vector3)",
+                "return placed(positions, normals, matrix if not dr.is_jit_v(matrix) else types.matrix4(matrix),"
+                " types.vector3)",
+            ),
+            (
+                "patches/nearest_in_piece.py",
+                "return step * np.minimum(part, 1)[:, None], is_newton & (part >= 1)",
+                "return step * np.minimum(part, 1)[:, None], is_newton & (part > 1)",
+            ),
+            (
+                "patches/surface_area.py",
+                "rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)",
+                "rough = sum(float(_measured(part, ORDERS[0])[ 0].sum()) for part in parts)",
+            ),
+            (
+                "shapes/cage_files.py",
+                "if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:",
+                "if abs(clock.time_ns() - found.st_mtime_ns) <= SETTLED:",
+            ),
         ),
     ),
     (
-        "a probe or a step among many as good: any power checks a basis, any places a linear function, and steps of"
-        " either sign shrink until one leads nearer",
+        "a probe or a step among many as good: any power checks a basis, any places a linear function or a"
+        " texture's kind, and steps of either sign shrink until one leads nearer",
         (
             ("evaluation/eigenbasis.py", "POWER = 20", "POWER = 19"),
             ("evaluation/ring_symmetry.py", "PROBES_OF_FACE = 2", "PROBES_OF_FACE = 1"),
@@ -259,6 +366,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "patches/nearest_in_piece.py",
                 "self.part = np.where(improves, 1, self.part * SHORTER)",
                 "self.part = np.where(improves, 2, self.part * SHORTER)",
+            ),
+            ("shapes/heights.py", "middle = self._interaction(0.5, 0.5)", "middle = self._interaction( 1.5, 0.5)"),
+            (
+                "shapes/mitsuba_3_9_hook/hook_trial.py",
+                'mesh = Triangle("triangle", vertex_count=3, face_count=1)',
+                'mesh = Triangle("triangle", vertex_count=3, face_count= 2)',
             ),
         ),
     ),

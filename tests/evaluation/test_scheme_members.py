@@ -393,6 +393,19 @@ def test_a_member_that_does_something_else_is_named(damage):
         register_scheme(Members(CatmullClark(), **{member: value}))
 
 
+@pytest.mark.parametrize(("kind", "own"), [("vertex", 4), ("face", 1)])
+def test_a_scheme_needs_rules_for_a_regular_face_and_its_corners_and_not_for_what_lies_beside_them(kind, own):
+    """Those of the face come first in its one-ring."""
+
+    def refusing(index):
+        return Members(CatmullClark(), unsupported=lambda _: Unsupported(kind, np.array([index]), "is here", "none"))
+
+    for index in range(own):
+        with pytest.raises(SchemeError, match="unsupported refuses a face with fans"):
+            register_scheme(refusing(index))
+    register_scheme(refusing(own))
+
+
 def test_faces_that_are_not_the_corners_do_not_split_corners():
     class Turned(CatmullClark):
         """Each refined face begins at the middle of an edge."""

@@ -321,6 +321,15 @@ def test_numbers_and_words_that_fit_nothing_name_their_line(read, old, new, mess
         read(text.replace(old, new, 1))
 
 
+def test_the_number_that_is_out_of_range_is_named_after_lists_of_any_length(read):
+    text = SHEET.replace("end_header", "property list uchar uchar tags\nproperty uchar flag\nend_header")
+    text = text.replace("4 0 1 2 3", "4 0 1 2 3 0 7").replace("3 1 4 2", "3 1 4 2 2 5 5 FLAG")
+    with pytest.warns(CageWarning, match=r'"flag" of faces left out'):
+        assert read(text.replace("FLAG", "255")).face_count == 2
+    with pytest.raises(CageError, match=r'line 19: element "face": the value of "flag" is 256; expected 0 to 255'):
+        read(text.replace("FLAG", "256"))
+
+
 @pytest.mark.parametrize(("item", "index"), [("int", "<i4"), ("uchar", "u1")])
 def test_lists_of_negative_length_are_errors(read, item, index):
     header = SHEET[: SHEET.index("end_header")].replace("ascii", "binary_little_endian")

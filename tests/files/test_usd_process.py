@@ -1,10 +1,13 @@
 """USD files read in a process of their own."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from fuzz.seed_files import seed_files
 from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.files import usd_process
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.files.usd_reader import read_usd
 
@@ -86,6 +89,28 @@ def test_a_process_without_an_answer_is_an_error(file, library):
         ControlCage.from_file(file)
 
 
+def test_an_answer_cannot_run_anything(file, library, tmp_path):
+    """A damaged file may take over the process that reads it, and answer with an object that acts when it is loaded."""
+    library(
+        "import io, os, numpy\n"
+        "class Trap:\n"
+        "    def __reduce__(self):\n"
+        f"        return os.mkdir, ({str(tmp_path / 'trapped')!r},)\n"
+        "content = io.BytesIO()\n"
+        "numpy.savez(content, text=numpy.array([Trap()], dtype=object))\n"
+        # One of these is the answer's.
+        "for file in range(3, 20):\n"
+        "    try:\n"
+        "        os.write(file, content.getvalue())\n"
+        "    except OSError:\n"
+        "        pass\n"
+        "os._exit(0)\n"
+    )
+    with pytest.raises(CageError, match=r'cube.usda": the process that read the file gave no answer'):
+        ControlCage.from_file(file)
+    assert not (tmp_path / "trapped").exists()
+
+
 def test_reading_for_too_long_is_an_error(file, library, monkeypatch):
     library("import time\ntime.sleep(1000)\n")
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, "0.5")
@@ -105,7 +130,11 @@ def test_memory_is_limited(file, library, tmp_path):
     )
     with pytest.raises(CageError, match=r'cube.usda": .*the process that read the file ended with the exit code 1'):
         ControlCage.from_file(file)
-    assert 1 << 30 < int((tmp_path / "limit").read_text()) < 1 << 36
+    limit = int((tmp_path / "limit").read_text())
+    assert 1 << 30 < limit < 1 << 36
+    if Path("/proc/self/statm").exists():
+        # Beyond what the process has already.
+        assert limit > usd_process._LEAST_MEMORY + usd_process._MEMORY_PER_BYTE * file.stat().st_size
 
 
 @pytest.mark.parametrize("seconds", ["yes", "0", "-1", "nan", "inf"])

@@ -18,8 +18,8 @@ from mitsuba_subdivision.images.compare import compare, relmse
 from mitsuba_subdivision.images.flip_tier import flip, flip_exposures
 from mitsuba_subdivision.images.image import Image
 from mitsuba_subdivision.images.panel import Panel
-from mitsuba_subdivision.images.png import srgb
-from mitsuba_subdivision.images.probe_tier import normal_angle
+from mitsuba_subdivision.images.png import colours, srgb
+from mitsuba_subdivision.images.probe_tier import _ANGLE_DECADES, normal_angle
 from mitsuba_subdivision.images.report import write_report
 from mitsuba_subdivision.images.tier import Status, TierResult
 from mitsuba_subdivision.images.tiers import TIERS, Tier
@@ -161,6 +161,23 @@ def test_more_scenes_ask_for_more_evidence(reference, np_rng):
     assert limits[1] == pytest.approx(limits[0] / 10, rel=2e-3)
 
 
+@pytest.mark.parametrize(("batches", "is_told"), [(25, False), (26, True)])
+def test_a_reference_needs_16_times_the_samples(reference, np_rng, batches, is_told):
+    """It has 400 batches."""
+    lines = compare(reference, random_image(np_rng, batches), ["tile"]).tier("tile").lines
+    assert any("the reference has less than 16 times the samples" in line for line in lines) == is_told
+
+
+def test_colours_of_evidence_are_even_up_to_the_most(reference):
+    evidence = np.linspace(0, 40, 9)[None]
+    maps = {"z": 0 * evidence, "evidence": evidence}
+    _, panel = TIERS["tile"].panels(
+        reference, reference, TierResult("tile", Status.PASS, [], {"failing": []}, None, maps)
+    )
+    assert panel.ends == ("0", "40")
+    np.testing.assert_array_equal(panel.pixels, colours(evidence / 40, panel.colour_map))
+
+
 BAD = {"nan": np.nan, "infinite": np.inf}
 
 
@@ -227,6 +244,63 @@ def test_silhouettes_do_not_count(reference, np_rng):
     rim[:, 1:] |= shape[:, 1:] != shape[:, :-1]
     normal[rim & (shape == 0)] = (0, 0, 1)
     assert compare(reference, random_image(np_rng, probe=changed_probe(normal=normal)), ["probe"]).exit_status == 0
+
+
+def test_normals_count_from_the_third_pixel_beside_one_of_another_shape(reference, np_rng):
+    """It and the four pixels beside it are a silhouette, and the eight neighbours of these do not count either."""
+    silhouette = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]
+    for y, x in np.argwhere(np.ones((7, 7))) - 3:
+        normal, shape = dome().normal.copy(), dome().shape.copy()
+        shape[16, 16] = 2**32 - 1
+        normal[16 + y, 16 + x] *= -1
+        found = compare(reference, random_image(np_rng, probe=changed_probe(normal=normal, shape=shape)), ["probe"])
+        is_near = any(max(abs(y - b), abs(x - a)) <= 1 for b, a in silhouette)
+        assert found.tier("probe").status is (Status.PASS if is_near else Status.FAIL), (y, x)
+
+
+@pytest.mark.parametrize(("other", "what"), [("angle_p999", "maximum"), ("angle_max", "99.9th percentile")])
+def test_the_worst_normal_is_none_at_a_silhouette(reference, np_rng, other, what):
+    """Its own is turned more than those of some pixels in the middle."""
+    probe = changed_probe(normal=rotated(20))
+    y, x = np.argwhere(probe.hit)[0]
+    probe.normal[y, x] *= -1
+    loose = LIMITS.with_values({other: 180})
+    found = compare(reference, random_image(np_rng, probe=probe), ["probe"], loose)
+    assert f"degrees between normals, {what}" in found.tier("probe").lines[0]
+    assert 12 <= found.worst.x < 20
+    assert 12 <= found.worst.y < 20
+
+
+def test_one_pixel_in_a_thousand_may_hit_another_triangle(reference, np_rng):
+    for count, status in ((1, Status.PASS), (2, Status.WARN)):
+        triangle = dome().triangle.copy()
+        triangle[16, 16 : 16 + count] += 1
+        found = compare(reference, random_image(np_rng, probe=changed_probe(triangle=triangle)), ["probe"])
+        assert found.tier("probe").status is status
+        assert found.tier("probe").numbers["triangle_fraction"] == count / SIZE**2
+
+
+def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np_rng):
+    """Another environment makes pixels of the same samples a warning; and a square is brighter."""
+    paired, mean = reference.paired.copy(), truth()
+    paired[7, 9] *= 1.001
+    mean[16:24, 16:24] *= 2
+    other = {**METADATA, "environment": {"llvm": "1", "processor": "b"}}
+    found = compare(reference, random_image(np_rng, mean=mean, paired=paired, metadata=other))
+    assert statuses(found) == {"probe": "pass", "paired": "warn", "tile": "fail"}
+    assert found.tier("paired").worst == (7, 9)
+    assert found.worst.shown_by == "tile"
+    assert 16 <= found.worst.x < 24
+    assert 16 <= found.worst.y < 24
+
+
+def test_colours_of_angles_are_even_over_decades(reference):
+    low, high = _ANGLE_DECADES
+    angles = 10.0 ** np.arange(low - 2, high + 2)[None]
+    result = TierResult("probe", Status.FAIL, [], {}, None, {"angle": angles})
+    (panel,) = TIERS["probe"].panels(reference, reference, result)
+    expected = np.clip((np.arange(low - 2, high + 2) - low) / (high - low), 0, 1)
+    np.testing.assert_array_equal(panel.pixels[0], colours(expected, panel.colour_map))
 
 
 def test_the_worst_pixel_names_both_values_and_the_surface(reference, np_rng):
@@ -331,6 +405,7 @@ UNUSABLE = {
     'tier "tile" cannot run: the reference has no': lambda a: compare(replace(a, estimate=None), a, ["tile"]),
     'tier "paired" cannot run': lambda a: compare(a, replace(a, paired=None, estimate=None), ["paired"]),
     'unknown tolerance "angle"': lambda a: compare(replace(a, metadata={"tolerances": {"angle": 1}}), a),
+    'tolerance "alpha" is 0; expected a probability between': lambda a: LIMITS.with_values({"alpha": 0}),  # noqa: ARG005
     'tolerance "alpha" is 1': lambda a: LIMITS.with_values({"alpha": 1}),  # noqa: ARG005
     '"flip_mean" is nan': lambda a: LIMITS.with_values({"flip_mean": math.nan}),  # noqa: ARG005
 }

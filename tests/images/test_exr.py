@@ -1,5 +1,7 @@
 """OpenEXR files: what comes back, and what is refused."""
 
+import os
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -30,9 +32,25 @@ def test_the_same_image_gives_the_same_bytes(tmp_path, np_rng):
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
+def test_the_order_of_metadata_does_not_change_the_bytes(tmp_path):
+    for name, metadata in (("a.exr", {"x": 1, "y": {"u": 2, "v": 3}}), ("b.exr", {"y": {"v": 3, "u": 2}, "x": 1})):
+        write_exr(tmp_path / name, PIXELS, metadata)
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
 def test_numbers_in_the_metadata_keep_their_digits(tmp_path):
     write_exr(tmp_path / "a.exr", PIXELS, {"x": 0.01})
     assert read_channels(tmp_path / "a.exr")[1] == {"x": 0.01}
+
+
+def test_standard_error_is_where_it_was_after_reading(tmp_path):
+    before = os.fstat(2)
+    write_exr(tmp_path / "a.exr", PIXELS)
+    read_channels(tmp_path / "a.exr")
+    (tmp_path / "broken.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-20])
+    with pytest.raises(ImageError, match=r"broken\.exr"):
+        read_channels(tmp_path / "broken.exr")
+    assert (os.fstat(2).st_dev, os.fstat(2).st_ino) == (before.st_dev, before.st_ino)
 
 
 def test_other_programs_read_one_part_with_layers(tmp_path, np_rng, variant_scalar_rgb):  # noqa: ARG001

@@ -1,6 +1,9 @@
 """The report, read as a page and looked at in a browser."""
 
+import base64
+import io
 import json
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -12,7 +15,7 @@ from images.random_images import random_image, truth
 from mitsuba_subdivision.images.compare import compare
 from mitsuba_subdivision.images.exr import read_channels
 from mitsuba_subdivision.images.panel import relative_panel
-from mitsuba_subdivision.images.png import colours, png_bytes, srgb
+from mitsuba_subdivision.images.png import MAPS, colours, png_bytes, srgb
 from mitsuba_subdivision.images.report import write_index, write_report
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -74,6 +77,54 @@ def test_the_page_has_every_panel_and_runs_nothing(tmp_path, failed):
     assert "script" not in reader.tags
     assert reader.links == ["comparison.json", "maps.exr"]
     assert "rect" in reader.tags
+
+
+def pictures(page, pattern):
+    """Pictures in a page whose element begins with a pattern, as arrays."""
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    found = re.findall(rf"{pattern}'data:image/png;base64,([^']*)'", page.read_text())
+    return [np.round(255 * pyplot.imread(io.BytesIO(base64.b64decode(each)))[..., :3]) for each in found]
+
+
+def test_equal_pictures_are_shown_alike_with_white_for_the_brightest(tmp_path, failed):
+    reference, test = pictures(write_report(tmp_path, compare(failed.reference, failed.reference)), "<image href=")[:2]
+    np.testing.assert_array_equal(reference, test)
+    is_brightest = failed.reference.pixels.max(axis=2) >= np.percentile(failed.reference.pixels, 99.5)
+    assert (reference[is_brightest].max(axis=1) == 255).all()
+    assert reference.min() < 200
+
+
+def test_legends_run_from_the_colour_of_one_end_to_that_of_the_other(tmp_path, failed):
+    bars = pictures(write_report(tmp_path, failed), "<img src=")
+    ends = [colours(np.array([0.0, 1.0]), name) for name in MAPS]
+    assert bars
+    for bar in bars:
+        assert any(np.array_equal(bar[0, [0, -1]], each) for each in ends)
+
+
+def test_the_page_speaks_of_a_worst_pixel_where_there_is_one(tmp_path, failed):
+    same = compare(failed.reference, failed.reference)
+    for comparison, is_marked in ((failed, True), (same, False)):
+        page = write_report(tmp_path, comparison).read_text()
+        assert ("Dashed circle: worst pixel" in page) == ("<circle" in page) == is_marked
+
+
+def test_the_circle_is_around_the_middle_of_the_worst_pixel(tmp_path, failed):
+    centres = re.findall(r"<circle cx=(\S+) cy=(\S+) ", write_report(tmp_path, failed).read_text())
+    assert {(float(x), float(y)) for x, y in centres} == {(failed.worst.x + 0.5, failed.worst.y + 0.5)}
+
+
+def test_no_outline_of_a_tile_is_below_one_of_a_larger_tile(tmp_path, failed):
+    sides = [(8, 4, 1), (16, 16, -3), (16, 4, 2), (12, 16, 4), (16, 16, 2)]
+    tiles = [{"x": 0, "y": 0, "width": width, "height": height, "channel": "R", "z": z} for width, height, z in sides]
+    numbers = {**failed.tier("tile").numbers, "failing": tiles}
+    results = [replace(each, numbers=numbers) if each.name == "tile" else each for each in failed.tiers]
+    page = write_report(tmp_path, replace(failed, tiers=results)).read_text()
+    figure = next(each for each in page.split("<figure>") if "<h2>z-score" in each)
+    shown = [tuple(map(int, each)) for each in re.findall(r"<rect x=0 y=0 width=(\d+) height=(\d+)>", figure)]
+    assert shown == [(16, 16), (12, 16), (16, 4), (8, 4)]
+    # Of two channels of one tile, the one that is further from noise.
+    assert "16 &times; 16, R, z = -3.0" in figure
 
 
 def test_names_are_escaped(tmp_path, failed):

@@ -49,6 +49,11 @@ SURFACES = {
     "corner": ("catmull_clark", lambda: spokes(extraordinary(8, closed=False), 8, (INFINITE,) * 3)),
     "into a dart": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (INFINITE, 1.5))),
     "semi-sharp ring": ("catmull_clark", lambda: tagged(cube(), creases=[(a, b, 4) for a, b in RING])),
+    # Divided along the edge, and no vertex is extraordinary.
+    "semi-sharp torus": (
+        "catmull_clark",
+        lambda: tagged(cage_of("catmull_clark", "torus"), creases=[(0, 1, 1.5)]),
+    ),
     "chaikin": (
         "catmull_clark",
         lambda: tagged(

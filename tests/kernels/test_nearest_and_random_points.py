@@ -19,6 +19,8 @@ STEP, DIFFERENCES = 1e-6, 1e-7
 # Standard errors of a mean that are allowed; seeds are fixed.
 ERRORS = 4
 COUNT = 20_000
+# A parameter is a sum of three products of numbers up to one.
+ROUNDED = 1e-15
 
 # One for each kind of piece and of border: the searches ask for points and derivatives only, which
 # test_surface_kernel compares on all surfaces.
@@ -159,6 +161,13 @@ def test_densities_weigh_random_points(name):
         error = np.hypot(moments.std(axis=0), expected.std(axis=0)) / COUNT**0.5
         off = np.abs(moments.mean(axis=0) - expected.mean(axis=0))
         assert (off <= ERRORS * error + 1e-5 * area).all(), variant
+
+
+@pytest.mark.parametrize("name", ["torus", "loop sheet"])
+def test_random_points_lie_in_their_elements(name, np_rng):
+    location = drawn_points(kernel_named(name, DOUBLE), COUNT, np_rng).location
+    inside = surface_named(name).scheme.domain.inside(np.array([location.u, location.v]).T)
+    assert inside.min() >= -ROUNDED
 
 
 @pytest.mark.parametrize("name", ["torus", "sheet"])

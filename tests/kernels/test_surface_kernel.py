@@ -443,12 +443,8 @@ def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
     assert inside.min() >= 0
 
 
-@pytest.mark.core
-@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
-@pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2])
-def test_lines_past_a_border_lead_to_the_border(variant, beyond):
-    surface = surface_named("sheet without corners")
-    kernel = surface.on_device(variant)
+def met_past_a_border(kernel, surface, beyond, turns=0):
+    """Points beside a border, and what is met of lines across them; from locations seen from the next corners."""
     types, elements = kernel.types, surface.patches.elements
     edges = np.flatnonzero(elements.twin < 0)
     element = elements.face_of(edges).astype(int)
@@ -457,16 +453,42 @@ def test_lines_past_a_border_lead_to_the_border(variant, beyond):
     border = surface.evaluate(element, uv, corner)
     out = -border.dp_dv / np.linalg.norm(border.dp_dv, axis=1)[:, None]
     p, d = border.p + beyond * out, border.n + 0.1 * border.dp_du
-    start = kernel.walk.at(
-        types.index(element), types.float(uv[:, 0]), types.float(uv[:, 1] + 0.03), types.index(corner)
-    )
+    u, v = uv[:, 0], uv[:, 1] + 0.03
+    for _ in range(turns):
+        u, v, corner = v, 1 - u, (corner + 1) % 4
+    start = kernel.walk.at(types.index(element), types.float(u), types.float(v), types.index(corner))
     met = kernel.line_hits(types.vector3(*map(types.float, p.T)), types.vector3(*map(types.float, d.T)), start)
-    dr.eval(met.location, met.kind)
+    dr.eval(met.location, met.kind, met.values.value)
+    return p, met
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+@pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2])
+def test_lines_past_a_border_lead_to_the_border(variant, beyond):
+    surface = surface_named("sheet without corners")
+    kernel = surface.on_device(variant)
+    p, met = met_past_a_border(kernel, surface, beyond)
     assert (np.array(met.kind) == ON_NORMAL).all()
     found = kernel.at(met.location)
+    np.testing.assert_allclose(vectors(met.values.value), vectors(found.p), rtol=0, atol=BARS[variant]["point"])
     inside = surface.scheme.domain.inside(np.array([met.location.u, met.location.v]).T)
     np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])
     assert np.linalg.norm(vectors(found.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("beyond", [1e-2, 1.0])
+def test_lines_find_the_same_place_of_a_border_seen_from_any_corner(beyond):
+    surface = surface_named("sheet without corners")
+    kernel = surface.on_device(DOUBLE)
+    _, expected = met_past_a_border(kernel, surface, beyond)
+    for turns in (1, 2, 3):
+        _, met = met_past_a_border(kernel, surface, beyond, turns)
+        np.testing.assert_array_equal(np.array(met.location.half_edge), np.array(expected.location.half_edge))
+        np.testing.assert_allclose(
+            vectors(met.values.value), vectors(expected.values.value), rtol=0, atol=ON_RAY[DOUBLE]
+        )
 
 
 @pytest.mark.parametrize("depth", [8, 11, 14])

@@ -3,8 +3,9 @@
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 
+import numpy as np
 import pytest
-from mitsuba_subdivision.mesh.shared import Shared
+from mitsuba_subdivision.mesh.shared import Content, Shared
 
 THREADS = 4
 # Seconds, by far more than threads take to begin.
@@ -67,3 +68,16 @@ def test_a_value_that_could_not_be_made_is_tried_again():
 def test_making_a_value_may_request_others():
     shared, inner = Shared(), _Value()
     assert shared.get("outer", lambda: shared.get("inner", lambda: inner)) is inner
+
+
+def test_arrays_are_the_same_key_if_their_numbers_type_and_shape_are():
+    array = np.arange(6)
+    same, copied = Content(array), Content(array.copy())
+    assert same == copied
+    assert hash(same) == hash(copied)
+    for other in (array + 1, array.reshape(2, 3), array.astype(np.uint64), array[:5], None):
+        assert same != Content(other)
+    # Bits of a number are those of another of another type.
+    assert Content(np.zeros(3)) != Content(np.zeros(3, np.int64))
+    assert Content(None) == Content(None)
+    assert same != hash(same)

@@ -25,6 +25,10 @@ COUNT = 6
 ROUNDED = 1e-13
 # Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
+# Of areas: sums over pieces in another order.
+AREA = 1e-12
+# Of parameters: the same steps, but for rounding of sums over other numbers of points.
+DESCENT = 1e-12
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
 SAMPLES, REFINED = 3_000, 8
 STEPS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
@@ -185,8 +189,9 @@ def test_elements_that_are_divided_when_needed_change_nothing(name, np_rng, monk
     expected = surface.closest_point(points)
     monkeypatch.setattr(polynomial_pieces, "MOST_PIECES", 1)
     monkeypatch.setattr(polynomial_pieces, "DIVISIONS", 1)
-    found = LimitSurface(surface.cage).closest_point(points)
-    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
+    later = LimitSurface(surface.cage)
+    np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
+    assert later.area() == pytest.approx(surface.area(), rel=AREA)
 
 
 def test_descents_are_the_same_in_every_unit_of_length(np_rng):
@@ -234,6 +239,16 @@ def test_descents_end_at_local_minima(np_rng):
         values = pieces.basis.values(np.clip(uv + step, 0, 1))
         p = np.einsum("sb,sbx->sx", values, pieces.coefficients[which]) + pieces.origins[which]
         assert (((p - points) ** 2).sum(axis=1) >= (1 - ROUNDED) * squared).all()
+
+
+def test_descents_of_many_points_are_those_of_few(np_rng):
+    """Some take shorter steps where others have taken theirs."""
+    pieces, count = surface_named("mixed torus")._all_pieces.regular, 600
+    points, which, begin = np_rng.normal(size=(count, 3)) * 3, np.arange(count) % len(pieces), np_rng.random((count, 2))
+    together, _, slope = nearest_in_pieces(pieces, which, points, begin, 1.0)
+    parts = [nearest_in_pieces(pieces, which[at], points[at], begin[at], 1.0) for at in np.split(np.arange(count), 100)]
+    np.testing.assert_allclose(together, np.concatenate([uv for uv, _, _ in parts]), rtol=0, atol=DESCENT)
+    np.testing.assert_allclose(slope, np.concatenate([each for _, _, each in parts]), rtol=0, atol=DESCENT)
 
 
 def test_nearest_points_move_with_the_surface(np_rng):

@@ -9,6 +9,7 @@ from mitsuba_subdivision import LimitSurface, pixel_error_for
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.tessellation_parameters import ViewingSensor
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
 from shapes.test_subdivision import SINGLE, buffer
@@ -44,6 +45,26 @@ def test_every_variant_has_the_same_triangles_on_the_surface():
     np.testing.assert_allclose(buffer(shape, "vertex_normals"), normals, atol=50 * SINGLE)
     for line in ("tessellation = adaptive", "chord_error = 0.01", "max_rate = 32"):
         assert line in str(shape)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.parametrize(("size", "fov"), [((60, 40), 70.0), ((40, 60), 20.0)])
+def test_the_smallest_pixels_are_those_in_the_corners_of_the_film(size, fov):
+    """By Mitsuba's own rays: how far two of them are apart at a distance of one, side by side, from a depth of one."""
+    given = perspective(size, fov)
+    sensor, to_world = mi.load_dict(given), np.array(given["to_world"].matrix, dtype=np.float64)
+    axis = to_world[:3, 2]
+
+    def point(x, y):
+        ray = sensor.sample_ray(0, 0, mi.Point2f(x / size[0], y / size[1]), 0)[0]
+        return np.array(ray.d) / (axis @ np.array(ray.d))
+
+    corners = [(x, y, x + (1 if x == 0 else -1)) for x in (0, size[0]) for y in (0, size[1])]
+    smallest = [
+        np.linalg.norm(point(x, y) - point(beside, y)) / np.linalg.norm(point(x, y)) for x, y, beside in corners
+    ]
+    found = ViewingSensor(to_world, fov, size).in_world()
+    np.testing.assert_allclose(smallest, found.pixel, rtol=PIXEL)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

@@ -218,6 +218,23 @@ def test_hits_are_those_of_the_limit_surface(scheme, shift):
 
 
 @llvm
+def test_hits_are_no_farther_from_their_triangles_than_these_are_large(np_rng):
+    """Else a ray that passes an edge of a coarse triangle would be led to another part of the surface."""
+    cage = ControlCage.from_file(example_file("cages/propeller.obj"))
+    low, high = cage.positions.min(axis=0), cage.positions.max(axis=0)
+    o = (low + high) / 2 + np.linalg.norm(high - low) * np_rng.normal(size=(8000, 3))
+    d = np_rng.uniform(low, high, o.shape) - o
+    rays = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f((d / np.linalg.norm(d, axis=1)[:, None]).T))
+    shape = make(cage, tessellation_rate=1)
+    found, coarse = hits(shape, rays), hits(shape | {"shading": "vertex"}, rays)
+    met = np.array(coarse.is_valid())
+    moved = np.linalg.norm(rows(found.p) - rows(coarse.p), axis=1)
+    large = np.maximum(*(np.linalg.norm(rows(side), axis=1) for side in (coarse.dp_du, coarse.dp_dv)))
+    assert met.mean() > 0.3
+    assert (moved[met] <= large[met]).all()
+
+
+@llvm
 def test_parameters_run_on_over_all_triangles_of_an_element():
     shape, surface = make(named_cages.torus(5, 4), tessellation_rate=2), LimitSurface(named_cages.torus(5, 4))
     # Along the middle of face 0.

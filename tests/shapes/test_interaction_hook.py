@@ -605,6 +605,8 @@ def test_a_class_with_other_functions_is_rejected(monkeypatch, place, value, mes
     ("kind", "message"),
     [
         ("deaf", "compute_surface_interaction does not pass on its arguments, or its result"),
+        ("hard of hearing", "compute_surface_interaction does not pass on its arguments, or its result"),
+        ("mute", "compute_surface_interaction does not pass on its arguments, or its result"),
         ("forgetful", "eval_attribute does not pass on its arguments, or its result"),
         ("quiet", "an error in an answer is lost"),
     ],
@@ -618,9 +620,12 @@ def test_the_trial_notices_what_differs(kind, message):
         def __init__(self, trial):
             self.trial = trial
 
-        def complete(self, *arguments):
+        def complete(self, si, ray, preliminary, flags, active):
+            uv = mi.Point2f(si.uv)
             with contextlib.suppress(hook_trial.TrialError):
-                self.trial.complete(*arguments)
+                self.trial.complete(si, ray, preliminary, flags + (kind == "hard of hearing"), active)
+            if kind == "mute":
+                si.uv = uv
 
         def attribute(self, *arguments):
             found = None

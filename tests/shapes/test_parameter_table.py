@@ -11,6 +11,7 @@ from mitsuba_subdivision.shapes import register_variant
 from mitsuba_subdivision.shapes.attribute_parameters import is_attribute_parameter
 from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
 from mitsuba_subdivision.shapes.tessellation_parameters import LIMITS
+from mitsuba_subdivision.tessellation import HIGHEST_RATE
 
 ROWS = (*PARAMETERS, *STATE_PARAMETERS)
 
@@ -78,6 +79,32 @@ def test_a_stated_default_is_the_value_as_scene_files_have_it(row):
         kinds = {bool: {"true": True, "false": False}.get, str: str}
         assert kinds.get(type(row.default), float)(stated) == row.default
     assert row.checked(row.default) == row.default
+
+
+# The numbers next to a bound, on either side: some parameters take the bound itself, and some do not.
+BELOW_ZERO, ABOVE_ZERO, BELOW_ONE, BELOW_180 = (
+    float(np.nextafter(*pair)) for pair in ((0, -1), (0, 1), (1, 0), (180, 0))
+)
+# Numbers that are taken, and numbers that are refused.
+ENDS = {
+    "sensor_fov": ((0.0, BELOW_180), (BELOW_ZERO, 180.0)),
+    "film_width": ((1,), (0,)),
+    "film_height": ((1,), (0,)),
+    "displacement_scale": ((-1.0, 0.0), (-np.inf, np.inf, np.nan)),
+    "sample_offset": ((0.0, BELOW_ONE), (BELOW_ZERO, 1.0)),
+    **dict.fromkeys(("tessellation_rate", "max_rate"), ((1, HIGHEST_RATE), (0, HIGHEST_RATE + 1))),
+    **dict.fromkeys(LIMITS, ((ABOVE_ZERO,), (0.0, np.inf, np.nan))),
+}
+
+
+@pytest.mark.parametrize("row", [row for row in PARAMETERS if row.accepts is not None], ids=lambda row: row.name)
+def test_a_parameter_takes_the_numbers_that_its_message_states_and_no_others(row):
+    taken, refused = ENDS[row.name]
+    for value in taken:
+        assert row.checked(value) == value
+    for value in refused:
+        with pytest.raises(ValueError, match=re.escape(f'parameter "{row.name}" is {value}; expected {row.expected}')):
+            row.checked(value)
 
 
 def test_names_with_placeholders_are_those_of_attributes():

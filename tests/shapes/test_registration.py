@@ -72,6 +72,16 @@ def test_a_missing_llvm_matters_to_its_own_variants_only(monkeypatch):
         assert mi.load_dict(shape).face_count() == 12
 
 
+@pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+def test_a_library_that_aborts_is_warned_of_where_an_llvm_variant_is_set_and_nowhere_else(monkeypatch):
+    mi.set_variant("scalar_rgb")
+    monkeypatch.setattr("mitsuba_subdivision.llvm.llvm_problem", lambda: "this LLVM aborts")
+    with pytest.warns(RuntimeWarning, match="this LLVM aborts"):
+        mi.set_variant("llvm_ad_rgb")
+    # A warning would be an error.
+    mi.set_variant("scalar_rgb")
+
+
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_registers_once():
     before = register_variant("scalar_rgb")

@@ -241,6 +241,26 @@ def test_parts_said_to_curve_one_way_do(np_rng):
     assert np.count_nonzero(found) > 0.3 * np.count_nonzero(curves_one_way)
 
 
+@pytest.mark.parametrize("measure", Measure)
+def test_u_and_v_are_alike(measure, np_rng):
+    """Exchanged, they exchange the segments that are needed along them."""
+    basis = BernsteinBasis(SQUARE, 3)
+    u, v = (basis.indices / 3).T
+    # Longer along one than along the other.
+    patches = np.stack([0.2 * u, 3 * v, 0 * u], axis=1)[..., None] + 0.01 * np_rng.normal(size=(len(u), 3, 50))
+    by_u, by_v = basis.derivatives
+    derivatives = [
+        np.einsum("ab,bxt->axt", each, patches) for each in (by_u, by_v, by_u @ by_u, by_u @ by_v, by_v @ by_v)
+    ]
+    tangents = [TangentCone.of(each) for each in derivatives[:2]]
+    found = []
+    for first, second in ((0, 1), (1, 0)):
+        own = tangents[first], tangents[second]
+        turned = [derivatives[i] for i in (first, second, 2 + 2 * first, 3, 2 + 2 * second)]
+        found.append(Criterion(measure, 1e-3).form(turned, own, NormalCone.of(*own), 4))
+    np.testing.assert_allclose(found[1], found[0][::-1], rtol=ROUNDING)
+
+
 @pytest.mark.parametrize("scale", [1e-3, 1e-19, 1e-21, 1e-30, 1e-40, 0])
 def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound(scale):
     """At a curve in place of a surface, however much of the other tangent rounding leaves; in single precision."""

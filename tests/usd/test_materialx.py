@@ -222,6 +222,37 @@ def test_tiles_and_bumps(tmp_path):
     )
 
 
+def test_a_picture_at_constant_coordinates_is_one_texel(tmp_path):
+    mi.Bitmap(np.full((4, 4, 3), 128, np.uint8)).write(str(tmp_path / "color.png"))
+    graph = """<image name="spot" type="color3"><input name="file" type="filename" value="color.png" />
+        <input name="texcoord" type="vector2" value="0.25, 0.75" /></image>"""
+    inputs = '<input name="base_color" type="color3" nodename="spot" />'
+    (found,) = materials(stage(tmp_path, LOOKS % "" + bound(), red=surface(inputs, graph=graph)))
+    for uv in ((0, 0), (0.5, 2)):
+        np.testing.assert_array_equal(found.inputs["base_color"].to_uv @ [*uv, 1], [0.25, 0.75, 1])
+
+
+def test_tiles_lie_beside_the_layer_that_names_them(tmp_path):
+    """In a network inside a stage, wherever the working folder is."""
+    for tile in (1001, 1002):
+        mi.Bitmap(np.full((4, 4, 3), 128, np.uint8)).write(str(tmp_path / f"color.{tile}.png"))
+    text = """def Material "Red" {
+        token outputs:mtlx:surface.connect = </Red/surface.outputs:out>
+        def Shader "surface" {
+            uniform token info:id = "ND_standard_surface_surfaceshader"
+            color3f inputs:base_color.connect = </Red/color.outputs:out>
+            token outputs:out
+        }
+        def Shader "color" {
+            uniform token info:id = "ND_image_color3"
+            asset inputs:file = @./color.<UDIM>.png@
+            color3f outputs:out
+        }
+    }\n"""
+    (found,) = materials(stage(tmp_path, text + bound(target="</Red>")))
+    assert found.inputs["base_color"].file == str(tmp_path / "color.<UDIM>.png")
+
+
 def test_nodes_of_the_document_itself_are_graphs(tmp_path):
     """A definition with an implementation by nodes, used twice with other inputs."""
     own = """<nodedef name="ND_double_float" node="double"><input name="in" type="float" value="0.1" />
@@ -418,3 +449,15 @@ def test_surfaces_of_the_stage_look_as_they_should(tmp_path):
     path = stage(tmp_path, SKY + CAMERA + LOOKS % "" + bound(), red=text)
     picture = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), [0.25, 0.5, 0.75], rtol=0.02)
+
+
+@pytest.mark.parametrize("color", [(0.25, 0.5, 0.75), None])
+def test_a_material_that_asks_for_colours_of_the_mesh_is_black_where_it_has_none(tmp_path, color):
+    inputs = '<input name="base_color" type="color3" nodename="tone" />' + value("specular", "float", "0")
+    text = surface(inputs, graph='<geomcolor name="tone" type="color3" />')
+    square = (
+        bound() if color is None else bound().replace(SQUARE, SQUARE + f"color3f[] primvars:displayColor = [{color}]")
+    )
+    path = stage(tmp_path, SKY + CAMERA + LOOKS % "" + square, red=text)
+    picture = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
+    np.testing.assert_allclose(picture.mean(axis=(0, 1)), color or (0, 0, 0), rtol=0.02)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from mitsuba_subdivision.usd import baking
-from mitsuba_subdivision.usd.baking import baked
+from mitsuba_subdivision.usd.baking import _procedural_wrap, baked
 from mitsuba_subdivision.usd.contents import NodeContents, TextureContents, leaves
 from mitsuba_subdivision.usd.materialx_nodes import evaluate, node, operation
 
@@ -56,6 +56,9 @@ GREY = [0.2, 0.5, 0.7]
         ("normalize", "vector3", {"in_": [3.0, 0.0, 4.0]}, [0.6, 0, 0.8]),
         ("rotate2d", "vector2", {"in_": [1.0, 0.0], "amount": 90.0}, [0, -1]),
         ("rotate3d", "vector3", {"in_": [1.0, 0.0, 0.0], "amount": 90.0, "axis": [0.0, 0.0, 1.0]}, [0, 1, 0]),
+        # Around an axis, its own points stay, and a third of a turn around the diagonal exchanges the others.
+        ("rotate3d", "vector3", {"in_": [0.0, 0.0, 2.0], "amount": 50.0, "axis": [0.0, 0.0, 1.0]}, [0, 0, 2]),
+        ("rotate3d", "vector3", {"in_": [1.0, 2.0, 3.0], "amount": 120.0, "axis": [1.0, 1.0, 1.0]}, [3, 1, 2]),
         ("screen", "float", {"fg": 0.5, "bg": 0.5, "mix": 1.0}, 0.75),
         ("dodge", "float", {"fg": 0.5, "bg": 0.25, "mix": 1.0}, 0.5),
         ("burn", "float", {"fg": 0.5, "bg": 0.75, "mix": 1.0}, 0.5),
@@ -227,3 +230,11 @@ def test_lookups_of_a_linear_image_are_linear(np_rng):
     uv = np.stack([(column + 0.5) / 7, 1 - (row + 0.5) / 5], axis=1)
     found = baking._looked_up(values, uv, "clamp")
     np.testing.assert_allclose(found[:, 0], 2 * column + 3 * row, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("noise", ["noise2d", "fractal2d", "cellnoise2d"])
+def test_ramps_end_at_the_unit_square_and_repeat_where_there_is_noise(noise):
+    ramp = node("ramplr", "float", valuel=0.0, valuer=1.0, texcoord=node("texcoord", "vector2", name="st"))
+    pattern = node(noise, "float", texcoord=node("texcoord", "vector2", name="st"))
+    assert _procedural_wrap(ramp) == "clamp"
+    assert _procedural_wrap(node("add", "float", in1=ramp, in2=pattern)) == "repeat"

@@ -229,40 +229,73 @@ APPROACH = """def Camera "camera" {
 """
 
 
+def floor_with_tiles(folder, camera):
+    path = write(folder, FLOOR + LAMP + camera)
+    # In place of a smaller one.
+    mi.Bitmap(np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), 200, np.uint8)).write(str(folder / "tiles.png"))
+    return path
+
+
+def texture_side(entries):
+    """Of the floor's texture, by entries that are made again of what the scene is made of."""
+    given, more = entries
+    made = SceneEntries(*given, **{**more, "loaded": None})
+    paint = made.scene["paint"]
+    return paint.get("bsdf", paint)["base_color"]["bitmap"].size()[0]
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What entries of scenes are made of."""
+    found = []
+    monkeypatch.setattr(
+        stage_scenes, "SceneEntries", lambda *given, **more: found.append((given, more)) or SceneEntries(*given, **more)
+    )
+    return found
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.filterwarnings("ignore:.*shutters of cameras have no effect")
+def test_textures_are_as_fine_as_the_part_of_a_frame_that_shows_most_of_them_needs(tmp_path, asked):
+    """While the shutter is open, the camera comes nearer."""
+    opened = "double shutter:open = 0\ndouble shutter:close = 1\n"
+    camera = APPROACH.replace('"camera" {', '"camera" {\n' + opened).replace("2: (0, 0, 40)", "2: (0, 0, 10)")
+    path = floor_with_tiles(tmp_path, camera)
+    sides = []
+    for time in (1, 1.25, 1.75):
+        asked.clear()
+        StillPicture(StageScenes(path, LOOK, RATE, time=time))
+        sides.append(texture_side(asked[0]))
+    asked.clear()
+    numbers = range(1, 2)
+    assert (
+        len([*FrameRange(StageScenes(path, LOOK, RATE, numbers=numbers, shutter=2), numbers).frames([1], "box")]) == 2
+    )
+    assert sides[0] == sides[1] < sides[2] < TEXTURE_SIDE
+    assert texture_side(asked[0]) == sides[2]
+
+
 @pytest.mark.usefixtures("variant_scalar_rgb")
 @pytest.mark.parametrize("shown", ["frames", "turntable"])
-def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_path, monkeypatch, shown):
+def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_path, asked, shown):
     """Alike in all frames, so that nothing changes from one to the next, and no finer than that."""
-    path = write(tmp_path, FLOOR + LAMP + APPROACH)
-    mi.Bitmap(np.full((TEXTURE_SIDE, TEXTURE_SIDE, 3), 200, np.uint8)).write(str(tmp_path / "tiles.png"))
-    asked = []
-    monkeypatch.setattr(
-        stage_scenes, "SceneEntries", lambda *given, **more: asked.append((given, more)) or SceneEntries(*given, **more)
-    )
-
-    def side(entries):
-        """Of the floor's texture, by entries that are made again of what the scene is made of."""
-        given, more = entries
-        made = SceneEntries(*given, **{**more, "loaded": None})
-        paint = made.scene["paint"]
-        return paint.get("bsdf", paint)["base_color"]["bitmap"].size()[0]
-
+    path = floor_with_tiles(tmp_path, APPROACH)
     sides = []
     for time in (1, 2, 3):
         asked.clear()
         StillPicture(StageScenes(path, LOOK, RATE, time=time))
-        sides.append(side(asked[0]))
+        sides.append(texture_side(asked[0]))
     asked.clear()
     if shown == "frames":
         assert [*frame_range(path, range(1, 4)).frames([3, 1], "box")]
         assert max(sides) > sides[0]
-        assert [side(each) for each in asked] == [max(sides)] * 2
+        assert [texture_side(each) for each in asked] == [max(sides)] * 2
         assert max(sides) < TEXTURE_SIDE
     else:
         Turntable(StageScenes(path, LOOK, RATE), 4)
-        assert side(asked[0]) == sides[0]
+        assert texture_side(asked[0]) == sides[0]
         Turntable(StageScenes(path, LOOK, RATE), 4, follows_sensor=False)
-        assert side(asked[1]) == TEXTURE_SIDE
+        assert texture_side(asked[1]) == TEXTURE_SIDE
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.usd import surface_models
-from mitsuba_subdivision.usd.bsdfs import Bsdfs
+from mitsuba_subdivision.usd.bsdfs import Bsdfs, interior
 from mitsuba_subdivision.usd.contents import ShapeContents, TextureContents
 from mitsuba_subdivision.usd.materialx_library import library, numbers
 from mitsuba_subdivision.usd.materialx_nodes import node
@@ -26,6 +26,8 @@ IDS = {
 COLOR = [0.2, 0.4, 0.8]
 # Of means of 65,536 samples whose lobes are chosen by other odds.
 SAMPLED = 0.02
+# Media have finite densities.
+ABSORBED = 1e-3
 
 
 @pytest.fixture(autouse=True)
@@ -263,6 +265,8 @@ def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters():
     metal = {"metallic": 1.0, "base_color": COLOR, "roughness": 0.5, "anisotropy_strength": 0.5}
     bsdf = entry(look("gltf_pbr", **metal))[0]["bsdf"]
     assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(0.25 + 0.75 * 0.25), pytest.approx(0.25))
+    bsdf = entry(look("gltf_pbr", **{**metal, "anisotropy_strength": 1.0}))[0]["bsdf"]
+    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(1), pytest.approx(0.25))
     metal = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
     skew, notes = entry(look("standard_surface", **metal))
     assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
@@ -302,6 +306,28 @@ def test_bodies_without_a_distance_absorb_nothing():
     body = {"transmission": 1.0, "thickness": 1.0, "attenuation_color": COLOR}
     assert "depth" not in look("gltf_pbr", **body).inputs
     assert look("gltf_pbr", **body, attenuation_distance=2.0).inputs["depth"] == 2.0
+
+
+def test_bodies_absorb_all_of_a_colour_that_they_have_none_of():
+    inputs = {"transmission": 1.0, "transmission_depth": 2.0, "transmission_color": [0.0, 0.5, 1.0]}
+    medium = interior(look("standard_surface", **inputs))["interior"]
+    along = np.exp(-2 * medium["scale"] * np.array(medium["sigma_t"]["value"]))
+    np.testing.assert_allclose(along, [0, 0.5, 1], rtol=0, atol=ABSORBED)
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "part"),
+    [
+        ("standard_surface", {"thin_walled": 1.0, "subsurface": 0.5}, 0.5),
+        # OpenPBR lets half of the light out on either side.
+        ("open_pbr_surface", {"geometry_thin_walled": 1.0, "subsurface_weight": 0.5}, 0.25),
+    ],
+)
+def test_sheets_let_through_the_part_of_diffuse_light_that_the_model_says(model, given, part):
+    """A thin sheet of paper."""
+    reflected, transmitted = both(model, base_color=[0.8] * 3, subsurface_color=[0.8] * 3, **given)
+    np.testing.assert_allclose(transmitted, 0.8 * part, rtol=SAMPLED)
+    assert (reflected > 0.8 * (1 - part) - SAMPLED).all()
 
 
 def test_emission_and_presence():

@@ -2,6 +2,7 @@
 
 import warnings
 
+import drjit as dr
 import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
@@ -38,6 +39,8 @@ CAMERA = """def Camera "camera" {
     uniform token[] xformOpOrder = ["xformOp:translate"]
 }
 """
+# The largest light is 5 units wide at a distance of 7: what its sides send comes from farther away, and at an angle.
+AREA_LIGHT = 0.15
 DARK = 'def DomeLight "dome" { float inputs:intensity = 0 }\n'
 
 
@@ -568,6 +571,22 @@ def test_textures_read_the_coordinates_that_they_name(stage, tmp_path):
             np.testing.assert_allclose(rendered(scene, 1).mean(axis=(0, 1)), expected, atol=0.02)
 
 
+def test_nodes_of_texture_coordinates_that_are_not_known_are_told_and_left_out(stage, tmp_path):
+    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    glow = "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>"
+    odd = """def Shader "odd" {
+        uniform token info:id = "OddTransform"
+        float2 inputs:in.connect = </paint/reader.outputs:result>
+        float2 outputs:result
+    }"""
+    for chain, expected in (("</paint/odd.outputs:result>", 1), ("</paint/reader.outputs:result>", 0)):
+        paint = material(glow, texture("black.png", chain=chain) + odd)
+        with warnings.catch_warnings(record=True) as record:
+            warnings.simplefilter("always")
+            msub.usd_scene(stage(paint + mesh("square", SQUARE + BOUND)), mi)
+        assert told(record).count('shaders "OddTransform" of texture coordinates are ignored (/paint/odd)') == expected
+
+
 def test_normal_maps_turn_the_normal(stage, tmp_path):
     """A surface that faces the light by its normal map gets all of it."""
     normal = np.array([0.6, 0.0, 0.8])
@@ -673,6 +692,50 @@ def test_lights_of_which_nothing_is_said_are_as_large_as_usd_says_and_shine_ever
     assert found.size == size
 
 
+@pytest.mark.parametrize("is_point", [False, True])
+def test_a_sphere_is_a_point_where_the_stage_says_so(stage, is_point):
+    (found,) = read_stage(stage(light("SphereLight", [f"bool treatAsPoint = {int(is_point)}"]))).lights
+    assert found.kind == ("point" if is_point else "sphere")
+
+
+@pytest.mark.parametrize(
+    ("schema", "attribute", "is_told"),
+    [
+        ("ShapingAPI", "float inputs:shaping:cone:angle = 30", True),
+        # It shines everywhere in its half of the directions, or in all.
+        ("ShapingAPI", "float inputs:shaping:cone:angle = 180", False),
+        ("ShapingAPI", "float inputs:shaping:focus = 2", True),
+        ("ShadowAPI", "bool inputs:shadow:enable = 0", True),
+        ("ShadowAPI", "bool inputs:shadow:enable = 1", False),
+        ("ShadowAPI", "float inputs:diffuse = 0.5", True),
+        ("ShadowAPI", "float inputs:specular = 1", False),
+    ],
+)
+def test_what_lights_cannot_do_is_told(stage, schema, attribute, is_told):
+    text = light("SphereLight", [attribute]).replace('"lamp"', f'"lamp" ( prepend apiSchemas = ["{schema}"] )')
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        msub.usd_scene(stage(text + mesh("square", SQUARE)), mi)
+    name = attribute.split()[1]
+    assert (f"{name} of lights is ignored" in told(record)) == is_told
+
+
+def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(stage):
+    """There they are far away, where no picture shows them."""
+    places = (np.indices((16, 16)).reshape(2, -1) + 0.5) / 16
+    middle = dr.zeros(mi.SurfaceInteraction3f)
+    for name in ("key_light", "fill_light", "rim_light"):
+        found = []
+        for camera, kind in (("", "rectangle"), (CAMERA, "directional")):
+            scene = msub.usd_scene(stage(camera + mesh("cube", CUBE)), mi)
+            assert scene[name]["type"] == kind
+            alone = mi.load_dict({"type": "scene", "light": scene[name]})
+            # Mean of what comes from all places of a light: its irradiance.
+            weight = alone.sample_emitter_direction(middle, mi.Point2f(places), False)[1]
+            found.append(np.array(weight).reshape(3, -1).mean(axis=1))
+        np.testing.assert_allclose(found[1], found[0], rtol=AREA_LIGHT)
+
+
 def test_a_stretched_cylinder_is_as_long_and_as_wide_as_its_axes_say(stage):
     """It lies along x: its scale there makes it longer, and the scales of y and z wider."""
     lamp = light("CylinderLight", ["float inputs:length = 2", "float inputs:radius = 0.25"])
@@ -757,6 +820,18 @@ def test_depth_of_field_and_the_resolution_of_render_settings(stage):
         msub.usd_scene(stage(lens + mesh("cube", CUBE)), mi, camera="/none")
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_of_several_cameras_the_first_is_used_and_told(stage, count):
+    cameras = "".join(CAMERA.replace('"camera"', f'"camera_{number}"') for number in range(count))
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        scene = msub.usd_scene(stage(cameras.replace("Length = 50", "Length = 60", 1) + mesh("cube", CUBE)), mi)
+    names = ", ".join(f"/camera_{number}" for number in range(count))
+    assert (f"there are several cameras, and the first is used ({names})" in told(record)) == (count > 1)
+    alone = msub.usd_scene(stage(CAMERA.replace("Length = 50", "Length = 60") + mesh("cube", CUBE)), mi)
+    assert scene["sensor"]["fov"] == alone["sensor"]["fov"]
+
+
 @pytest.mark.parametrize("scheme", ["none", "catmullClark"])
 def test_display_colours_of_every_interpolation(stage, scheme):
     """Two squares side by side, lit evenly: colours where the interpolation says that they are."""
@@ -814,6 +889,14 @@ def test_normals_of_polygons(stage):
         )
         assert found[(-1, -1)] == [1, 0, 0]
         assert found[(1, -1)] == [0, 1, 0]
+
+
+def test_holes_of_polygons_are_open(stage):
+    both = SQUARE.replace("= [4]", "= [4, 4]").replace("[0, 1, 2, 3]", "[0, 1, 2, 3, 3, 2, 1, 0]")
+    shape = msub.usd_scene(stage(mesh("square", both + "int[] holeIndices = [1]")), mi)["square"]
+    assert shape.face_count() == 2
+    p = positions(shape)[np.array(mi.traverse(shape)["faces"]).reshape(-1, 3)]
+    assert (np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] > 0).all()
 
 
 def test_planes_are_rectangles(stage):
