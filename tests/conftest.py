@@ -45,6 +45,8 @@ def pytest_collection_finish():
 
 def pytest_runtest_setup(item):
     is_alone = item.path.parent.name in IN_ONE_THREAD and not item.get_closest_marker("threads")
+    # A picture that a test before still writes ends with a call of Python, for which Dr.Jit would wait for ever.
+    mi.Thread.wait_for_tasks()
     dr.set_thread_count(1 if is_alone else ALL_THREADS)
     if os.name != "posix" and item.get_closest_marker("posix"):
         pytest.skip("there are no programs of the shell, signals, pipes or links as on POSIX")
