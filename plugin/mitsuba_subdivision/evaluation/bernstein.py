@@ -15,6 +15,9 @@ from .polynomial_basis import polynomial_basis
 
 # Sums of Bernstein coefficients, differences and halvings have entries of small fractions; rounding leaves these.
 NO_ENTRY = 1e-12
+# In one product of matrices. For more, OpenBLAS starts threads, and where those of Dr.Jit wait for work in a loop, each
+# product then takes up to fifteen times as long.
+MOST_MULTIPLICATIONS = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +148,13 @@ def regular_bernstein(scheme: Scheme) -> RegularBernstein:
 
 def times(rows: FloatArray, points: FloatArray) -> FloatArray:
     """``(r, 3, n)`` rows ``(r, b)`` times points ``(b, 3, n)``."""
-    return (rows @ points.reshape(len(points), -1)).reshape(len(rows), *points.shape[1:])
+    columns = points.reshape(len(points), -1)
+    found = np.empty((len(rows), columns.shape[1]), dtype=np.result_type(rows, columns))
+    length = max(1, MOST_MULTIPLICATIONS // max(1, rows.size))
+    for begin in range(0, columns.shape[1], length):
+        run = slice(begin, begin + length)
+        np.matmul(rows, columns[:, run], out=found[:, run])
+    return found.reshape(len(rows), *points.shape[1:])
 
 
 def _clean(matrix: FloatArray) -> FloatArray:
