@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.evaluation.bernstein import regular_bernstein
+from mitsuba_subdivision.evaluation.bernstein import regular_bernstein, times
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
 
 pytestmark = pytest.mark.core
@@ -59,3 +59,16 @@ def test_halves_are_the_same_polynomials_over_copies_of_the_domain(scheme, np_rn
 def test_coefficients_at_corners_are_values(scheme):
     basis = regular_bernstein(scheme).basis
     np.testing.assert_array_equal(basis.values(scheme.domain.corners)[:, basis.corners], np.eye(len(basis.corners)))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [0, 1, 7, 100])
+def test_products_do_not_depend_on_the_blocks_they_are_made_in(dtype, count, np_rng, monkeypatch):
+    rows, points = np_rng.normal(size=(5, 9)).astype(dtype), np_rng.normal(size=(9, 3, count)).astype(dtype)
+    expected = np.einsum("rb,bxn->rxn", rows, points)
+    for most in (1, rows.size * 10, 1 << 18):
+        monkeypatch.setattr("mitsuba_subdivision.evaluation.bernstein.MOST_MULTIPLICATIONS", most)
+        found = times(rows, points)
+        assert found.dtype == dtype
+        # Sums of nine products.
+        np.testing.assert_allclose(found, expected, rtol=0, atol=100 * np.finfo(dtype).eps)
