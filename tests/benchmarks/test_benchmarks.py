@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from benchmarks.peers import time_peer
+from benchmarks.whole_stage import without_materials
 from mitsuba_subdivision.llvm import llvm_problem
 
 HERE = Path(__file__).parent
@@ -60,6 +61,25 @@ def Mesh "quads" {
     point3f[] points = [(0, 0, 0), (1, 0, 0), (2, 0, 1), (0, 1, 0), (1, 1, 0), (2, 1, 1)]
 }
 """
+
+
+def test_a_stage_without_materials_has_all_else(tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    path = tmp_path / "quads.usda"
+    binding = '(prepend apiSchemas = ["MaterialBindingAPI"]) {\n    rel material:binding = </red>'
+    text = STAGE.replace("#usda 1.0", '#usda 1.0\n(\n    upAxis = "Z"\n)\ndef Material "red" {\n}')
+    path.write_text(text.replace('"quads" {', f'"quads" {binding}'))
+    given = usd.Stage.Open(str(path))
+    found = usd.Stage.Open(str(without_materials(path, tmp_path / "grey.usda")))
+    assert [each.GetName() for each in given.Traverse()] == ["red", "quads"]
+    assert [each.GetName() for each in found.Traverse()] == ["quads"]
+    bindings = [
+        each.GetPrimAtPath("/quads").GetRelationship("material:binding").GetTargets() for each in (given, found)
+    ]
+    assert [len(each) for each in bindings] == [1, 0]
+    assert found.GetMetadata("upAxis") == given.GetMetadata("upAxis") == "Z"
+    points = [each.GetPrimAtPath("/quads").GetAttribute("points").Get() for each in (given, found)]
+    assert points[0] == points[1]
 
 
 def test_a_whole_stage_is_measured_without_cycles(tmp_path):

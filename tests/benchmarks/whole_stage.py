@@ -1,6 +1,6 @@
 """Time a USD file from its reading to the picture and to the next one, against Cycles with adaptive subdivision.
 
-python tests/benchmarks/whole_stage.py STAGE.usda [--cycles PYTHON] [--size 640 480] [--spp 16] [--repeats 2]
+python tests/benchmarks/whole_stage.py STAGE.usda [--grey] [--cycles PYTHON] [--size 640 480] [--spp 16] [--repeats 2]
 
 The stage that the page of speed has is the Open Chess Set of https://github.com/usd-wg/assets, which is not loaded from
 there by itself. PYTHON is one that has Blender as a module, `pip install bpy==5.0.1`; without it Cycles is left out.
@@ -40,13 +40,6 @@ def main(arguments=None):
     if options.process:
         print(json.dumps(_own(options)))
         return
-    with tempfile.TemporaryDirectory() as folder:
-        if options.grey:
-            options.stage = _without_materials(options.stage.resolve(), Path(folder) / "grey.usda")
-        _compare(options)
-
-
-def _compare(options):
     sides = {shading: [sys.executable, __file__, "--process", shading] for shading in SHADINGS}
     if reason := _no_cycles(options.cycles):
         print(f"Cycles: left out, {reason}")
@@ -67,7 +60,7 @@ def _parsed(arguments):
     return parser.parse_args(arguments)
 
 
-def _without_materials(path, copy):
+def without_materials(path, copy):
     """A stage that has all of another one but its materials, except in prototypes."""
     from pxr import Sdf, Usd, UsdShade, UsdUtils
 
@@ -98,9 +91,12 @@ def _no_cycles(python):
 
 def _measured(sides, options):
     """By side, the best wall and processor seconds of each stage, and the peak of memory in MB."""
-    common = [options.stage, "--size", *options.size, "--spp", options.spp]
     found = {name: [] for name in sides}
     with tempfile.TemporaryDirectory() as folder:
+        stage = (
+            without_materials(options.stage.resolve(), Path(folder) / "grey.usda") if options.grey else options.stage
+        )
+        common = [stage, "--size", *options.size, "--spp", options.spp]
         # Modules that are imported later are compiled once, as in an installation.
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         os.environ["PYTHONPYCACHEPREFIX"] = folder
@@ -108,7 +104,7 @@ def _measured(sides, options):
         # The first round compiles kernels and modules, and reads files into memory.
         for number in range(options.repeats + 1):
             for name, command in sides.items():
-                words = [*command, *common] if name != "cycles" else [*command, options.stage, camera]
+                words = [*command, *common] if name != "cycles" else [*command, stage, camera]
                 run = _run(name, words)
                 if number:
                     found[name].append(run)

@@ -236,6 +236,17 @@ def floor_with_tiles(folder, camera):
     return path
 
 
+def sides_of_stills(path, times, asked):
+    """Of the texture in pictures at some times; nothing is asked for afterwards."""
+    sides = []
+    for time in times:
+        asked.clear()
+        StillPicture(StageScenes(path, LOOK, RATE, time=time))
+        sides.append(texture_side(asked[0]))
+    asked.clear()
+    return sides
+
+
 def texture_side(entries):
     """Of the floor's texture, by entries that are made again of what the scene is made of."""
     given, more = entries
@@ -261,12 +272,7 @@ def test_textures_are_as_fine_as_the_part_of_a_frame_that_shows_most_of_them_nee
     opened = "double shutter:open = 0\ndouble shutter:close = 1\n"
     camera = APPROACH.replace('"camera" {', '"camera" {\n' + opened).replace("2: (0, 0, 40)", "2: (0, 0, 10)")
     path = floor_with_tiles(tmp_path, camera)
-    sides = []
-    for time in (1, 1.25, 1.75):
-        asked.clear()
-        StillPicture(StageScenes(path, LOOK, RATE, time=time))
-        sides.append(texture_side(asked[0]))
-    asked.clear()
+    sides = sides_of_stills(path, (1, 1.25, 1.75), asked)
     numbers = range(1, 2)
     assert (
         len([*FrameRange(StageScenes(path, LOOK, RATE, numbers=numbers, shutter=2), numbers).frames([1], "box")]) == 2
@@ -280,12 +286,7 @@ def test_textures_are_as_fine_as_the_part_of_a_frame_that_shows_most_of_them_nee
 def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_path, asked, shown):
     """Alike in all frames, so that nothing changes from one to the next, and no finer than that."""
     path = floor_with_tiles(tmp_path, APPROACH)
-    sides = []
-    for time in (1, 2, 3):
-        asked.clear()
-        StillPicture(StageScenes(path, LOOK, RATE, time=time))
-        sides.append(texture_side(asked[0]))
-    asked.clear()
+    sides = sides_of_stills(path, (1, 2, 3), asked)
     if shown == "frames":
         assert [*frame_range(path, range(1, 4)).frames([3, 1], "box")]
         assert max(sides) > sides[0]

@@ -31,6 +31,7 @@ from .equations import (
     times_powers,
 )
 from .ring_symmetry import (
+    LEADING,
     fan_eigenbasis,
     fan_ring,
     leading_of_fan,
@@ -330,7 +331,7 @@ def _leading(structure: IrregularStructure) -> Eigenbasis | None:
         return None
     order = structure.order_of(ring)
     # Frames are made of three eigenvectors where a crease ends, and of all elsewhere.
-    return leading_of_fan(structure.table.matrix, order, 3 if rule == VertexRule.DART else len(order))
+    return leading_of_fan(structure.table.matrix, order, LEADING if rule == VertexRule.DART else len(order))
 
 
 @lru_cache(maxsize=4096)
