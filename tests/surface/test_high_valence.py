@@ -7,6 +7,7 @@ from mitsuba_subdivision.evaluation import occupied_pieces
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
 from mitsuba_subdivision.patches import patch_samples, patch_table
 from mitsuba_subdivision.schemes import CatmullClark, Loop
+from mitsuba_subdivision.surface import high_valence
 
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 # Of which weights would take tens of gigabytes.
@@ -67,6 +68,21 @@ def test_pieces_of_a_semi_sharp_fan_that_take_too_much_are_refused():
     surface.tessellate(1)
     with pytest.raises(MemoryError, match=rf"vertex {HIGH} has {HIGH} faces, and pieces .* GB .*several vertices"):
         surface.pieces()
+
+
+def test_memory_is_read_for_the_first_surface_of_a_topology_only(monkeypatch):
+    """A scene of a thousand equal cages read a dozen of the system's files for each."""
+    calls = []
+    monkeypatch.setattr(high_valence, "SMALL", 0)
+    monkeypatch.setattr(high_valence, "available_memory", lambda: calls.append(None))
+    cage = pyramid(5)
+    first, second = (LimitSurface(cage.with_positions(z * cage.positions), "loop") for z in (1, 2))
+    tables = [first.pieces()]
+    assert calls
+    calls.clear()
+    tables.append(second.pieces())
+    assert tables[0] is tables[1]
+    assert not calls
 
 
 def test_samples_on_a_fan_are_those_of_its_faces_one_after_the_other(monkeypatch, np_rng):

@@ -140,7 +140,7 @@ class DividedElement:
         """All children, as `child` gives them; none of a piece."""
         return [] if self.piece is not None else [self.child(number) for number in range(len(self.domains))]
 
-    @property
+    @cached_property
     def child_elements(self) -> list[DividedElement]:
         """All children; none of a piece."""
         return [] if self.piece is not None else [self.child_element(number) for number in range(len(self.domains))]

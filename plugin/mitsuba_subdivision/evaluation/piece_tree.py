@@ -199,6 +199,7 @@ def _tips(element: DividedElement, piece_levels: int) -> list[_Tip]:
     return [
         tip._replace(rows=element.over_controls(tip.rows, number))
         for number, child in enumerate(element.child_elements)
+        if child.tip_count
         for tip in _tips(child, piece_levels)
     ]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -86,7 +87,13 @@ class PieceTable:
 
     @classmethod
     def build(
-        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
+        cls,
+        patches: PatchTable,
+        control_of_vertex: IntArray,
+        control_count: int,
+        piece_levels: int = PIECE_LEVELS,
+        *,
+        require_memory: Callable[[], None] = lambda: None,
     ) -> PieceTable:
         """Prepare the evaluation of some patches; equal arguments share the object while it is referenced.
 
@@ -98,14 +105,20 @@ class PieceTable:
         control_count : int
         piece_levels : int
             Number of levels of tips that are pieces, if these do not take too much memory.
+        require_memory : callable
+            Called before an object is made; raises if it would not fit into memory.
 
         Raises
         ------
         SchemeError
             As `piece_tree`.
         """
-        key = patches, Content(control_of_vertex), control_count, piece_levels
-        return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))
+
+        def make() -> PieceTable:
+            require_memory()
+            return cls._build(patches, control_of_vertex, control_count, piece_levels)
+
+        return _TABLES.get((patches, Content(control_of_vertex), control_count, piece_levels), make)
 
     @classmethod
     def _build(

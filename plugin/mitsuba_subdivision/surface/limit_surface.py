@@ -452,10 +452,14 @@ class LimitSurface:
             If the pieces of so many classes of patches do not fit into memory.
         """
         if evaluator not in self._pieces:
-            require_memory_for_pieces(self.cage, self.patches)
             levels = {"piece_levels": 0} if evaluator == "stam" else {}
-            control_of_vertex, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-            self._pieces[evaluator] = patches.PieceTable.build(self.patches, control_of_vertex, count, **levels)
+            self._pieces[evaluator] = patches.PieceTable.build(
+                self.patches,
+                self.cage.cut_mesh.vertex,
+                self.cage.vertex_count,
+                require_memory=lambda: require_memory_for_pieces(self.cage, self.patches),
+                **levels,
+            )
         return self._pieces[evaluator]
 
     @cached_property
