@@ -78,6 +78,21 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights
     np.testing.assert_allclose(found, of_row[:, None] * [1, 0, 0], rtol=0, atol=rounding(float_type))
 
 
+def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, weights, np_rng):
+    types, weighted = ArrayTypes.of(float_type), WeightedValues(weights, float_type)
+    values = np_rng.random((COLUMNS, 3))
+    make = partial(weighted, size=3)
+    first, second = (ControlValues(values.copy(), types, make, key=weighted) for _ in range(2))
+    other, apart = ControlValues(values + 1, types, make, key=weighted), ControlValues(values, types, make)
+    kept = np.array(second.flat)
+    assert first.flat is not second.flat
+    assert first.flat.index == second.flat.index
+    assert len({each.flat.index for each in (first, other, apart)}) == 3
+    first.set(float_type(np.ravel(2 * values)))
+    np.testing.assert_array_equal(second.flat, kept)
+    np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding(float_type))
+
+
 @pytest.mark.parametrize("is_weighted", [False, True])
 def test_scalar_variants_look_up_the_same(weights, is_weighted, np_rng):
     first, second = np_rng.random((2, COLUMNS, 3))

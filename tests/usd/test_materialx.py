@@ -12,6 +12,7 @@ from mitsuba_subdivision.cage.equality import same
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.contents import NodeContents, PrimvarContents, TextureContents
+from mitsuba_subdivision.usd.materialx_library import library
 from mitsuba_subdivision.usd.stage_reader import StageReader
 
 pytest.importorskip("MaterialX")
@@ -90,6 +91,14 @@ def test_documents_are_found_by_reference_and_layers_stay_as_they_are(tmp_path, 
     assert layer.GetCompositionAssetDependencies() == ["red.mtlx"]
     assert Sdf.Layer.Find(str(tmp_path / "red.mtlx")) is None
     assert "file format" not in "".join(capfd.readouterr())
+
+
+def test_the_library_of_nodes_goes_with_the_reader(tmp_path):
+    reader = StageReader(stage(tmp_path, LOOKS % "" + bound(), red=RED))
+    reader.at()
+    assert library.cache_info().currsize == 1
+    del reader
+    assert library.cache_info().currsize == 0
 
 
 def test_inputs_are_overridden_as_in_any_reference(tmp_path):

@@ -55,7 +55,7 @@ class SubdividedChannelKernel:
             own: Value = values if size == 1 else dr.unravel(types.vector(size), values)
             return coefficients(dr.ravel(types.vector3(*([own] if size == 1 else own), *[0] * (3 - size))))
 
-        self.values = ControlValues(channel.values, types, make)
+        self.values = ControlValues(channel.values, types, make, key=coefficients)
 
     def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:
         """The value, and its derivatives by the parameters."""

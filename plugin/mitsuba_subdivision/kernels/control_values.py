@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, LaterArray, Shared
 from .array_types import ArrayTypes
 from .sparse_matrix import SparseMatrix
 from .types import FloatBuffer, Index, Mask, Value
@@ -82,6 +82,8 @@ class ControlValues:
     make : callable, optional
         Computes the gathered values, flat, from the cage's, which are flat on a device, else ``(n, k)`` float64. The
         default is the identity.
+    key : hashable, optional
+        Of what ``make`` does: with it, equal values share what is made of them until they are set.
 
     Attributes
     ----------
@@ -92,16 +94,23 @@ class ControlValues:
     """
 
     def __init__(
-        self, values: NDArray[np.floating], types: ArrayTypes, make: Callable[[FloatBuffer], FloatBuffer] | None = None
+        self,
+        values: NDArray[np.floating],
+        types: ArrayTypes,
+        make: Callable[[FloatBuffer], FloatBuffer] | None = None,
+        key: Hashable = None,
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
-        self.flat: FloatBuffer = types.float() if types.is_jit else None
+        self.flat: FloatBuffer = None
+        self._shared: LaterArray | None = None
         if not types.is_jit:
             self.set(values)
             return
-        # Kept, so that others that are equal share its memory.
+        self.flat = types.float()
+        # Kept, so that others that are equal share the memory.
         self._given = types.shared_floats(values)
-        self.set(self._given.array)
+        self._shared = LaterArray() if key is None else _MADE.get((key, self._given), LaterArray)
+        self.flat[:] = self._shared.get(lambda: self._made(self._given.array))
 
     def set(self, values: FloatBuffer) -> None:
         """Set new values of the cage, flat. Later lookups are attached to them."""
@@ -109,10 +118,14 @@ class ControlValues:
             given = np.array(values, dtype=np.float64).reshape(-1, self.size)
             self.flat = np.ravel(given if self._make is None else self._make(given))
             return
-        made = values if self._make is None else self._make(values)
+        self.flat[:] = self._made(values)
+        self._shared = None
+
+    def _made(self, values: FloatBuffer) -> FloatBuffer:
+        found = values if self._make is None else self._make(values)
         # Literals would be compiled into kernels.
-        dr.make_opaque(made)
-        self.flat[:] = made
+        dr.make_opaque(found)
+        return found
 
     @property
     def are_moving(self) -> bool:
@@ -125,3 +138,4 @@ class ControlValues:
 
 
 _WEIGHTED: Shared[WeightedValues] = Shared()
+_MADE: Shared[LaterArray] = Shared()

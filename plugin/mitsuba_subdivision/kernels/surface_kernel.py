@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, LaterArray, Shared
 from .apply_weights import coordinates_expected
 from .area_sampler import AreaSampler
 from .array_types import ArrayTypes
@@ -76,7 +76,7 @@ class SurfaceKernel:
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
         self.coefficients: FloatBuffer = float_type() if self.types.is_jit else None
-        self._loaded: _Loaded | None = None
+        self._loaded: LaterArray | None = None
 
     def set_control_points(self, points: FloatBuffer) -> None:
         """Take over control points. What is evaluated afterwards has derivatives by them.
@@ -98,11 +98,8 @@ class SurfaceKernel:
 
     def load(self, positions: NDArray[np.floating]) -> None:
         """Take over control points, ``(n, 3)``, that other kernels may have: equal ones share their coefficients."""
-        self._loaded = _LOADED.get((self._map, Content(positions)), _Loaded)
-        if self._loaded.coefficients is None:
-            self._loaded.coefficients = self._map(self.types.floats(positions.ravel()))
-            dr.make_opaque(self._loaded.coefficients)
-        self.take(self._loaded.coefficients)
+        self._loaded = _LOADED.get((self._map, Content(positions)), LaterArray)
+        self.take(self._loaded.get(lambda: self._map(self.types.floats(positions.ravel()))))
 
     def attach(self, points: FloatBuffer) -> None:
         """Attach derivatives by the control points once more, without making coefficients."""
@@ -380,14 +377,4 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
     return by_u, by_v
 
 
-class _Loaded:
-    """Coefficients that kernels of the same control points share."""
-
-    # Without a dictionary, so that Dr.Jit does not take it for a shape's state.
-    __slots__ = ("__weakref__", "coefficients")
-
-    def __init__(self) -> None:
-        self.coefficients: FloatBuffer = None
-
-
-_LOADED: Shared[_Loaded] = Shared()
+_LOADED: Shared[LaterArray] = Shared()

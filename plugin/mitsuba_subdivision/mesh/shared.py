@@ -49,6 +49,22 @@ class SharedArray:
     array: Any
 
 
+class LaterArray:
+    """An array as a value of `Shared` that is made when the value is there: what makes it may wait for Dr.Jit."""
+
+    # Without a dictionary, so that Dr.Jit does not take it for a shape's state.
+    __slots__ = ("__weakref__", "_array")
+
+    def __init__(self) -> None:
+        self._array: Any = None
+
+    def get(self, make: Callable[[], Any]) -> Any:
+        """The array, made at the first call."""
+        if self._array is None:
+            self._array = make()
+        return self._array
+
+
 class Shared(Generic[Value]):
     """Values by keys, each made at its first use and kept while it is referenced elsewhere."""
 

@@ -259,10 +259,11 @@ class PatchTable:
         return index, patch, patch_corner
 
     @cached_property
-    def _patch_of_corner(self) -> tuple[IndexArray, IndexArray, IndexArray]:
-        """`patch_at` all half-edges."""
+    def _patch_of_corner(self) -> tuple[IntArray, IndexArray, NDArray[np.int8]]:
+        """`patch_at` all half-edges, each in few bytes: a cage has some millions of them."""
         t = self.elements
-        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=np.int32) for _ in range(3))
+        types = np.min_scalar_type(-self.class_count), np.int32, np.int8
+        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=each) for each in types)
         for index, patch_class in enumerate(self.classes):
             corners = patch_class.corners
             whole = self.is_whole[t.face_of(corners[0])]

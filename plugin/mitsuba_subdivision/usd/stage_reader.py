@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ..cage.errors import CageWarning, warn
 from ..files.usd_process import call_in_process, seconds_in_process
 from .contents import TYPES, SceneContents
+from .materialx_library import library
 from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage, read_stage
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ class StageReader:
         self._first: SceneContents | None = None
         self._is_still: bool | None = None
         self._warned = set() if warned is None else warned
+        # It takes a dozen megabytes, which no scene needs.
+        weakref.finalize(self, library.cache_clear)
 
     def at(self, time: float | None = None) -> SceneContents:
         """Contents of the stage at a time code; by default, at the first one of each value.
