@@ -74,6 +74,11 @@ class ArrayTypes:
         return getattr(sys.modules[self.float.__module__], "ArrayXf64" if self.is_double else "ArrayXf")
 
     @property
+    def index64(self) -> type:
+        """Unsigned integers of 64 bits."""
+        return int if not self.is_jit else sys.modules[self.float.__module__].UInt64
+
+    @property
     def matrix4(self) -> type:
         """Matrices of four rows and columns."""
         name = "Matrix4f64" if self.is_double else "Matrix4f"

@@ -32,7 +32,7 @@ from ..patches.piece_table import (
     WHOLE,
 )
 from .array_types import ArrayTypes
-from .domain_map import distances, in_child, turn_matrix, turned
+from .domain_map import distances, doublings, in_child, turn_matrix, turned
 from .element_walk import ElementWalk
 from .polynomial import Monomials
 from .types import Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
@@ -41,7 +41,7 @@ from .vectors import added, combined, cross, like
 if TYPE_CHECKING:
     from ..patches import PieceTable
 
-# The logarithm of zero would be infinite. Nothing as near to an extraordinary point has a level of its own.
+# Zero has no exponent. Nothing as near to an extraordinary point has a level of its own.
 LEAST_EXTENT = 2.0**-64
 # Derivatives that no polynomial gives are differences over so much of a piece. Rounding leaves 2⁻¹³ of them in single
 # precision.
@@ -479,12 +479,10 @@ class PieceKernel:
         """
         types = self.types
         extent = u + v if self.domain.corner_count == 3 else dr.maximum(u, v)
-        # Where rounding takes a power of two for a little more or less, parameters are as little outside the child.
-        n = dr.floor(-dr.log2(dr.maximum(extent, LEAST_EXTENT)))
-        n = dr.select(is_tip, dr.clip(n, 0, types.float(level_count)), types.float(0))
-        level, power = types.index(n), dr.exp2(n)
+        most = dr.select(is_tip, level_count, types.index(0))
+        level, power = doublings(types, dr.maximum(extent, LEAST_EXTENT), most)
         u, v, scale = u * power, v * power, scale * power
-        number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v, is_beyond_first=True)
+        number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
         is_child = is_tip & (level < level_count)
         block = dr.select(is_child, dr.fma(level, LEVEL_PIECES, number - 1), level * LEVEL_PIECES)
         return (
