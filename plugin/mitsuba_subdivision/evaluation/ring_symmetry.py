@@ -54,6 +54,8 @@ PROBES = 8
 PROBES_OF_FACE = 2
 # Vectors that matter where a crease ends.
 LEADING = 3
+# By so much of their distance from a shift eigenvalues are found before the shift is moved there.
+ROUGH = 1e-3
 # Digits of weights by which rings are recognised as equal.
 SAME_DIGITS = 12
 # Rows of large matrices that are sorted at once.
@@ -364,12 +366,14 @@ def _leading_ring_basis(ring: _RingMatrix) -> Eigenbasis:
         values, vectors = eigs(matrix.T.tocsr() if transposed else matrix, k=count, sigma=shift, v0=start)
         return vectors.real[:, np.argsort(-values.real)].astype(np.float64)
 
-    # No eigenvalue is above one. Just above the second and third, these are found at once.
-    above = 1 + SEPARATE
-    rough = eigs(matrix, k=LEADING, sigma=above, v0=start, tol=CLUSTER_WIDTH, return_eigenvectors=False)
-    second = float(np.sort(rough.real)[1]) * (1 + CLUSTER_WIDTH)
+    # No eigenvalue is above one. The nearer a shift is above the second and third, the sooner these are found.
+    above = shift = 1 + SEPARATE
+    for count in (LEADING, LEADING - 1):
+        rough = eigs(matrix, k=count, sigma=shift, v0=start, tol=ROUGH, return_eigenvectors=False)
+        second = float(np.sort(rough.real)[1])
+        shift = second * (1 + CLUSTER_WIDTH) + 2 * ROUGH * (shift - second)
     vectors, dual = (
-        np.hstack([vectors_near(above, is_dual, 1), vectors_near(second, is_dual, LEADING - 1)])
+        np.hstack([vectors_near(above, is_dual, 1), vectors_near(shift, is_dual, LEADING - 1)])
         for is_dual in (False, True)
     )
     vectors[:, 0] = 1
