@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 CHUNK_LENGTH = 1 << 14
 
 
-def chunks_of(count: int) -> Iterator[slice]:
-    """Successive slices of ``count`` entries, each so short that its temporary arrays stay in a core's cache."""
-    for begin in range(0, count, CHUNK_LENGTH):
-        yield slice(begin, min(begin + CHUNK_LENGTH, count))
+def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
+    """Successive slices of ``count`` entries, each so short that its temporary arrays stay in a core's cache.
+
+    Where each entry has some parts, so many times shorter.
+    """
+    length = CHUNK_LENGTH // parts
+    for begin in range(0, count, length):
+        yield slice(begin, min(begin + length, count))
 
 
 def gathered(values: NDArray, indices: NDArray[np.integer]) -> NDArray:

@@ -149,10 +149,12 @@ class AdaptiveGrid:
         Made at each call: few ask for them more than once, and they would take memory as long as the grid lives.
         """
         spans, m = self.spans, self._corner_count
-        inner_begin, begin = ragged.offsets(self._inner_counts), ragged.offsets(self._triangle_counts())
+        inner_begin, begin = (
+            ragged.offsets(counts, np.int32) for counts in (self._inner_counts, self._triangle_counts())
+        )
         found = np.empty((int(begin[-1]), 3), dtype=np.int32)
         side_count, side_begin = int(spans.rate.sum(dtype=np.int64)), 0
-        for own in chunks_of(len(self.tiles)):
+        for own in chunks_of(len(self.tiles), m):
             of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
             span, along = spans.samples(of_tiles)
             counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))

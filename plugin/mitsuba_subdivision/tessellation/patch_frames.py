@@ -84,7 +84,9 @@ class PatchFrames:
         if patches.scheme.element == "vertex":
             return cls(t, patches.scheme.domain, is_whole, scale, t.edge, t.face_vertices, lower != every)
         edge, is_backward = lower, lower != every
-        start, border = control_of_vertex.astype(np.int32)[t.face_vertices], np.flatnonzero(t.twin < 0)
+        start, border = t.face_vertices, np.flatnonzero(t.twin < 0)
+        if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
+            start = control_of_vertex.astype(np.int32)[start]
         one, other = start[border].astype(np.int64), start[t.following(border)]
         ends = np.minimum(one, other) * (int(control_of_vertex.max()) + 1) + np.maximum(one, other)
         _, first, same = np.unique(ends, return_index=True, return_inverse=True)
