@@ -119,6 +119,31 @@ def test_control_points_of_a_far_cage_keep_their_digits_where_they_stay():
     np.testing.assert_array_equal(buffer(shape, "vertex_normals"), normals)
 
 
+@pytest.mark.core
+@pytest.mark.parametrize("shading", ["vertex", "exact"])
+@pytest.mark.parametrize("mode", ["backward", "forward"])
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_derivatives_by_control_points_are_the_same_far_away(shading, mode):
+    """Coordinates that stay as they are loaded had none, so that no fit moved a far cage."""
+    found = []
+    for shift in (0, SHIFT):
+        cage = named_cages.extraordinary(5)
+        shape = make(cage.with_positions(cage.positions + shift), shading=shading)
+        parameters = mi.traverse(shape)
+        points = parameters["control_points"]
+        dr.enable_grad(points)
+        parameters.update()
+        weights = dr.linspace(mi.Float, -1, 1, len(parameters["vertex_positions"]))
+        if mode == "backward":
+            dr.backward(dr.sum(parameters["vertex_positions"] * weights))
+            found.append(np.array(dr.grad(points)))
+        else:
+            dr.set_grad(points, dr.linspace(mi.Float, -1, 1, len(points)))
+            found.append(np.array(dr.forward_to(parameters["vertex_positions"])))
+    assert np.abs(found[0]).max() > 0.1
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=10 * SINGLE * np.abs(found[0]).max())
+
+
 # As a parameter
 
 

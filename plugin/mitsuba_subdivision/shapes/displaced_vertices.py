@@ -121,7 +121,7 @@ class DeviceDisplacement:
         self._types = types = ArrayTypes.of(float_type)
         u, v = (types.floats(column) for column in locations.uv.T)
         self._location = Location(types.indices(locations.corner), u, v)
-        self._read: tuple[int, int] | None = None
+        self._read: FloatBuffer = None
         self._read_values()
         self._follows = types.indices(slopes.astype(np.uint32)) != 0
         dr.eval(self._follows)
@@ -134,10 +134,11 @@ class DeviceDisplacement:
     def _read_values(self) -> None:
         """Evaluate what heights depend on, if it has changed."""
         channel = self._displacement.channel
+        now, read = channel.values.flat, self._read
         # Derivatives of the same values may be new.
-        now = channel.values.flat.index, channel.values.flat.index_ad
-        if now != self._read:
-            self._read, self._value = now, channel(self._location)[0]
+        if read is None or (now.index, now.index_ad) != (read.index, read.index_ad):
+            # A copy that is kept, so that no other array gets its numbers.
+            self._read, self._value = type(now)(now), channel(self._location)[0]
             dr.eval(self._value)
 
     @property

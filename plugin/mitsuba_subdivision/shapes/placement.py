@@ -83,7 +83,10 @@ class RecentredPoints:
         # A wrong number of control points raises an error where they are used.
         if self.centre is None or len(control_points) != len(self._loaded):
             return control_points
-        return dr.select(control_points == self._loaded, self._relative, control_points - self._centres)
+        moved = control_points - self._centres
+        found = dr.select(control_points == self._loaded, self._relative, moved)
+        # What replaces a coordinate has its derivatives.
+        return dr.replace_grad(found, moved) if dr.grad_enabled(control_points) else found  # type: ignore[func-returns-value]  # The stub is wrong.
 
 
 @dataclass(frozen=True, eq=False)
