@@ -275,3 +275,17 @@ def test_errors_say_what_was_expected(parameters, message):
 def test_sensors_of_other_kinds_are_refused():
     with pytest.raises(ValueError, match="expected a loaded perspective, thinlens or orthographic sensor"):
         pixel_error_for(mi.load_dict({"type": "distant", "film": {"type": "hdrfilm", "width": 1, "height": 1}}))
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize(("count", "message"), [(21, "21 coordinates; expected"), (24, "expected finite numbers")])
+@pytest.mark.parametrize("limit", ["chord_error", None])
+def test_control_points_that_are_wrong_choose_no_triangles(count, message, limit):
+    shape = make(named_cages.cube(), chord_error=1e-2)
+    parameters, faces = mi.traverse(shape), buffer(shape, "faces")
+    parameters["control_points"] = type(parameters["control_points"])(np.full(count, np.nan))
+    if limit is not None:
+        parameters[limit] = 1e-1
+    with pytest.raises(ValueError, match=f'parameter "control_points": .*{message}'):
+        parameters.update() if limit else shape.retessellate()
+    np.testing.assert_array_equal(buffer(shape, "faces"), faces)

@@ -512,6 +512,35 @@ def test_updates_of_heights_and_scale_move_the_surface():
         parameters.update()
 
 
+@exact
+@llvm
+@pytest.mark.parametrize("refused", ["to_world", "control_points", "cage_height"])
+def test_an_update_that_is_refused_changes_nothing_else(refused):
+    """Rays met another surface than that of the triangles."""
+    shape = make(CAGES["cube"](), "vertex_height", shading="exact")
+    parameters, before = mi.traverse(shape), vertices(shape)
+    displacement = shape._exact.kernel.displacement
+    scale, height = np.array(displacement.scale), np.array(displacement.channel.values.flat)
+    given = {
+        "displacement_scale": 0.5,
+        "cage_height": 1 + np.array(parameters["cage_height"]),
+        "to_world": mi.ScalarTransform4f().translate([1, 0, 0]),
+    }
+    given |= {
+        "to_world": {"to_world": mi.AffineTransform4f(mi.Matrix4f(np.diag([1.0, 1, 0, 1])))},
+        "control_points": {"control_points": np.full(24, np.nan)},
+        "cage_height": {"cage_height": np.full(8, np.nan)},
+    }[refused]
+    for name, value in given.items():
+        parameters[name] = value
+    with pytest.raises(ValueError, match=f'parameter "{refused}"'):
+        parameters.update()
+    np.testing.assert_array_equal(displacement.scale, scale)
+    np.testing.assert_array_equal(displacement.channel.values.flat, height)
+    for found, expected in zip(vertices(shape), before, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 def other_values(cage):
     """The cage with heights and texture coordinates of its own elsewhere."""
     changed = {"height": 1 - cage.attributes["height"].values, "texcoords": 0.9 * cage.texcoords.values + 0.1}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import extraordinary, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
@@ -359,3 +359,16 @@ def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():
         return len(surface.adaptive_sampling(criterion, 64).triangles)
 
     assert triangles(1.0) > 2 * triangles(0.0)
+
+
+@pytest.mark.parametrize("error", [-1e-3, np.nan])
+def test_an_error_that_is_no_length_is_refused(error):
+    with pytest.raises(ValueError, match="expected a number from 0 on"):
+        Criterion(Measure.CHORD, error)
+
+
+@pytest.mark.parametrize("points", [np.zeros((5, 3)), np.zeros((9, 3)), np.full((8, 3), np.nan)])
+def test_control_points_of_another_cage_are_refused(points):
+    surface = LimitSurface(cube())
+    with pytest.raises(ValueError, match=r"control points of shape .*; expected finite ones of shape \(8, 3\)"):
+        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1), control_points=points)

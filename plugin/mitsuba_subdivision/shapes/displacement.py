@@ -112,8 +112,8 @@ class ShapeDisplacement:
             self.kernel.displacement = Displacement(channel, self.heights, scale)
         self.note_scale()
 
-    def note_scale(self) -> None:
-        """Read the value of ``displacement_scale``.
+    def checked_scale(self) -> float:
+        """The value of ``displacement_scale``.
 
         Raises
         ------
@@ -123,12 +123,17 @@ class ShapeDisplacement:
         found = np.array(self.scale).ravel()
         if len(found) != 1 or not np.isfinite(found[0]):
             raise ValueError(f"{found.tolist()} was given; expected a finite number")
-        self.host_scale = float(found[0])
+        return float(found[0])
+
+    def note_scale(self) -> None:
+        """Take over the value of ``displacement_scale``, which `checked_scale` accepts."""
+        self.host_scale = self.checked_scale()
         if self._is_jit:
             # A literal would be compiled into kernels.
             dr.make_opaque(self.scale)
         if self.kernel is not None and self.kernel.displacement is not None:
-            self.kernel.displacement.scale = self.scale if self._is_jit else self.host_scale
+            # A copy, as users assign the parameter in place, before it is checked.
+            self.kernel.displacement.scale = type(self.scale)(self.scale) if self._is_jit else self.host_scale
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the scale; Mitsuba exposes a texture as an attribute of the shape."""

@@ -26,7 +26,7 @@ from .plugin_page import plugin_page
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .triangles import Triangles
 from .vertex_choice import vertices_of
-from .vertices import require_finite
+from .vertices import require_control_points
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -210,6 +210,7 @@ def make_subdivision(variant: Variant) -> type:
             Afterwards, call ``parameters_changed()`` of a scene that holds the shape. An update of the parameter that
             limits the tessellation does both.
             """
+            self._require_control_points()
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
             self._take_to_world(to_world)
@@ -230,6 +231,16 @@ def make_subdivision(variant: Variant) -> type:
 
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
+            # Before anything changes.
+            if "control_points" in keys:
+                self._require_control_points()
+            to_world = checked_matrix(self.to_world) if "to_world" in keys else None
+            if "displacement_scale" in keys and self._displacement is not None:
+                with errors_about("displacement_scale"):
+                    self._displacement.checked_scale()
+            tessellation = self._tessellation
+            if not _CHOOSING.isdisjoint(keys) and isinstance(tessellation, AdaptiveTessellation):
+                tessellation = tessellation.with_error(np.array(self._error).ravel())
             if "faces" in keys:
                 # Mitsuba discards its silhouette edges.
                 self._has_outlines = False
@@ -239,16 +250,12 @@ def make_subdivision(variant: Variant) -> type:
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])
                 return
-            if "control_points" in keys:
-                with errors_about("control_points"):
-                    require_finite(self.control_points)
             if "displacement_scale" in keys and self._displacement is not None:
-                with errors_about("displacement_scale"):
-                    self._displacement.note_scale()
-            if "to_world" in keys:
-                self._take_to_world(checked_matrix(self.to_world))
-            if not _CHOOSING.isdisjoint(keys) and isinstance(self._tessellation, AdaptiveTessellation):
-                self._tessellation = self._tessellation.with_error(np.array(self._error).ravel())
+                self._displacement.note_scale()
+            if to_world is not None:
+                self._take_to_world(to_world)
+            if tessellation is not self._tessellation:
+                self._tessellation = tessellation
                 self.retessellate()
                 return
             buffers = {**self._tessellate(moves_points="control_points" in keys), **self._cage.buffers(attributes)}
@@ -264,6 +271,10 @@ def make_subdivision(variant: Variant) -> type:
                 keys = [key for key in keys if key != "faces"]
             # Listed among the keys, so that Mitsuba keeps these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
+
+        def _require_control_points(self) -> None:
+            with errors_about("control_points"):
+                require_control_points(self.control_points, self._parameters.surface.cage.vertex_count)
 
         def _take_to_world(self, matrix: NDArray[np.float64]) -> None:
             """Set the placement to the parameter's value, a checked matrix."""

@@ -110,14 +110,18 @@ class _Selection:
         return types.gathered(flat, self._uploaded)
 
 
-def require_finite(control_points: FloatBuffer) -> None:
-    """Check flat coordinates on any device.
+def require_control_points(control_points: FloatBuffer, count: int) -> None:
+    """Check flat coordinates of so many control points, on any device.
 
     Raises
     ------
     ValueError
-        If one is not a finite number.
+        If there are more or fewer, or one is not a finite number.
     """
+    if len(control_points) != 3 * count:
+        from ..kernels.apply_weights import coordinates_expected
+
+        raise ValueError(coordinates_expected(len(control_points), count))
     if dr.all(dr.isfinite(control_points)):
         return
     points = np.array(control_points)

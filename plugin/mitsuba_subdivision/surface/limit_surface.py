@@ -527,7 +527,8 @@ class LimitSurface:
         Raises
         ------
         ValueError
-            If ``max_rate`` is anything else.
+            If ``max_rate`` is anything else, or there are more or fewer control points than the cage's, or some that
+            are not finite.
         MemoryError
             If the tessellation would not fit into memory.
 
@@ -538,7 +539,11 @@ class LimitSurface:
             outlines causes none.
         """
         require_moderate_valences(self.cage, self.scheme, needs_bases=True)
-        points = self.cage.positions if control_points is None else control_points
+        points, shape = self.cage.positions, self.cage.positions.shape
+        if control_points is not None:
+            points = np.asarray(control_points, dtype=np.float64)
+            if points.shape != shape or not np.isfinite(points).all():
+                raise ValueError(f"control points of shape {points.shape}; expected finite ones of shape {shape}")
         return tessellation.adaptive_table(
             self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate, self.cage.source.name
         )

@@ -111,6 +111,11 @@ class Criterion:
         Triangles that this sensor cannot see edge-on, and so cannot be at a silhouette, may be coarse.
     displacement : DisplacementBound or None
         Displacement of the surface. The limit is checked at samples of it.
+
+    Raises
+    ------
+    ValueError
+        If the error is negative or no number.
     """
 
     measure: Measure
@@ -118,6 +123,10 @@ class Criterion:
     sensor: Sensor | None = None
     outline: Sensor | None = None
     displacement: DisplacementBound | None = None
+
+    def __post_init__(self) -> None:
+        if not self.error >= 0:
+            raise ValueError(f"an error of {self.error}; expected a number from 0 on")
 
     @property
     def is_everywhere_alike(self) -> bool:
