@@ -142,6 +142,8 @@ def test_a_surface_without_area_has_no_points():
     cage = ControlCage(np.zeros_like(cube().positions), cube().face_vertices.reshape(-1, 4))
     with pytest.raises(ValueError, match="the surface has no area"):
         LimitSurface(cage).sample(3)
+    with pytest.raises(ValueError, match="the surface has no area"):
+        LimitSurface(cage).on_device("scalar_rgb").sample(0.5, [0.5, 0.5])
 
 
 def test_no_points_can_be_drawn():

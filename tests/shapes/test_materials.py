@@ -101,6 +101,9 @@ def test_unknown_materials_and_faces_are_errors(file):
         shape(filename=file, shown_faces=mi.TensorXu(np.array([6], np.uint32)))
     with pytest.raises(RuntimeError, match='"material" and "shown_faces" contradict each other'):
         shape(filename=file, material="red", shown_faces=mi.TensorXu(np.array([1], np.uint32)))
+    # Mitsuba would render no other shape of the scene beside one without triangles.
+    with pytest.raises(RuntimeError, match='parameter "shown_faces" shows no face; expected one at least'):
+        shape(filename=file, shown_faces=mi.TensorXu(np.array([], np.uint32)))
     with pytest.raises(
         RuntimeError, match='expected none for the scheme "doo_sabin", whose surface belongs to vertices'
     ):

@@ -7,7 +7,7 @@ from mitsuba_subdivision.evaluation import occupied_pieces
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
 from mitsuba_subdivision.patches import patch_samples, patch_table
 from mitsuba_subdivision.schemes import CatmullClark, Loop
-from mitsuba_subdivision.surface import high_valence
+from mitsuba_subdivision.tessellation import memory
 
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 # Of which weights would take tens of gigabytes.
@@ -73,8 +73,8 @@ def test_pieces_of_a_semi_sharp_fan_that_take_too_much_are_refused():
 def test_memory_is_read_for_the_first_surface_of_a_topology_only(monkeypatch):
     """A scene of a thousand equal cages read a dozen of the system's files for each."""
     calls = []
-    monkeypatch.setattr(high_valence, "SMALL", 0)
-    monkeypatch.setattr(high_valence, "available_memory", lambda: calls.append(None))
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda: calls.append(None))
     cage = pyramid(5)
     first, second = (LimitSurface(cage.with_positions(z * cage.positions), "loop") for z in (1, 2))
     tables = [first.pieces()]
@@ -83,6 +83,13 @@ def test_memory_is_read_for_the_first_surface_of_a_topology_only(monkeypatch):
     tables.append(second.pieces())
     assert tables[0] is tables[1]
     assert not calls
+
+
+def test_no_memory_at_all_is_too_little(monkeypatch):
+    monkeypatch.setattr(memory, "SMALL", 0)
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
+    with pytest.raises(MemoryError, match=r"vertex 0 has 2 faces .* at most 0 GB"):
+        LimitSurface(pyramid(5), "loop").tessellate(1)
 
 
 def test_samples_on_a_fan_are_those_of_its_faces_one_after_the_other(monkeypatch, np_rng):

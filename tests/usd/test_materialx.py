@@ -9,7 +9,7 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.equality import same
-from mitsuba_subdivision.cage.errors import CageWarning
+from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_subdivision.usd.materialx_library import library
@@ -99,6 +99,20 @@ def test_the_library_of_nodes_goes_with_the_reader(tmp_path):
     assert library.cache_info().currsize == 1
     del reader
     assert library.cache_info().currsize == 0
+
+
+def test_warnings_keep_their_kind_and_are_given_before_an_error(tmp_path, monkeypatch):
+    def read(*_):
+        warnings.warn("overflow", RuntimeWarning, stacklevel=1)
+        warn("the stage is odd")
+        raise CageError("the stage is unusable")
+
+    reader = StageReader(stage(tmp_path, LOOKS % "" + bound(), red=RED))
+    monkeypatch.setattr(reader, "_read", read)
+    with pytest.warns() as caught, pytest.raises(CageError, match="unusable"):
+        reader.at()
+    found = {each.category: str(each.message) for each in caught}
+    assert found == {RuntimeWarning: "overflow", CageWarning: "the stage is odd"}
 
 
 def test_inputs_are_overridden_as_in_any_reference(tmp_path):

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
+from mitsuba_subdivision.usd.baking import Baked
 from mitsuba_subdivision.usd.contents import (
     InstanceContents,
     MaterialContents,
@@ -16,8 +17,10 @@ from mitsuba_subdivision.usd.contents import (
     TextureContents,
 )
 from mitsuba_subdivision.usd.image_reduction import halvings, reduced
+from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_subdivision.usd.texture_image import read_texture_image
+from mitsuba_subdivision.usd.textures import Textures
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -170,6 +173,37 @@ def test_jpeg_files_are_decoded_at_a_scale(tmp_path, channels, space):
         expected = reduced(full, needed, is_srgb=space == "auto" and channels == 3)
         assert found.shape == expected.shape
         np.testing.assert_allclose(found.astype(float), expected, rtol=0, atol=JPEG_LEVELS)
+
+
+def test_one_file_is_read_for_each_of_its_uses(tmp_path):
+    """What is halved as colours is another picture than that halved as numbers; a light needs the whole of it."""
+    x, y = np.meshgrid(np.arange(64), np.arange(64))
+    stripes, path = np.uint8(255 * ((x + y) % 2))[..., None].repeat(3, axis=2), str(tmp_path / "a.png")
+    mi.Bitmap(stripes).write(path)
+    uses = texture(path), texture(path, color_space="raw")
+    for order in (uses, uses[::-1]):
+        textures = Textures(StageWarnings(), {path: 8.0})
+        textures.read(order)
+        of_colours, of_numbers = (textures.mean(each) for each in uses)
+        np.testing.assert_allclose(of_colours, 0.5, rtol=0, atol=0.01)
+        np.testing.assert_allclose(of_numbers, 0.5, rtol=0, atol=0.01)
+        assert textures.radiance(path, np.ones(3)).size().x == 64
+
+
+def test_a_jpeg_of_many_pixels_is_no_attack(tmp_path, monkeypatch):
+    image = pytest.importorskip("PIL.Image")
+    path = str(tmp_path / "a.jpg")
+    mi.Bitmap(np.full((64, 64, 3), 127, np.uint8)).write(path)
+    monkeypatch.setattr(image, "MAX_IMAGE_PIXELS", 100)
+    assert read_texture_image(path, "sRGB", 8).pixels.shape == (8, 8, 3)
+
+
+def test_two_components_are_red_and_green(monkeypatch):
+    values = np.random.default_rng(1).random((4, 4, 2)).astype(np.float32)
+    monkeypatch.setattr("mitsuba_subdivision.usd.textures.baked", lambda *_: Baked(values, np.eye(3), "repeat"))
+    given = NodeContents("texcoord", "vector2", {"name": "st"})
+    found = np.array(Textures(StageWarnings()).color(given)["bitmap"])
+    np.testing.assert_array_equal(found, np.pad(values, ((0, 0), (0, 0), (0, 1))))
 
 
 def test_tiles_are_read_smaller_each(tmp_path):

@@ -29,6 +29,8 @@ class AreaSampler:
     def __init__(self, cells: SamplingCells, types: ArrayTypes, walk: ElementWalk) -> None:
         self._types, self._walk = types, walk
         self._count = len(cells.areas)
+        if not cells.areas.sum() > 0:
+            raise ValueError("the surface has no area; expected one to draw points from")
         precision = np.float64 if types.is_double else np.float32
         # Probabilities are differences of the rounded cumulative sums.
         until = (np.cumsum(cells.areas) / cells.areas.sum()).astype(precision)

@@ -70,7 +70,8 @@ class Shared(Generic[Value]):
 
     def __init__(self) -> None:
         self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
-        # Of several threads that request a value, one makes it and others wait, those of other values do not.
+        # Of several threads that request a value, one makes it and others wait, those of other values do not. After an
+        # error, several may make it.
         self._making: dict[Hashable, RLock] = {}
         self._lock = Lock()
 

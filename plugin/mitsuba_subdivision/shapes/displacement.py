@@ -169,7 +169,7 @@ class ShapeDisplacement:
         """Interval of the scaled heights."""
         found = self.heights.range()
         low, high = sorted((found.low * self.host_scale, found.high * self.host_scale))
-        return HeightRange(low, high, found.is_bound)
+        return HeightRange(low, high)
 
 
 def _attribute_named(given: str, surface: LimitSurface) -> str:

@@ -40,13 +40,11 @@ class HeightRange:
     Attributes
     ----------
     low, high : float
-    is_bound : bool
-        Whether no height is outside; otherwise, `low` and `high` are the extremes of samples.
+        Of textures that are no bitmap, of samples.
     """
 
     low: float
     high: float
-    is_bound: bool
 
 
 class SurfaceHeights(Heights, Protocol):
@@ -83,7 +81,7 @@ class AttributeHeights:
 
     def range(self) -> HeightRange:
         """Interval of the control values, which contains all heights because weights are not negative."""
-        return HeightRange(float(self._values.min()), float(self._values.max()), is_bound=True)
+        return HeightRange(float(self._values.min()), float(self._values.max()))
 
 
 class TextureHeights:
@@ -149,13 +147,12 @@ class TextureHeights:
         if "data" in parameters and self._texture.class_name().startswith("BitmapTexture"):
             data = np.array(parameters["data"])
             values = data @ np.array(_LUMINANCE, dtype=data.dtype) if data.shape[2] == 3 else data
-            return HeightRange(float(values.min()), float(values.max()), is_bound=True)
+            return HeightRange(float(values.min()), float(values.max()))
         along = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
         float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
         s, t = (float_type(each.ravel()) for each in np.meshgrid(along, along))
         values = np.array(self.height((s, t)))
-        is_bound = self._texture.class_name() == "UniformSpectrum"
-        return HeightRange(float(values.min()), float(values.max()), is_bound)
+        return HeightRange(float(values.min()), float(values.max()))
 
     def _each(self, function: Callable, s: Float, t: Float, active: Mask) -> Value:
         """Results of a function; scalar variants call it point by point."""

@@ -53,4 +53,5 @@ def _in_own_thread(function: Callable[..., None], *arguments: Any) -> None:
     thread.start()
     thread.join()
     if errors:
-        raise errors[0]
+        # Nothing else keeps the error, which keeps the frames that it came through.
+        raise errors.pop()

@@ -154,6 +154,8 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
             raise ValueError(f'parameter "{name}" has {wrong[0]}; expected 0 to {cage.face_count - 1}')
     shown = np.zeros(cage.face_count, dtype=bool)
     shown[faces] = True
+    if not (shown & ~cage.is_hole).any():
+        raise ValueError(f'parameter "{name}" shows no face; expected one at least that is no hole')
     return shown
 
 

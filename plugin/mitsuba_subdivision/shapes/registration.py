@@ -39,8 +39,8 @@ def register() -> None:
 def register_variant(variant: ModuleType | str) -> type:
     """Register the plugins for a variant, and for the one in which Mitsuba looks up plugin kinds. Idempotent.
 
-    `register` does this for every variant that is set. Call it for a variant that is used without being set, as in
-    ``mi.scalar_rgb.load_dict(..)``.
+    `register` does this for every variant that is set. Call it for a variant that is used without being set, as by
+    ``mi.parser.instantiate``.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from ..mesh.signature import NEAR_FACES
 from ..patches import PatchTable
 from ..schemes.scheme import Scheme
 from ..schemes.scheme_members import optional_member
-from ..tessellation.memory import SMALL, available_memory
+from ..tessellation.memory import exceeded_limit
 
 # Bytes for each pair of control points of a one-ring: its subdivision matrix, its eigenbasis, and what makes these.
 # Measured at valences of 200 to 1,600 under all schemes, those below of 200 to 800; Doo-Sabin's rules are matrices
@@ -69,10 +69,8 @@ def require_moderate_valences(cage: ControlCage, scheme: Scheme, *, needs_bases:
     # The centre of a polygon becomes a vertex.
     at_faces = pair * (width * t.face_sizes.astype(np.float64)) ** 2
     needed = max(at_vertices.max(initial=0), at_faces.max(initial=0))
-    if needed <= SMALL:
-        return
-    available = min(MOST_BYTES, available_memory() or MOST_BYTES)
-    if needed <= available:
+    available = exceeded_limit(needed, MOST_BYTES)
+    if available is None:
         return
     if needed == at_faces.max(initial=0):
         face = int(at_faces.argmax())
@@ -114,8 +112,8 @@ def require_memory_for_pieces(cage: ControlCage, patches: PatchTable) -> None:
     counts = np.array([each.regular_count + PIECES_OF_TIP * each.tip_count for each in elements])
     weights = counts * table.control_counts * len(polynomial_basis(table.scheme).powers)
     needed = PIECE_COPIES * weights.sum() * np.float64().itemsize
-    available = MOST_BYTES if needed <= SMALL else min(MOST_BYTES, available_memory() or MOST_BYTES)
-    if needed <= available:
+    available = exceeded_limit(needed, MOST_BYTES)
+    if available is None:
         return
     largest = table.classes[int(weights.argmax())]
     corner = largest.corners[:1] if refined is None else refined.corners(largest)[:1]

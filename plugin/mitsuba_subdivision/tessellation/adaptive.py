@@ -71,7 +71,7 @@ def adaptive_table(
 
 
 def _vertex_stencils(patches: PatchTable, grid: AdaptiveGrid, controls: NDArray[np.uint32]) -> VertexStencils:
-    """VertexStencils of one vertex each; vertices of the same stencil are of a kind."""
+    """Runs of one vertex each; vertices of the same stencil are of a kind."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     # In the order of their sizes, so that kernels pad them alike.

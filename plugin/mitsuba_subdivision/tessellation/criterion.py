@@ -89,7 +89,7 @@ class DisplacementBound:
     heights : callable
         Finds heights ``(s,)`` of samples, given as for `PatchSampler.evaluate`.
     extent : float
-        Largest distance that any point moves.
+        Largest distance that any point moves; of a texture that is no bitmap, that any sample does.
     """
 
     heights: Callable[[IntArray, FloatArray], FloatArray]

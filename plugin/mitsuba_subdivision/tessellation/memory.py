@@ -48,8 +48,8 @@ def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
         If not; says which rate would.
     """
     needed = bytes_of_tessellation(patches, grid)
-    available = None if needed <= SMALL else available_memory()
-    if available is None or needed <= available:
+    available = exceeded_limit(needed)
+    if available is None:
         return
     fits = bisect_right(
         range(1, grid.rate),
@@ -71,12 +71,20 @@ def require_memory_for_triangles(count: int) -> None:
         If not.
     """
     needed = ADAPTIVE_TRIANGLE_BYTES * count
-    available = None if needed <= SMALL else available_memory()
-    if available is not None and needed > available:
+    available = exceeded_limit(needed)
+    if available is not None:
         raise MemoryError(
             f"an adaptive tessellation of about {count:.3g} triangles needs about {needed / 1e9:.3g} GB, and "
             f"{available / 1e9:.3g} GB are available; expected a larger error, or a smaller highest rate"
         )
+
+
+def exceeded_limit(needed: float, most: int | None = None) -> int | None:
+    """The bytes that are available, or the most to be used, if these are fewer than are needed; else None."""
+    if needed <= SMALL:
+        return None
+    limit = min((each for each in (available_memory(), most) if each is not None), default=None)
+    return None if limit is None or needed <= limit else limit
 
 
 def available_memory(root: str | Path = "/") -> int | None:

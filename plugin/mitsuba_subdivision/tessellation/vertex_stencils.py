@@ -109,7 +109,7 @@ class VertexStencils:
         return self.samples[start : start + int(self.counts[kind])]
 
     def of_kinds(self, first: int, last: int) -> VertexStencils:
-        """VertexStencils of the kinds from the first one to before the last one, of the same classes."""
+        """Those of the kinds from the first one to before the last one, of the same classes."""
         kinds = slice(first, last)
         sample, run = int(self.counts[:first].sum()), int(self.run_counts[:first].sum())
         samples = slice(sample, sample + int(self.counts[kinds].sum()))

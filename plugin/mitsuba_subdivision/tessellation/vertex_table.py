@@ -186,7 +186,7 @@ class VertexTable:
                 yield self._gathered_block(own, first_runs[own])
 
     def _product_block(self, kind: int, own: slice) -> _Block:
-        """Some vertex_stencils of one kind."""
+        """Some runs of one kind."""
         vertex_stencils = self.vertex_stencils
         stencils, samples = self.classes[int(vertex_stencils.class_of_kind[kind])], vertex_stencils.samples_of(kind)
         weights = stencils.weights[:, samples].transpose(0, 2, 1)
@@ -194,7 +194,7 @@ class VertexTable:
         return _Block(vertices.ravel(), weights, stencils.controls[vertex_stencils.patch[own]].T, None)
 
     def _gathered_block(self, kinds: IntArray, first_runs: IntArray) -> _Block:
-        """All vertex_stencils of some kinds, on patches with as many control points."""
+        """All runs of some kinds, on patches with as many control points."""
         vertex_stencils = self.vertex_stencils
         # Of each run.
         run, kind = (

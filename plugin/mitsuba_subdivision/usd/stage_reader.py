@@ -64,15 +64,25 @@ class StageReader:
         if time is not None and not math.isfinite(time):
             raise ValueError(f'"{self._path}": time {time}; expected a finite number, a time code')
         code = None if time is None else float(time)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CageWarning)
-            contents = self._read(code)
-        for message in (str(each.message) for each in caught):
-            what = message.replace(str(self._path), "")
-            if what not in self._warned:
-                self._warned.add(what)
-                warn(message)
-        return contents
+        caught: list[warnings.WarningMessage] = []
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", CageWarning)
+                return self._read(code)
+        finally:
+            for each in caught:
+                self._pass_on(each)
+
+    def _pass_on(self, warning: warnings.WarningMessage) -> None:
+        """Give a warning that was caught, if it is not one of the cage's that has been given."""
+        if not issubclass(warning.category, CageWarning):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+            return
+        message = str(warning.message)
+        what = message.replace(str(self._path), "")
+        if what not in self._warned:
+            self._warned.add(what)
+            warn(message)
 
     def _read(self, time: float | None) -> SceneContents:
         if self._seconds is None:

@@ -181,10 +181,16 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
     Scales are means of encoded values. Of colours in sRGB, the last halving is left to `reduced`.
     """
     try:
-        from PIL import Image
+        # Image.open refuses pictures of 13,400 by 13,400 pixels and more.
+        from PIL.JpegImagePlugin import JpegImageFile
     except ImportError:
         return None
-    with Image.open(io.BytesIO(content)) as image:
+    try:
+        opened = JpegImageFile(io.BytesIO(content))
+    except SyntaxError:
+        # Mitsuba tells what is wrong.
+        return None
+    with opened as image:
         is_srgb = _is_srgb(color_space, np.dtype(np.uint8), len(image.getbands()))
         scale = min(1 << max(halvings(image.size, needed, most) - is_srgb, 0), _MOST_SCALE)
         if scale == 1 or image.mode not in ("L", "RGB") or any(side % scale for side in image.size):

@@ -40,17 +40,19 @@ class Textures:
         self, notes: StageWarnings, needed: Mapping[str, float] | None = None, most: int | None = None
     ) -> None:
         self._notes, self._needed, self._most = notes, needed or {}, most
-        self._pictures: dict[str, TextureImage | None] = {}
+        # By file and the colour space in which it is halved; whole ones have none.
+        self._pictures: dict[tuple[str, str | None], TextureImage | None] = {}
         # In eight bits, by file, channel and whether they are decoded.
         self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
         self._expressions: dict[int, tuple[NodeContents, Baked]] = {}
 
     def read(self, uses: Iterable[TextureContents]) -> None:
         """Read the pictures of textures on all processors."""
-        first = {each.file: each for each in uses if each.file not in self._pictures}
+        first = {_key(each.file, each): each for each in uses if _key(each.file, each) not in self._pictures}
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            for file, found in zip(first, pool.map(self._read, first, first.values()), strict=True):
-                self._keep(file, found)
+            found = pool.map(self._read, [file for file, _ in first], first.values())
+            for key, picture in zip(first, found, strict=True):
+                self._keep(key, picture)
 
     def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
         """A texture of colours, or the fallback of a picture that cannot be read.
@@ -64,10 +66,11 @@ class Textures:
         most = None if is_radiance else 1.0
         if isinstance(given, NodeContents):
             found = self._baked(given)
+            # Two components are red and green.
             values = (
-                np.broadcast_to(found.values, (*found.values.shape[:2], 3))
-                if found.values.shape[2] < 3
-                else found.values
+                np.repeat(found.values, 3, axis=2)
+                if found.values.shape[2] == 1
+                else np.pad(found.values, ((0, 0), (0, 0), (0, 1)))
             )
             return self._bitmap(np.clip(values[..., :3], 0, most), found.to_uv, found.wrap, is_raw=False)
         picture = self._picture(given.file, given)
@@ -166,17 +169,18 @@ class Textures:
 
     def _picture(self, path: str, use: TextureContents | None = None) -> TextureImage | None:
         """A picture, as fine as its use needs; None if it cannot be read."""
-        if path not in self._pictures:
-            self._keep(path, self._read(path, use))
-        return self._pictures[path]
+        key = _key(path, use)
+        if key not in self._pictures:
+            self._keep(key, self._read(path, use))
+        return self._pictures[key]
 
-    def _keep(self, path: str, found: TextureImage | Exception) -> None:
+    def _keep(self, key: tuple[str, str | None], found: TextureImage | Exception) -> None:
         if isinstance(found, Exception):
             # Python's own text of a missing file repeats its path, with a number.
             said = (isinstance(found, OSError) and found.strerror) or str(found).strip()
             reason = said.splitlines()[-1] if said else type(found).__name__
-            self._notes.add("images that cannot be read are replaced by their fallback", f"{path}: {reason}")
-        self._pictures[path] = None if isinstance(found, Exception) else found
+            self._notes.add("images that cannot be read are replaced by their fallback", f"{key[0]}: {reason}")
+        self._pictures[key] = None if isinstance(found, Exception) else found
 
     def _read(self, path: str, use: TextureContents | None) -> TextureImage | Exception:
         try:
@@ -185,6 +189,10 @@ class Textures:
             return read_texture_image(path, use.color_space, self._needed.get(path, np.inf), self._most)
         except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
             return error
+
+
+def _key(path: str, use: TextureContents | None) -> tuple[str, str | None]:
+    return path, None if use is None else use.color_space
 
 
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
