@@ -491,6 +491,33 @@ def test_both_strategies_find_the_same_light_of_coarse_triangles():
     assert means == pytest.approx([means[2]] * 3, rel=ENERGY)
 
 
+@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.parametrize("displacement", [None, "vertex_heat"])
+@pytest.mark.parametrize("kind", ["bitmap", "checkerboard"])
+def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
+    """Mitsuba draws points of them by the texture coordinates of the mesh, which had none."""
+    cage, given = textured(), {}
+    if displacement is not None:
+        heat = Attribute(np.linspace(0, 0.2, 8)[:, None], "vertex")
+        cage = cube(texcoords=cage.texcoords, attributes={"heat": heat})
+        given = {"displacement": displacement}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
+    texels, points, means = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32), [], []
+    for shading in ("exact", "vertex"):
+        radiance = {"data": mi.TensorXf(texels), "raw": True} if kind == "bitmap" else {}
+        shape = {**make(cage, tessellation_rate=4, shading=shading, **given)}
+        shape["emitter"] = {"type": "area", "radiance": {"type": kind, **radiance}}
+        view = sensor(resolution=12)
+        scene = mi.load_dict({"type": "scene", "i": {"type": "path"}, "s": shape, "floor": floor, "sensor": view})
+        si = scene.ray_intersect(mi.Ray3f([1.9, 0.3, 4], [0, 0, -1]))
+        drawn = (scene.sample_emitter_direction(si, mi.Point2f(*xy), False)[0] for xy in ([0.2, 0.7], [0.9, 0.4]))
+        points.append([np.array(each.p).ravel() for each in drawn])
+        # In scalar variants, a picture takes a minute.
+        means.append(np.array(mi.render(scene, spp=256)).mean() if dr.is_jit_v(mi.Float) else 0)
+    np.testing.assert_allclose(points[0], points[1], rtol=0, atol=SINGLE)
+    assert means[0] == pytest.approx(means[1], rel=ENERGY)
+
+
 @pytest.mark.parametrize("integrator", ["path", "direct"])
 @llvm
 def test_hidden_emitters_are_passed(integrator):

@@ -109,6 +109,8 @@ def make_subdivision(variant: Variant) -> type:
             # Dr.Jit's variable indices of the mesh's buffers when they were last set.
             self._evaluated: dict[str, int] = {}
             kind = variant.Float if is_jit else dr.scalar.ArrayXf
+            # Mitsuba draws points of such emitters by the mesh's own texture coordinates.
+            self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
             if is_exact:
@@ -179,10 +181,11 @@ def make_subdivision(variant: Variant) -> type:
             bound = None if self._displacement is None else self._displacement.bound()
             table = self._tessellation.table(surface, control_points, to_world, bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
-            if self._exact is None:
+            if self._exact is None or self._has_textured_emitter:
                 attributes = surface.attribute_table(table)
             else:
                 attributes = self._exact.welded_table(table)
+            if self._exact is not None:
                 self._exact.set_triangles(table, kept)
             self._cage.set_triangles(table, attributes)
             self._triangles = Triangles(variant, table, attributes, kept)
@@ -398,6 +401,12 @@ def make_subdivision(variant: Variant) -> type:
             return f"Subdivision[\n  {text}\n]"
 
     return Subdivision
+
+
+def _has_textured_emitter(props: mi.Properties, variant: Variant) -> bool:
+    given = (props[name] for name in props.keys() if props.type(name) == mi.Properties.Type.Object)  # noqa: SIM118
+    varying = int(mi.EmitterFlags.SpatiallyVarying)
+    return any(isinstance(each, variant.Emitter) and int(each.flags()) & varying for each in given)
 
 
 def _is_exact(parameters: Parameters, variant: Variant) -> bool:

@@ -68,7 +68,7 @@ def vertices_of(
     else:
         displaced = HostDisplacement(locations, slopes, parameters.surface, displacement, has_normals=has_normals)
     kept = None
-    if is_exact and split.surface_vertex is not None:
+    if attributes.surface_vertex is None and split.surface_vertex is not None:
         _, kept = np.unique(split.surface_vertex, return_index=True)
     return Vertices(evaluate, evaluate_tangents, copied=split.surface_vertex, displacement=displaced, kept=kept)
 
