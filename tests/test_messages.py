@@ -193,6 +193,14 @@ def test_a_closed_pipe_is_no_error(folder, words):
     assert not done.stderr
 
 
+def test_the_reason_is_told_that_a_message_refers_to(capsys):
+    reason = RuntimeError("the texture is odd")
+    error = RuntimeError("drjit.custom(<op>): error while performing a custom differentiable operation. (see above).")
+    error.__cause__ = reason
+    print_error(error)
+    assert capsys.readouterr().err == "mitsuba-subdivision: error: the texture is odd\n"
+
+
 @pytest.mark.parametrize(
     ("error", "told"),
     [

@@ -66,6 +66,9 @@ def flushed_output() -> Iterator[None]:
 
 
 def _text_of(error: BaseException) -> str:
+    # Dr.Jit's own message refers to the one of the error that it was raised from.
+    while error.__cause__ is not None and "(see above)" in str(error):
+        error = error.__cause__
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f'"{error.filename}": {error.strerror}'
     if isinstance(error, OSError) and error.strerror:

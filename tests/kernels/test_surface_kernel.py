@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, kernel_named, on_device, random_locations, surface_named, vectors
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, tetrahedron, torus
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS
 from mitsuba_subdivision.kernels.line_intersection import ON_NORMAL
@@ -577,6 +577,23 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
     assert_transposed(changes, backward(hits(), inputs, seeds), forwards, seeds)
 
 
+@pytest.mark.parametrize(("cage", "scheme"), [(cube(), "catmull_clark"), (extraordinary_triangles(3), "loop")])
+def test_rays_beside_an_extraordinary_vertex_meet_the_surface_there(cage, scheme, np_rng):
+    """Tolerances in parameters shrink below the rounding of points there."""
+    surface = LimitSurface(cage, scheme)
+    kernel, t = surface.on_device(SINGLE), surface.patches.elements
+    beside = np.flatnonzero(np.bincount(cage.face_vertices)[cage.face_vertices] == 3)
+    half_edge = np_rng.choice(beside, 500)
+    element = t.face_of(half_edge).astype(np.int64)
+    corner = half_edge - t.face_offsets[element]
+    for level in (6, 10, 14):
+        uv = np_rng.random((500, 2)) * 2.0 ** -(level + 1)
+        target = surface.evaluate(element, uv, corner)
+        rays = rays_of(kernel.types, target.p + 0.1 * target.n, -target.n)
+        found = computed(kernel.intersect(rays, *on_device(kernel.types, element, uv, corner)))
+        assert np.isfinite(np.array(found.t)).mean() > 0.98
+
+
 # What can be wrong
 
 
@@ -591,6 +608,21 @@ def test_control_points_can_be_others_but_not_more():
     np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[SINGLE]["point"])
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel.set_control_points(dr.zeros(kernel.types.float, 21))
+
+
+@pytest.mark.parametrize("variant", [SINGLE, "scalar_rgb"])
+def test_control_points_and_places_have_any_natural_form(variant):
+    kernel, p = LimitSurface(cube()).on_device(variant), 2 * cube().positions
+    forms = [p, p.ravel(), p.astype(np.float32).tolist()]
+    if variant == SINGLE:
+        tensor, point = dr.llvm.ad.TensorXf(p), kernel.types.vector3(*map(kernel.types.float, p.T))
+        forms += [tensor, point, kernel.types.float(p.ravel())]
+    for each in forms:
+        kernel.set_control_points(cube().positions)
+        kernel.set_control_points(each)
+        found = np.array(kernel.evaluate(1, [0.3, 0.4], 2).p).ravel()
+        expected = 2 * LimitSurface(cube()).evaluate(1, [[0.3, 0.4]], 2).p[0]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=BARS[SINGLE]["point"])
 
 
 @pytest.mark.parametrize(

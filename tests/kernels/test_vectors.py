@@ -18,3 +18,6 @@ def test_only_zero_has_no_unit_vector(variant_llvm_ad_rgb, np_rng):  # noqa: ARG
     found = np.array(unit(mi.Vector3f(*(directions * lengths).astype(np.float32))))
     np.testing.assert_allclose(found, directions, atol=ROUNDING)
     np.testing.assert_array_equal(np.array(unit(mi.Vector3f(0, -0.0, 0))).ravel(), 0)
+    # The inverse of the smallest numbers is infinite.
+    for length in (np.inf, 1e-39, 1e-45):
+        np.testing.assert_array_equal(np.array(unit(mi.Vector3f(0, length, 0))).ravel(), 0)

@@ -65,9 +65,10 @@ class ElementWalk:
 
     def at(self, element: Index, u: Float, v: Float, corner: Index = 0, active: Mask = True) -> Location:
         """The location in an element with parameters seen from one of its corners."""
-        if not self.types.is_jit:  # NumPy's numbers, which loops of Dr.Jit refuse.
-            element, corner, u, v = int(element), int(corner), float(u), float(v)
-        return Location(self.types.fetch(self.types.index, self._first, element, active) + corner, u, v)
+        types = self.types
+        # Python's and NumPy's numbers, which loops of Dr.Jit refuse.
+        element, corner, u, v = types.index(element), types.index(corner), types.float(u), types.float(v)
+        return Location(types.fetch(types.index, self._first, element, active) + corner, u, v)
 
     def row(self, half_edge: Index, active: Mask = True) -> Index4:
         """The row of `PieceTable.half_edges`: the twin, the half-edge after and before in the element, and the code."""

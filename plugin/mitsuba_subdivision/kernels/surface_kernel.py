@@ -19,7 +19,7 @@ from .coefficient_map import CoefficientMap
 from .element_walk import Location
 from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
 from .nearest_location import NearestLocation, NearestPoints
-from .newton import over
+from .newton import over, rounding
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
@@ -83,7 +83,7 @@ class SurfaceKernel:
 
         Parameters
         ----------
-        points : flat array
+        points : flat array, 3-vector, or (n, 3) array of NumPy or Dr.Jit
             x, y, z of each.
 
         Raises
@@ -91,6 +91,10 @@ class SurfaceKernel:
         ValueError
             If there are more or fewer than before.
         """
+        if dr.is_vector_v(points) or dr.is_tensor_v(points):
+            points = dr.ravel(points)
+        elif not dr.is_array_v(points):
+            points = self.types.floats(np.ravel(points))
         if len(points) != 3 * self._control_count:
             raise ValueError(coordinates_expected(len(points), self._control_count))
         self._loaded = None
@@ -157,7 +161,10 @@ class SurfaceKernel:
         along_ray = found.p - o
         t = dr.dot(along_ray, d) / dr.squared_norm(d)
         off = dr.squared_norm(dr.detach(along_ray - d * t))
-        is_on = off < dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
+        near = dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(found.dp_du), dr.squared_norm(found.dp_dv))
+        # Beside extraordinary points, rounding errors exceed that.
+        size = dr.squared_norm(dr.detach(found.p)) + dr.squared_norm(dr.detach(along_ray))
+        is_on = off < dr.maximum(near, dr.square(rounding(self.types)) * size)
         t = dr.select((hits.kind != MISSED) & is_on, t, dr.inf)
         return SurfaceHits(**vars(found), t=t)
 

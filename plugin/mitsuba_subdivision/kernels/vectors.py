@@ -31,12 +31,12 @@ def cross(a: Vector3, b: Vector3) -> Vector3:
 
 
 def unit(vector: Vector3) -> Vector3:
-    """The vector over its length; zero if that is zero."""
+    """The vector over its length; zero if that is zero, infinite, or so small that its inverse is."""
     # Over the largest component first, so that squares neither overflow nor vanish.
     largest = dr.detach(reduce(dr.maximum, [dr.abs(x) for x in vector]))
-    exists = largest > 0
-    scale = 1 / dr.select(exists, largest, 1)
-    scaled = [x * scale for x in vector]
+    scale = 1 / dr.select(largest > 0, largest, 1)
+    exists = (largest > 0) & (scale > 0) & dr.isfinite(scale)
+    scaled = [dr.select(exists, x * scale, 0) for x in vector]
     inverse = dr.select(exists, dr.rsqrt(dr.select(exists, dot(scaled, scaled), 1)), 0)
     return like([x * inverse for x in scaled], vector)
 

@@ -338,6 +338,10 @@ class Topology:
         turn, turn_back, following = self._walk_views
         return turn.__getitem__, turn_back.__getitem__, following.__getitem__
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Views of memory cannot be pickled, and are made again.
+        return {name: value for name, value in vars(self).items() if name != "_walk_views"}
+
     @cached_property
     def _walk_views(self) -> tuple[memoryview, memoryview, memoryview]:
         """``(n_h,)`` where `walks` lead from each half-edge; faster than arrays for one at a time, and as small."""

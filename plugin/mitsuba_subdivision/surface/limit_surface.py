@@ -92,6 +92,10 @@ class LimitSurface:
             raise CageError(f"cage {cage!r}; expected a ControlCage")
         vars(self).update(cage=cage, scheme=adapted_scheme(cage, scheme))
 
+    def __reduce__(self) -> tuple[type[LimitSurface], tuple[ControlCage, Scheme]]:
+        # What is prepared for samples has locks, and is made again.
+        return LimitSurface, (self.cage, self.scheme)
+
     @cached_property
     def patches(self) -> PatchTable:
         """The cage's patches, grouped by class; the same for all surfaces of the same topology, tags and rules.
