@@ -134,6 +134,34 @@ def test_equal_values_share_their_memory_until_those_of_one_shape_change():
     np.testing.assert_array_equal(np.array(second["cage_texcoords"]), before)
 
 
+@shadings
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize("interpolation", ["vertex", "varying"])
+@pytest.mark.parametrize("by", ["heat", "texcoords"])
+def test_a_frozen_function_sees_new_values(shading, interpolation, by):
+    """Dr.Jit went on reading the memory of NumPy that the first values came from."""
+    cube, rng = named_cages.cube(), np.random.default_rng(0)
+    texcoords, heat = (Attribute(rng.random((8, size)), kind) for size, kind in ((2, "vertex"), (1, interpolation)))
+    faces = cube.face_vertices.reshape(-1, 4)
+    cage = ControlCage(cube.positions, faces, texcoords=texcoords, attributes={"heat": heat})
+    shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "shading": shading})
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    parameters, x = mi.traverse(shape), mi.Float(np.linspace(-0.4, 0.4, 9, dtype=np.float32))
+
+    def seen(scene, x):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.1, 5), mi.Vector3f(0, 0, -1)))
+        return si.uv.x if by == "texcoords" else si.shape.eval_attribute_1("vertex_heat", si)
+
+    frozen, before = dr.freeze(seen), None
+    for _ in range(3):
+        found = np.array(frozen(scene, x))
+        np.testing.assert_array_equal(found, np.array(seen(scene, x)))
+        assert before is None or not np.array_equal(found, before)
+        before = found
+        parameters[f"cage_{by}"] = parameters[f"cage_{by}"] * 0.7
+        parameters.update()
+
+
 # Under exact shading, vertices that no seam asks for hold no values; hits are those of test_hits_follow.
 @every_variant
 @pytest.mark.parametrize(

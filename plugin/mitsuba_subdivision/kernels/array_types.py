@@ -100,7 +100,18 @@ class ArrayTypes:
 
     def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
         """Upload an array of numbers, flattened; equal ones share their memory while one is referenced."""
-        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(self.floats(values)))
+        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(self.owned(self.floats(values))))
+
+    def owned(self, mapped: FloatBuffer) -> FloatBuffer:
+        """A copy of an uploaded array in Dr.Jit's own memory, for values that may change later.
+
+        Where a frozen function has read NumPy's memory through a shape, Dr.Jit (1.5) goes on reading that.
+        """
+        found: FloatBuffer = dr.empty(self.float, len(mapped))
+        # A gather of all entries in order would be the array itself.
+        dr.scatter(found, mapped, dr.arange(self.index, len(mapped)), mode=NO_CONFLICTS)
+        dr.eval(found)
+        return found
 
     def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:
         """Gather a number or a vector from an array that `indices` or `floats` uploaded.

@@ -147,7 +147,11 @@ class CageAttributes:
         def make() -> SharedArray:
             # Rendering loads texture coordinates in packets.
             found = aligned(values, dtype=np.float32)
-            return SharedArray(found if self._float is None else self._float(found.ravel()))
+            if self._float is None:
+                return SharedArray(found)
+            from ..kernels.array_types import ArrayTypes
+
+            return SharedArray(ArrayTypes.of(self._float).owned(self._float(found.ravel())))
 
         return make() if self._float is None else _UPLOADED.get((self._float, Content(values)), make)
 
