@@ -101,7 +101,8 @@ def test_file_with_every_feature(obj_file, monkeypatch, few_breaks):
     )
     path = obj_file(content)
     assert_reads_as(content, path)
-    cage = ControlCage.from_file(path)
+    with pytest.warns(CageWarning, match="colours of vertices are ignored"):
+        cage = ControlCage.from_file(path)
     np.testing.assert_array_equal(cage.positions, [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
     np.testing.assert_array_equal(cage.face_vertices.reshape(-1, 3), [[0, 1, 2], [0, 2, 3], [0, 3, 1], [2, 1, 3]])
     np.testing.assert_array_equal(cage.source.vertex_lines, [4, 5, 6, 16])
@@ -276,6 +277,13 @@ def test_texture_coordinates_of_some_corners_are_left_out_with_a_warning(obj_fil
     )
     with pytest.warns(CageWarning, match=message):
         assert ControlCage.from_file(path).texcoords is None
+
+
+def test_colours_of_vertices_are_left_out_with_a_warning(obj_file):
+    text = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 1 1 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3 4\n"
+    with pytest.warns(CageWarning, match="colours of vertices are ignored; expected them as an attribute"):
+        cage = ControlCage.from_file(obj_file(text))
+    np.testing.assert_array_equal(cage.positions, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
 
 
 def test_texture_coordinate_indices_without_texture_coordinates_are_a_warning(obj_file):

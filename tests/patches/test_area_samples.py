@@ -160,3 +160,10 @@ def test_points_of_a_flat_sheet_are_uniform_however_its_parameters_run():
     low, high = np.sort(ends, axis=0)[:, samples.element]
     along = (samples.p[:, 0] - low) / (high - low)
     assert stats.kstest(along, "uniform").pvalue > SIGNIFICANCE
+
+
+@pytest.mark.parametrize("scale", [1e-90, 1e-30, 1e30, 1e80])
+def test_areas_grow_with_the_square_of_any_scale(scale):
+    cage = cube()
+    found = LimitSurface(cage.with_positions(scale * cage.positions)).area()
+    assert found / scale / scale == pytest.approx(LimitSurface(cage).area(), rel=1e-12)

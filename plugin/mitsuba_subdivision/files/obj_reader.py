@@ -69,6 +69,8 @@ def read_obj(path: str | Path) -> CageContents:
         if not found.any():
             raise CageError(f"{obj.name}: there are no {what}; expected at least one")
     positions = _read_numbers(obj, is_vertex, "v", "coordinates", 3, 3)
+    if (obj.require_arguments(is_vertex, "coordinates", 3) >= 6).any():
+        warn(f"{obj.name}: colours of vertices are ignored; expected them as an attribute of a PLY or USD file")
     texcoords = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
     corners = _FaceCorners.read(obj, is_face)
     vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")

@@ -76,7 +76,8 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
         for orders in ORDERS:
             of_left = np.flatnonzero(left)
             rough, area = _measured(pieces if left.all() else pieces.chosen(of_left), orders)
-            is_good = np.abs(area - rough) <= np.maximum(tolerance, ROUNDED * area)
+            # Areas that are no number, of points beyond all measure, get no better.
+            is_good = ~(np.abs(area - rough) > np.maximum(tolerance, ROUNDED * area))
             if halving == MOST_HALVINGS and orders == ORDERS[-1]:
                 is_good[:] = True
             np.add.at(found, owner[of_left[is_good]], area[is_good])
@@ -89,8 +90,10 @@ def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
 
 def _area_elements(du: FloatArray, dv: FloatArray) -> FloatArray:
     """``(g, n)`` lengths of the cross products of vectors ``(g, 3, n)``."""
-    (a, b, c), (d, e, f) = du.swapaxes(0, 1), dv.swapaxes(0, 1)
-    return np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
+    # In units of the largest, so that squares neither overflow nor vanish.
+    unit = max(np.abs(du).max(initial=0), np.abs(dv).max(initial=0)) or 1.0
+    (a, b, c), (d, e, f) = (du / unit).swapaxes(0, 1), (dv / unit).swapaxes(0, 1)
+    return unit * unit * np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
 
 
 def _level_count(patch: IrregularPatch) -> int:
