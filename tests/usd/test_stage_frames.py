@@ -365,7 +365,7 @@ def test_a_shutter_needs_a_time_and_a_camera_that_opens_it(tmp_path, capsys):
     command = ["-m", "scalar_rgb", "-o", str(tmp_path / "x.png"), "--shutter", "2"]
     for arguments, message in (
         ([str(path), "--time", "1"], "shutter:open is 0, and shutter:close 0; expected a camera whose shutter opens"),
-        ([str(path)], "expected --time or --frames, not"),
+        ([str(path)], "expected --time or --frames\n"),
         ([str(path), "--time", "1", "--turntable", "3"], "not --turntable"),
         ([str(cage), "--time", "1"], "one cage"),
     ):

@@ -210,7 +210,8 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
     if options.time is not None and options.frames:
         raise ValueError("--time is one time, --frames are several; expected only one of them")
     if options.shutter and (options.turntable or (options.time is None and not options.frames)):
-        raise ValueError("--shutter opens at a time of a USD file; expected --time or --frames, not --turntable")
+        not_turntable = ", not --turntable" if options.turntable else ""
+        raise ValueError(f"--shutter opens at a time of a USD file; expected --time or --frames{not_turntable}")
 
 
 @contextmanager

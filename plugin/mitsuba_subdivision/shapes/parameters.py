@@ -144,8 +144,9 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
     if name == "material":
         material = value_of(props, name)
         if material not in cage.materials:
-            names = ", ".join(f'"{each}"' for each in cage.materials) or "none"
-            raise ValueError(f'parameter "material" is "{material}"; expected one of {names} in {cage.source.name}')
+            names = ", ".join(f'"{each}"' for each in cage.materials)
+            expected = f"one of {names} in {cage.source.name}" if names else f"a cage with some, not {cage.source.name}"
+            raise ValueError(f'parameter "material" is "{material}"; expected {expected}')
         faces = cage.materials[material]
     else:
         faces = _tensor(props, name, (-1,))

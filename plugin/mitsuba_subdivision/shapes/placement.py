@@ -20,8 +20,8 @@ _LAST_ROW = (0, 0, 0, 1)
 FAR = 4
 
 
-def checked_matrix(transform: Any) -> NDArray[np.float64]:
-    """``(4, 4)`` matrix of one of Mitsuba's transformations, of a scalar or a JIT variant.
+def checked_matrix(transform: Any, name: str = "to_world") -> NDArray[np.float64]:
+    """``(4, 4)`` matrix of one of Mitsuba's transformations, of a scalar or a JIT variant: the parameter of a name.
 
     Raises
     ------
@@ -29,16 +29,17 @@ def checked_matrix(transform: Any) -> NDArray[np.float64]:
         If it is not an invertible affine map.
     """
     if not hasattr(transform, "matrix"):
-        raise ValueError(f'parameter "to_world" is {transform!r}; expected a transformation')
+        raise ValueError(f'parameter "{name}" is {transform!r}; expected a transformation')
     matrix = np.array(transform.matrix, dtype=np.float64)
     if matrix.size != 16:
-        raise ValueError(f'parameter "to_world" has the shape {matrix.shape}; expected one transformation')
+        raise ValueError(f'parameter "{name}" has the shape {matrix.shape}; expected one transformation')
     matrix = matrix.reshape(4, 4)
-    determinant = np.linalg.det(matrix[:3, :3])
+    with np.errstate(invalid="ignore"):
+        determinant = np.linalg.det(matrix[:3, :3])
     if not (np.isfinite(matrix).all() and determinant != 0):
-        raise ValueError(f'parameter "to_world" has the determinant {determinant}; expected an invertible matrix')
+        raise ValueError(f'parameter "{name}" has the determinant {determinant}; expected an invertible matrix')
     if not np.array_equal(matrix[3], _LAST_ROW):
-        raise ValueError(f'parameter "to_world" has the last row {tuple(matrix[3].tolist())}; expected {_LAST_ROW}')
+        raise ValueError(f'parameter "{name}" has the last row {tuple(matrix[3].tolist())}; expected {_LAST_ROW}')
     return matrix
 
 

@@ -200,8 +200,7 @@ def _sensor(props: mi.Properties, is_needed: bool, needed_by: str) -> ViewingSen
             f'parameter "{needed_by}" needs a sensor, and "{missing[0]}" is missing; expected {", ".join(SENSOR)}, as '
             "pixel_error_for(sensor) returns them"
         )
-    with errors_about("sensor_to_world"):
-        to_world = checked_matrix(props["sensor_to_world"])
+    to_world = checked_matrix(props["sensor_to_world"], "sensor_to_world")
     fov, width, height = (value_of(props, name) for name in SENSOR[1:])
     return ViewingSensor(to_world, float(fov), (width, height))
 
