@@ -641,3 +641,23 @@ def test_the_trial_notices_what_differs(kind, message):
             hook.attach(shape, kept[0])
 
     assert hook_trial.trial_problem(mi.llvm_ad_rgb, attach) == message
+
+
+@pytest.mark.parametrize("current", ["scalar_rgb", None])
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_the_first_shape_of_a_variant_needs_it_to_be_set(current):
+    """Mitsuba makes the group that is built upon in the variant that is set: it was of another class."""
+    code = f"""
+import mitsuba_subdivision as msub, mitsuba as mi
+if {current!r}:
+    mi.set_variant({current!r})
+msub.register_variant("llvm_ad_rgb")
+config = mi.parser.ParserConfig("llvm_ad_rgb")
+shape = {{"type": "subdivision", "filename": msub.example_file("cages/rook.obj"), "shading": "exact"}}
+state = mi.parser.parse_dict(config, shape)
+mi.parser.transform_all(config, state)
+mi.parser.instantiate(config, state)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert f'made while {current or "no variant"} was set; expected mi.set_variant("llvm_ad_rgb") before' in done.stderr

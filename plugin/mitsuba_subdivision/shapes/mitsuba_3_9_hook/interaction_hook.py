@@ -34,7 +34,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ...kernels.types import Mask, Value
-from ...variants import Variant
+from ...variants import Variant, variant_name
 from ..garbage_collection import paused_collection
 from .hook_trial import trial_problem
 from .machine_code import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
@@ -369,8 +369,20 @@ _lock = threading.Lock()
 
 
 def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
-    """The hook of a variant's shapes, built for the first of them."""
+    """The hook of a variant's shapes, built for the first of them.
+
+    Raises
+    ------
+    RuntimeError
+        If there is none yet, and another variant is set, in which Mitsuba would make the group that is built upon.
+    """
     with _lock:
         if variant not in _hooks:
+            name, current = variant_name(variant), mi.variant() or "no variant"
+            if current != name:
+                raise RuntimeError(
+                    f'the first shape with exact shading in "{name}" was made while {current} was set; expected '
+                    f'mi.set_variant("{name}") before, or the shading "vertex"'
+                )
             _hooks[variant] = InteractionHook(variant, example)
         return _hooks[variant]
