@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageError, named_cages
+from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
@@ -99,6 +100,13 @@ def test_pictures_of_any_size_of_model_are_the_same_and_not_clipped(scale):
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     assert border.max() == 0
     assert alpha.max() > 0.9
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_a_model_of_a_size_that_mitsuba_cannot_render_is_told(scale):
+    with pytest.warns(CageWarning, match=r"a model .* units large; expected 1e-09 to 5e\+08"):
+        studio_scene(named_cages.cube().with_positions(scale * named_cages.cube().positions))
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

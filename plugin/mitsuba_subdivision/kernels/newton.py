@@ -30,7 +30,7 @@ def step_along(r: Vector3, d: Vector3, du: Vector3, dv: Vector3) -> tuple[Float,
     return dot(r, across_v) * inverse, dot(r, across_u) * inverse
 
 
-def over(value: Float, divisor: Float) -> Float:
-    """A quotient; infinite where the divisor is zero, also in scalar variants, where Python would raise an error."""
+def over(value: Float, divisor: Float, otherwise: float = dr.inf) -> Float:
+    """A quotient; another number where the divisor is zero, which is an error for Python's numbers."""
     exists = divisor != 0
-    return dr.select(exists, value / dr.select(exists, divisor, 1), dr.inf)
+    return dr.select(exists, value / dr.select(exists, divisor, 1), otherwise)

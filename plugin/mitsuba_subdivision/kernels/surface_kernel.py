@@ -358,9 +358,8 @@ class SurfaceKernel:
 def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vector3]:
     """Derivatives of the unit normal, from second derivatives."""
     uu, uv, vv = values.second
-    area = dr.norm(cross(values.du, values.dv))
     # Where the surface collapses, nothing turns: infinite derivatives times zero would not be numbers.
-    inverse = dr.select(area > 0, over(1, area), 0)
+    inverse = over(1, dr.norm(cross(values.du, values.dv)), 0)
     changes = (
         cross(uu, values.dv) + cross(values.du, uv),
         cross(uv, values.dv) + cross(values.du, vv),

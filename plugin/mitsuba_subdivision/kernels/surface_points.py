@@ -8,6 +8,7 @@ import drjit as dr
 
 from .affine_map import AffineMap
 from .element_walk import Location
+from .newton import over
 from .types import Float, Vector3
 from .vectors import unit
 
@@ -48,8 +49,7 @@ class SurfacePoints:
         )
         if self.dn_du is None:
             return found
-        length = dr.norm(normal)
-        inverse = dr.select(length > 0, 1 / dr.select(length > 0, length, 1), 0)
+        inverse = over(1, dr.norm(normal), 0)
         turns = (to_world.normal(each) * inverse for each in (self.dn_du, self.dn_dv))
         dn_du, dn_dv = (turn - n * dr.dot(n, turn) for turn in turns)
         return replace(found, dn_du=dn_du, dn_dv=dn_dv)

@@ -18,6 +18,7 @@ from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.element_walk import Location
 from ..kernels.line_intersection import ON_LINE, Lines
+from ..kernels.newton import over
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
@@ -328,9 +329,7 @@ class ExactShading:
             tangents.append((found.dn_du * self._sign, found.dn_dv * self._sign))
         if self._texcoords is not None:
             (u, v), (u_u, v_u), (u_v, v_v) = self._texcoords(found.location, active)
-            determinant = u_u * v_v - u_v * v_u
-            exists = determinant != 0
-            inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)
+            inverse = over(1, u_u * v_v - u_v * v_u, 0)
             tangents = [((a * v_v - b * v_u) * inverse, (b * u_u - a * u_v) * inverse) for a, b in tangents]
         si.uv = variant.Point2f(u, v)
         si.dp_du, si.dp_dv = (variant.Vector3f(each) for each in tangents[0])

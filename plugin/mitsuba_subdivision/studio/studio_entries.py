@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..cage.errors import warn
 from ..variants import SceneNode
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
@@ -18,6 +19,8 @@ from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 DEFAULT_SIZE = (640, 480)
 DEFAULT_SPP = 64
 LARGEST_SIDE = 1 << 14
+# Sizes of models that Mitsuba renders alike, as measured: lengths are squared in single precision.
+SIZES = (1e-9, 5e8)
 
 # Positions of lights, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
 # sides, their radiance, and their sampling weights, chosen for least noise.
@@ -77,6 +80,11 @@ def studio(
     ValueError
         If no variant is set; if bounds are not finite, or the least not below the greatest; if view, axis, size or
         samples are invalid.
+
+    Warns
+    -----
+    CageWarning
+        If the model is so small or large that Mitsuba's single precision does not render it.
     """
     variant_in_use()
     box = _checked_bounds(bounds)
@@ -86,6 +94,11 @@ def studio(
     in_world = box_corners(box) if points is None else np.asarray(points, dtype=np.float64).reshape(-1, 3)
     low, high = np.sort(box @ axes, axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    if not SIZES[0] < 2 * radius < SIZES[1]:
+        warn(
+            f"a model {2 * radius:.3g} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which Mitsuba's "
+            "single precision loses light and surfaces"
+        )
     camera = framed(in_world @ axes, azimuth, elevation, size)
     from_below = elevation < 0
     scene: SceneNode = {
