@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision import LimitSurface, example_file
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.llvm import llvm_problem
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
@@ -443,3 +443,17 @@ def test_renders():
     # The shape reflects half of the sky, which is behind it.
     assert 0.3 < image[8, 8].min() < 0.7
     assert np.allclose(image[0, 0], 1)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.parametrize("name", ["vertex_positions", "vertex_normals", "vertex_texcoords"])
+def test_a_buffer_of_another_length_is_refused(name):
+    """Mitsuba would read and write beyond its end."""
+    shape = mi.load_dict({"type": "subdivision", "filename": example_file("cages/jar.obj"), "tessellation_rate": 1})
+    parameters = mi.traverse(shape)
+    whole = mi.Float(parameters[name])
+    parameters[name] = mi.Float(np.array(whole)[:10])
+    with pytest.raises(ValueError, match=f'parameter "{name}": 10 numbers; expected {len(whole)}'):
+        parameters.update()
+    parameters[name] = whole
+    parameters.update()

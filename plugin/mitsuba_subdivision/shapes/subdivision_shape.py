@@ -106,8 +106,9 @@ def make_subdivision(variant: Variant) -> type:
             if isinstance(self._tessellation, AdaptiveTessellation):
                 error = self._tessellation.error
                 self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
-            # Dr.Jit's variable indices of the mesh's buffers when they were last set.
+            # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths.
             self._evaluated: dict[str, int] = {}
+            self._lengths: dict[str, int] = {}
             kind = variant.Float if is_jit else dr.scalar.ArrayXf
             # Mitsuba draws points of such emitters by the mesh's own texture coordinates.
             self._has_textured_emitter = _has_textured_emitter(props, variant)
@@ -235,6 +236,7 @@ def make_subdivision(variant: Variant) -> type:
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
             # Before anything changes.
+            self._require_lengths(keys)
             if "control_points" in keys:
                 self._require_control_points()
             to_world = checked_matrix(self.to_world) if "to_world" in keys else None
@@ -274,6 +276,13 @@ def make_subdivision(variant: Variant) -> type:
                 keys = [key for key in keys if key != "faces"]
             # Listed among the keys, so that Mitsuba keeps these normals instead of averaging those of the triangles.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
+
+        def _require_lengths(self, keys: list[str]) -> None:
+            """Check buffers of vertices that a user has assigned: Mitsuba reads as many as there were."""
+            names = [name for name in self._lengths if name in keys and name.startswith("vertex_")]
+            for name, values in self._get_buffers(*names).items():
+                if len(values) != self._lengths[name]:
+                    raise ValueError(f'parameter "{name}": {len(values)} numbers; expected {self._lengths[name]}')
 
         def _require_control_points(self) -> None:
             with errors_about("control_points"):
@@ -337,6 +346,7 @@ def make_subdivision(variant: Variant) -> type:
                 values.pop("vertex_normals", None)
             super().traverse(MeshBuffers(self, values.keys(), values))
             self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
+            self._lengths |= {name: len(value) for name, value in values.items()}
 
         def _get_buffers(self, *names: str) -> dict[str, FloatBuffer | IndexBuffer]:
             found = MeshBuffers(self, names)
