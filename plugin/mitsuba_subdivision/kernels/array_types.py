@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from functools import cached_property
+from types import ModuleType
 from typing import Any, Literal
 
 import drjit as dr
@@ -69,20 +70,26 @@ class ArrayTypes:
         return cls(float_type, arrays.UInt32, vector2, vector3, vector4, arrays.Array2u, arrays.Array4u)
 
     @property
+    def _module(self) -> ModuleType:
+        """Dr.Jit's module of the type; of JIT variants."""
+        return sys.modules[self.float.__module__]
+
+    @property
     def _many(self) -> type:
         """Arrays of any number of floats."""
-        return getattr(sys.modules[self.float.__module__], "ArrayXf64" if self.is_double else "ArrayXf")
+        return self._module.ArrayXf64 if self.is_double else self._module.ArrayXf
 
     @property
     def index64(self) -> type:
         """Unsigned integers of 64 bits."""
-        return int if not self.is_jit else sys.modules[self.float.__module__].UInt64
+        return self._module.UInt64 if self.is_jit else int
 
     @property
     def matrix4(self) -> type:
         """Matrices of four rows and columns."""
-        name = "Matrix4f64" if self.is_double else "Matrix4f"
-        return dr.scalar.Matrix4f64 if not self.is_jit else getattr(sys.modules[self.float.__module__], name)
+        if not self.is_jit:
+            return dr.scalar.Matrix4f64
+        return self._module.Matrix4f64 if self.is_double else self._module.Matrix4f
 
     def vector(self, size: int) -> type:
         """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""

@@ -68,8 +68,7 @@ class OneRing:
 
     def with_sharpness(self, signature: Signature) -> OneRing:
         """The one-ring of a signature that differs from this one's in its semi-sharp features."""
-        local = self.topology
-        return replace(self, topology=local.with_rules(local.rules, _local_sharpness(local, [(signature, 0)])))
+        return replace(self, topology=_with_sharpness(self.topology, signature))
 
     def edge_neighbours(self) -> list[int]:
         """Neighbours of the first vertex along edges, counter-clockwise, from border to border if it is on one."""
@@ -234,8 +233,7 @@ class LongRing(OneRing):
 
     def with_sharpness(self, signature: Signature) -> OneRing:
         same = LongRing(signature.smoothed, self.corner)
-        local = self.topology
-        vars(same)["topology"] = local.with_rules(local.rules, _local_sharpness(local, [(signature, 0)]))
+        vars(same)["topology"] = _with_sharpness(self.topology, signature)
         return same
 
     def gather(
@@ -380,6 +378,11 @@ class JoinedRings:
 def _fans(smooth: Signature) -> list[FanHalfEdges]:
     """Half-edges of the fan at each corner of the element in the local mesh of its one-ring."""
     return fan_half_edges(one_ring(smooth).topology, 0, smooth.kind)
+
+
+def _with_sharpness(local: Topology, signature: Signature) -> Topology:
+    """The topology of a one-ring, with the semi-sharp features of a signature."""
+    return local.with_rules(local.rules, _local_sharpness(local, [(signature, 0)]))
 
 
 def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..kernels.alignment import aligned
 from ..kernels.types import FloatBuffer
-from ..mesh.shared import Content, Shared, SharedArray
+from ..mesh.shared import SharedArray
 from ..schemes.domain import FloatArray
 from ..variants import Variant
 from .attribute_parameters import mesh_name
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 PREFIX = "cage_"
 
-
-_UPLOADED: Shared[SharedArray] = Shared()
 
 # Called with an attribute's name and the gradient with respect to its values, after reverse mode has reached them.
 OnBackward = Callable[[str, FloatBuffer], None]
@@ -143,17 +141,12 @@ class CageAttributes:
 
     def _upload(self, values: FloatArray) -> SharedArray:
         """A mesh buffer; in JIT variants, meshes with equal values share one array."""
-
-        def make() -> SharedArray:
+        if self._float is None:
             # Rendering loads texture coordinates in packets.
-            found = aligned(values, dtype=np.float32)
-            if self._float is None:
-                return SharedArray(found)
-            from ..kernels.array_types import ArrayTypes
+            return SharedArray(aligned(values, dtype=np.float32))
+        from ..kernels.array_types import ArrayTypes
 
-            return SharedArray(ArrayTypes.of(self._float).owned(self._float(found.ravel())))
-
-        return make() if self._float is None else _UPLOADED.get((self._float, Content(values)), make)
+        return ArrayTypes.of(self._float).shared_floats(values.astype(np.float32))
 
     def _at_vertices(self, name: str) -> FloatBuffer:
         if name not in self._moved:

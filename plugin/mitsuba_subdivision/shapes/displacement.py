@@ -110,7 +110,7 @@ class ShapeDisplacement:
             self._own_values = channel.values
         if self.kernel is not None:
             self.kernel.displacement = Displacement(channel, self.heights, scale)
-        self.note_scale()
+        self.take_scale(self.checked_scale())
 
     def checked_scale(self) -> float:
         """The value of ``displacement_scale``.
@@ -125,9 +125,9 @@ class ShapeDisplacement:
             raise ValueError(f"{found.tolist()} was given; expected a finite number")
         return float(found[0])
 
-    def note_scale(self) -> None:
-        """Take over the value of ``displacement_scale``, which `checked_scale` accepts."""
-        self.host_scale = self.checked_scale()
+    def take_scale(self, checked: float) -> None:
+        """Take over ``displacement_scale``, given its `checked_scale`."""
+        self.host_scale = checked
         if self._is_jit:
             # A literal would be compiled into kernels.
             dr.make_opaque(self.scale)

@@ -240,9 +240,10 @@ def make_subdivision(variant: Variant) -> type:
             if "control_points" in keys:
                 self._require_control_points()
             to_world = checked_matrix(self.to_world) if "to_world" in keys else None
+            scale = None
             if "displacement_scale" in keys and self._displacement is not None:
                 with errors_about("displacement_scale"):
-                    self._displacement.checked_scale()
+                    scale = self._displacement.checked_scale()
             tessellation = self._tessellation
             if not _CHOOSING.isdisjoint(keys) and isinstance(tessellation, AdaptiveTessellation):
                 tessellation = tessellation.with_error(np.array(self._error).ravel())
@@ -255,8 +256,8 @@ def make_subdivision(variant: Variant) -> type:
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])
                 return
-            if "displacement_scale" in keys and self._displacement is not None:
-                self._displacement.note_scale()
+            if self._displacement is not None and scale is not None:
+                self._displacement.take_scale(scale)
             if to_world is not None:
                 self._take_to_world(to_world)
             if tessellation is not self._tessellation:

@@ -48,7 +48,7 @@ class Textures:
 
     def read(self, uses: Iterable[TextureContents]) -> None:
         """Read the pictures of textures on all processors."""
-        first = {_key(each.file, each): each for each in uses if _key(each.file, each) not in self._pictures}
+        first = {key: each for each in uses if (key := _key(each.file, each)) not in self._pictures}
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = pool.map(self._read, [file for file, _ in first], first.values())
             for key, picture in zip(first, found, strict=True):
@@ -66,13 +66,13 @@ class Textures:
         most = None if is_radiance else 1.0
         if isinstance(given, NodeContents):
             found = self._baked(given)
-            # Two components are red and green.
-            values = (
-                np.repeat(found.values, 3, axis=2)
-                if found.values.shape[2] == 1
-                else np.pad(found.values, ((0, 0), (0, 0), (0, 1)))
-            )
-            return self._bitmap(np.clip(values[..., :3], 0, most), found.to_uv, found.wrap, is_raw=False)
+            values = found.values[..., :3]
+            if values.shape[2] == 1:
+                values = np.broadcast_to(values, (*values.shape[:2], 3))
+            elif values.shape[2] == 2:
+                # Red and green.
+                values = np.pad(values, ((0, 0), (0, 0), (0, 1)))
+            return self._bitmap(np.clip(values, 0, most), found.to_uv, found.wrap, is_raw=False)
         picture = self._picture(given.file, given)
         if picture is None:
             channels = ["rgba".index(each) for each in given.channel]
