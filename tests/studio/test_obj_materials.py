@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageWarning, studio_scene
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.studio.obj_materials import material_bsdf, read_materials
 
 LIBRARY = """newmtl red
@@ -65,7 +66,7 @@ def test_a_missing_library_leaves_one_shape(file):
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_pictures_are_upright(tmp_path):
     # White at the top left, where u is small and v large.
-    white = mi.TensorXf(np.array([[1.0, 0.0], [0.0, 0.0]])[..., None])
+    white = upload(mi.TensorXf, np.array([[1.0, 0.0], [0.0, 0.0]])[..., None])
     mi.util.write_bitmap(str(tmp_path / "a b.png"), white, write_async=False)
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n")
     (tmp_path / "a.mtl").write_text("newmtl a\nmap_Kd .\\a b.png\n")
