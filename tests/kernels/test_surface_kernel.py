@@ -288,7 +288,7 @@ def forward(outputs, inputs, changes):
 def backward(outputs, inputs, seeds):
     """Gradients by inputs of the sum of all products of outputs and seeds."""
     for output, seed in zip(outputs, seeds, strict=True):
-        dr.set_grad(output, type(output)(seed.T))
+        dr.set_grad(output, upload(type(output), seed))
     dr.enqueue(dr.ADMode.Backward, *outputs)
     dr.traverse(dr.ADMode.Backward)
     found = [dr.grad(each) for each in inputs]
