@@ -328,10 +328,8 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
             ),
             (
                 "shapes/moving_vertices.py",
-                "return placed(positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix),"
-                " types.vector3)",
-                "return placed(positions, normals, matrix if not dr.is_jit_v(matrix) else types.matrix4(matrix),"
-                " types.vector3)",
+                "to_world = matrix if dr.is_jit_v(matrix) else types.matrix4(matrix.tolist())",
+                "to_world = matrix if not dr.is_jit_v(matrix) else types.matrix4(matrix.tolist())",
             ),
             (
                 "patches/nearest_in_piece.py",

@@ -218,9 +218,8 @@ def _placed(positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4) -> tu
         from ..kernels.array_types import ArrayTypes
 
         types = ArrayTypes.of(type(positions))
-        return placed(
-            positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix.tolist()), types.vector3
-        )
+        to_world = matrix if dr.is_jit_v(matrix) else types.matrix4(matrix.tolist())
+        return placed(positions, normals, to_world, types.vector3)
     linear, offset = matrix[:3, :3], matrix[:3, 3]
     p = positions.reshape(-1, 3) @ linear.T.astype(np.float32)
     p += offset.astype(np.float32)
