@@ -279,6 +279,24 @@ class ExactShading:
         value = self._attributes[name](location, active)[0]
         return self._upsampling(value) if self._upsampling and name in self._colors else value
 
+    def texcoords_of_corners(self, face_count: int) -> FloatArray:
+        """Texture coordinates ``(3 n, 2)`` at the corners of all triangles, in their order in the mesh."""
+        if self._texcoords is None:
+            raise RuntimeError(f"{self._name} has no texture coordinates")
+        index, b1, b2 = np.repeat(np.arange(face_count), 3), *np.tile(np.eye(3)[1:], face_count)
+        if self._are_turned:
+            b1, b2 = b2, b1
+        if not self._is_jit:
+            found = [
+                self._texcoords(self._triangles(*corner, True), True)[0]
+                for corner in zip(index.tolist(), b1.tolist(), b2.tolist(), strict=True)
+            ]
+            return np.array(found)
+        types = self.kernel.types
+        with dr.suspend_grad():
+            location = self._triangles(types.indices(index), types.floats(b1), types.floats(b2), True)
+            return np.array(self._texcoords(location, True)[0]).T
+
     def _is_moving(self) -> bool:
         """Whether there are derivatives by anything that moves the surface."""
         displacement = self.kernel.displacement
