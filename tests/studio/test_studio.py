@@ -1,5 +1,6 @@
 """The studio: what the camera frames, scenes of models, and scenes as XML."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 
 import mitsuba as mi
@@ -343,3 +344,33 @@ def test_a_checkerboard_goes_before_colours():
     # Other numbers are no colours.
     plain = msub.ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), attributes={"color": np.zeros((8, 1))})
     assert studio_scene(plain, **SMALL)["surface"]["bsdf"]["bsdf"]["base_color"]["type"] == "rgb"
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        (0, 'cube.obj": bounds from (1, 1, 1) to (1, 1, 1); expected a box with a size, below 1e+37'),
+        (1e300, 'cube.obj": bounds from (-8.3'),
+    ],
+)
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_messages_about_boxes_name_the_file(tmp_path, scale, message):
+    cage = named_cages.cube()
+    msub.ControlCage(cage.positions * scale + (scale == 0), cage.face_vertices.reshape(-1, 4)).save(
+        tmp_path / "cube.obj"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        studio_scene(tmp_path / "cube.obj", **SMALL)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_message_about_a_size_names_the_file(tmp_path):
+    cage = named_cages.cube()
+    msub.ControlCage(1e12 * cage.positions, cage.face_vertices.reshape(-1, 4)).save(tmp_path / "cube.obj")
+    with pytest.warns(CageWarning, match=r'cube.obj": a model [0-9.]+ units large'):
+        studio_scene(tmp_path / "cube.obj", **SMALL)
+
+
+def test_numbers_in_messages_differ_from_what_was_expected():
+    with pytest.raises(ValueError, match=r"elevation 90.00000001; expected -90 to 90"):
+        msub.studio_scene(named_cages.cube(), view=(0, 90.00000001))

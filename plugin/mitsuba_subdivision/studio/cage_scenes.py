@@ -144,7 +144,7 @@ class CageScenes:
         points = self.points(contents) if points is None else points
         up, view, size = self.framing(contents)
         bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-        staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points)
+        staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points, name=self.name)
         triangles = None
         if follows_sensor and look.rate is None and look.shading == "exact":
             triangles = model.triangles_for(staged["sensor"])
