@@ -116,8 +116,8 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _without_comment(line: str) -> str:
-    """A line without its comment; a name may have a "#" in it."""
-    return re.sub(r"(^|\s)#.*", "", line).strip()
+    """A line without its comment; a name may have a "#" in it, but for one between spaces."""
+    return re.sub(r"(^#|\s#(?=\s|$)).*", "", line.strip()).strip()
 
 
 def _parsed(library: Path, text: str) -> dict[str, Material]:
