@@ -348,3 +348,23 @@ def test_spectra_have_derivatives_by_colours(tmp_path, shading):
         step = 1e-3 * np.eye(3)[i]
         change = np.array(spectrum(given + step) - spectrum(given - step)).ravel() @ [1, 2, 3, 4] / 2e-3
         np.testing.assert_allclose(gradient[i], change, rtol=2e-2)
+
+
+@exact
+@pytest.mark.usefixtures("variant_llvm_ad_spectral")
+def test_frozen_functions_look_up_spectra(tmp_path):
+    path = str(square(tmp_path / "square.ply"))
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "subdivision", "filename": path, "shading": "exact"}})
+    parameters = mi.traverse(scene)
+
+    def spectrum(scene, x):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.1, 5), [0, 0, -1], 0, mi.Spectrum(450, 500, 550, 600)))
+        return si.shape.eval_attribute("vertex_color", si)
+
+    frozen = dr.freeze(spectrum)
+    for grey in (0.25, 0.75):
+        parameters["shape.cage_color"] = dr.full(mi.Float, grey, 12)
+        parameters.update()
+        found = frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))
+        np.testing.assert_allclose(np.array(found), grey, atol=SPECTRUM)
+    assert frozen.n_recordings == 1
