@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from .upload import upload
+
 if TYPE_CHECKING:
     import mitsuba as mi
 
@@ -58,8 +60,7 @@ def mitsuba_mesh(
             mesh.add_attribute(key, values.shape[1], [0.0] * values.size)
     parameters = mi.traverse(mesh)
     for key, values in {"faces": triangles, **buffers}.items():
-        kind = np.uint32 if key == "faces" else np.float32
-        parameters[key] = type(parameters[key])(np.ascontiguousarray(values, dtype=kind).ravel())
+        parameters[key] = upload(type(parameters[key]), values)
     parameters.update()
     if averages_normals:
         mesh.recompute_vertex_normals()

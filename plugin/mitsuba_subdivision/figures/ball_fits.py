@@ -17,6 +17,7 @@ from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.triangle_samples import triangle_samples
 from ..shapes.views import loss_of_views
 from ..surface import LimitSurface
+from ..upload import upload
 from ..variants import SceneNode
 from .figure_scenes import make_mesh
 
@@ -165,7 +166,10 @@ def fit_mesh(views: list[View], steps: int, measure: Measurement) -> Course:
         }
     )
     params, key = mi.traverse(scene), "mesh.vertex_positions"
-    targets, sensors = [mi.TensorXf(view.picture) for view in views], [mi.load_dict(view.sensor) for view in views]
+    targets, sensors = (
+        [upload(mi.TensorXf, view.picture) for view in views],
+        [mi.load_dict(view.sensor) for view in views],
+    )
     for sensor in sensors:
         sensor.sampler().set_sample_count(SPP)
     large_steps = LargeSteps(mesh.laplacian(), MESH_SMOOTHING)

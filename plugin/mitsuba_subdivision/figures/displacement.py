@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
+from ..upload import upload
 from ..variants import SceneNode
 from .figure_scenes import in_8_bits, load_stage, render, staged
 from .output import FigureOptions, save_png, scene_path, write_pixels
@@ -48,7 +49,7 @@ def draw(options: FigureOptions) -> list[Path]:
         "max_rate": MAX_RATE,
         "bsdf": glazed({"type": "rgb", "value": GLAZE}),
     }
-    heights = mi.load_dict({"type": "bitmap", "data": mi.TensorXf(quilt()[..., None]), "raw": True})
+    heights = mi.load_dict({"type": "bitmap", "data": upload(mi.TensorXf, quilt()[..., None]), "raw": True})
     displaced = {**plain, "displacement": heights, "displacement_scale": SCALE}
     coarse = mi.load_dict({**displaced, "pixel_error": PIXEL_ERROR_OF_LINES})
     slices = {
@@ -116,7 +117,7 @@ def _lines() -> SceneNode:
     distance = np.minimum(np.minimum(u, v), 1 - u - v)
     part = np.clip(1.5 - distance / LINE, 0, 1)[..., None]
     colours = part * np.array(LINES) + (1 - part) * np.array(GLAZE)
-    data = mi.TensorXf(np.ascontiguousarray(colours, dtype=np.float32))
+    data = upload(mi.TensorXf, colours)
     return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
 
 

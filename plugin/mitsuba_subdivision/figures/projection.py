@@ -6,6 +6,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..upload import upload
+
 # Points are lifted off their surface by this part of their distance to the camera, before they are tested.
 LIFT = 2e-3
 
@@ -31,7 +33,7 @@ def visible(scene: mi.Scene, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     if "scalar" in str(mi.variant()):
         return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), mi.Vector3f(towards))) for p in start], dtype=bool)
     directions = np.broadcast_to(towards, start.shape)
-    rays = mi.Ray3f(mi.Point3f(start.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
+    rays = mi.Ray3f(upload(mi.Point3f, start), upload(mi.Vector3f, directions))
     return ~np.array(scene.ray_test(rays))
 
 

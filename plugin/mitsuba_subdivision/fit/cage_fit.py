@@ -17,6 +17,7 @@ from ..refinement.cage_refinement import CageRefinement, built
 from ..refinement.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
+from ..upload import upload
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
 from .crease_sharpness import refined_points
 from .fitting import Fit
@@ -146,14 +147,14 @@ class CageFit(Fit):
         else:
             self._pictures.load(variable.cage, variable.highest)
             edges_of = np.bincount(self._crease_of)
-            self._others[SHARPNESS] = mi.Float(np.bincount(self._crease_of, variable.initial) / edges_of)
+            self._others[SHARPNESS] = upload(mi.Float, np.bincount(self._crease_of, variable.initial) / edges_of)
         self._steps: LargeSteps | None = None
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
             self._steps = LargeSteps(laplacian, self._smoothing)
         self._regularizers = {name: device_regularizer(name, start) for name in self._weights}
         self._optimizer = mi.ad.Adam(lr=1.0, uniform=True)
-        flat = mi.Float(positions.ravel())
+        flat = upload(mi.Float, positions)
         self._optimizer[U] = flat if self._steps is None else self._steps.to_differential(flat)
         self._load_others()
 
@@ -238,7 +239,7 @@ class CageFit(Fit):
         values = {name: self._others[name] for name in self._other_rates if name != SHARPNESS}
         values[CONTROL_POINTS] = points
         if self._variable is not None:
-            sharpness = dr.gather(mi.Float, self._others[SHARPNESS], mi.UInt32(self._crease_of))
+            sharpness = dr.gather(mi.Float, self._others[SHARPNESS], upload(mi.UInt32, self._crease_of))
             values[CONTROL_POINTS] = refined_points(self._variable, sharpness, points)
         loss = self._pictures.loss(values, self._seed + number)
         total: Any = loss

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..refinement.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
+from ..upload import upload
 
 
 def refined_points(variable: VariableSharpness, sharpness: dr.ArrayBase, points: dr.ArrayBase) -> mi.Float:
@@ -30,16 +31,16 @@ class _RefinedPoints(dr.CustomOp):
     def eval(self, variable, sharpness, points):
         values = np.clip(np.array(sharpness, dtype=np.float64), 0, variable.highest)
         self.linearization = variable.linearization(values, _rows(points))
-        return mi.Float(variable.points(values, _rows(points)).ravel())
+        return upload(mi.Float, variable.points(values, _rows(points)))
 
     def forward(self):
         along = np.array(self.grad_in("sharpness"), dtype=np.float64), _rows(self.grad_in("points"))
-        self.set_grad_out(mi.Float(self.linearization.forward(*along).ravel()))
+        self.set_grad_out(upload(mi.Float, self.linearization.forward(*along)))
 
     def backward(self):
         by_sharpness, by_points = self.linearization.backward(_rows(self.grad_out()))
-        self.set_grad_in("sharpness", mi.Float(by_sharpness))
-        self.set_grad_in("points", mi.Float(by_points.ravel()))
+        self.set_grad_in("sharpness", upload(mi.Float, by_sharpness))
+        self.set_grad_in("points", upload(mi.Float, by_points))
 
     def name(self):
         return "RefinedPoints"

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..cage import ControlCage
 from ..mesh.connectivity import IntArray, Topology
+from ..upload import upload
 
 # Faces count from this cosine between their normals on, 107 degrees. Where a part is about to grow, those on both sides
 # of its end turn by a right angle and more.
@@ -39,7 +40,7 @@ def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
 def _quadrilaterals(t: Topology, half_edges: IntArray) -> list[mi.UInt32]:
     """Vertices of a face around its edge: one before it, the ends, and one after it, which may be the first one."""
     corners = t.prev[half_edges], half_edges, t.next[half_edges], t.next[t.next[half_edges]]
-    return [mi.UInt32(t.face_vertices[each].astype(np.uint32)) for each in corners]
+    return [upload(mi.UInt32, t.face_vertices[each]) for each in corners]
 
 
 def _normals(points: dr.ArrayBase, corners: list[mi.UInt32]) -> mi.Normal3f:

@@ -14,6 +14,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..upload import upload
+
 if TYPE_CHECKING:
     from scipy import sparse
 
@@ -60,7 +62,7 @@ class LargeSteps:
         mi.Float
         """
         given = np.array(points, dtype=np.float64).reshape(-1, 3)
-        return mi.Float((self.matrix @ given).ravel())
+        return upload(mi.Float, self.matrix @ given)
 
     def from_differential(self, u: dr.ArrayBase) -> mi.Float:
         """Control points, flat x, y, z, of large-step coordinates; differentiable in forward and reverse mode."""
@@ -85,4 +87,4 @@ class _Solve(dr.CustomOp):
 
     def _solved(self, flat: dr.ArrayBase) -> mi.Float:
         given = np.array(flat, dtype=np.float64).reshape(-1, 3)
-        return mi.Float(self.factors.solve(given).ravel())
+        return upload(mi.Float, self.factors.solve(given))

@@ -13,6 +13,7 @@ import numpy as np
 from ..kernels.sparse_matrix import SparseMatrix
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
+from ..upload import upload
 from .folds import folds
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def _require_name(name: str, names: tuple[str, ...]) -> None:
 def device_form(regularizer: Regularizer) -> Callable[[dr.ArrayBase], mi.Float]:
     """A regularizer as a function of control points, flat x, y, z, on the device; differentiable by them."""
     matrix = SparseMatrix(regularizer.matrix, mi.Float, is_relative=False)
-    origin = mi.Float(regularizer.origin.ravel())
+    origin = upload(mi.Float, regularizer.origin)
 
     def energy(points: dr.ArrayBase) -> mi.Float:
         away = points - origin

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..cage import ControlCage
 from ..shapes.views import loss_of_views
+from ..upload import upload
 
 # The name of the fitted shape in its scene.
 SHAPE = "surface"
@@ -159,7 +160,7 @@ def _target(picture: Any, size: tuple[int, int], where: str) -> mi.TensorXf:
         raise ValueError(f"{where}: a picture of the shape {values.shape}; expected ({size[0]}, {size[1]}, channels)")
     if not np.isfinite(values).all():
         raise ValueError(f"{where}: a picture with values that are not finite")
-    return mi.TensorXf(values)
+    return upload(mi.TensorXf, values)
 
 
 def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.TensorXf | None:
@@ -171,7 +172,7 @@ def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.Tenso
         raise ValueError(f"{where}: a mask of the shape {values.shape}; expected {size}")
     if not np.isfinite(values).all() or (values < 0).any():
         raise ValueError(f"{where}: a mask with weights that are negative or not finite")
-    return mi.TensorXf(values[:, :, None])
+    return upload(mi.TensorXf, values[:, :, None])
 
 
 def _size(sensor: mi.Sensor) -> tuple[int, int]:

@@ -150,8 +150,7 @@ class WeightKernel:
 
 def _batches(types: ArrayTypes, table: VertexTable) -> Iterator[Batch]:
     """All patches, grouped into a few kernels: classes of the same padded size; small classes share one kernel."""
-    # Not aligned, because kernels only gather from it.
-    controls = types.index(table.controls)
+    controls = types.indices(table.controls)
     are_rounded = table.refinement is not None
     vertex_stencils = table.vertex_stencils.along_patches()
     counts = np.bincount(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.shared import Content, Shared, SharedArray
-from .alignment import aligned
+from ..upload import upload
 from .types import Float, FloatBuffer, Index, IndexBuffer, Mask, Vector3
 
 # For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
@@ -97,28 +97,23 @@ class ArrayTypes:
 
     def indices(self, *parts: NDArray[np.integer]) -> IndexBuffer:
         """Upload integer arrays, flattened and concatenated."""
-        values = aligned(*parts, dtype=np.uint32)
-        return self.index(values) if self.is_jit else values
+        if self.is_jit:
+            return upload(self.index, *parts)
+        return np.concatenate(parts, axis=None, dtype=np.uint32, casting="unsafe")
 
     def floats(self, values: NDArray[np.floating]) -> FloatBuffer:
         """Upload an array of numbers, flattened."""
-        values = aligned(values, dtype=np.float64 if self.is_double else np.float32)
-        return self.float(values) if self.is_jit else values
+        return upload(self.float, values) if self.is_jit else np.array(values, dtype=np.float64).ravel()
 
     def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
         """Upload an array of numbers, flattened; equal ones share their memory while one is referenced."""
-        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(self.owned(self.floats(values))))
+        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(self.floats(values)))
 
-    def owned(self, mapped: FloatBuffer) -> FloatBuffer:
-        """A copy of an uploaded array in Dr.Jit's own memory, for values that may change later.
-
-        Where a frozen function has read NumPy's memory through a shape, Dr.Jit (1.5) goes on reading that.
-        """
-        found: FloatBuffer = dr.empty(self.float, len(mapped))
-        # A gather of all entries in order would be the array itself.
-        dr.scatter(found, mapped, dr.arange(self.index, len(mapped)), mode=NO_CONFLICTS)
-        dr.eval(found)
-        return found
+    def given(self, kind: type, values: Any) -> Any:
+        """A user's values as an array of one of these types; vectors of NumPy have a row for each component."""
+        if self.is_jit and isinstance(values, np.ndarray):
+            return upload(kind, values.T)
+        return kind(values)
 
     def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:
         """Gather a number or a vector from an array that `indices` or `floats` uploaded.

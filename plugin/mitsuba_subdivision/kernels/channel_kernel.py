@@ -46,7 +46,7 @@ class SubdividedChannelKernel:
     def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
         table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
         self._kernel, types = PieceKernel.shared(table, float_type), ArrayTypes.of(float_type)
-        coefficients = CoefficientMap.shared(table, float_type)
+        self._map = coefficients = CoefficientMap.shared(table, float_type)
         self._size = size = channel.values.shape[1]
 
         def make(values: FloatBuffer) -> FloatBuffer:

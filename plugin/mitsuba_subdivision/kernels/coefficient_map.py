@@ -30,6 +30,9 @@ class CoefficientMap:
         Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
     """
 
+    # See `WeightedValues`.
+    UPLOADED_LATER = ("_steps",)
+
     def __init__(self, table: PieceTable, float_type: type) -> None:
         self._table, self._types = table, ArrayTypes.of(float_type)
 
@@ -165,8 +168,7 @@ class _Steps:
                     self.point_count += count * own_count
                 to, step = of_piece * (first_piece + begin), of_piece * piece_count
                 pieces.add(weights, own_first, count, own_count, to, of_piece, step, is_part=is_part)
-        # Not aligned, and so not copied, because kernels only gather from it.
-        listed = types.index(controls)
+        listed = types.indices(controls)
         self.parts, self.pieces = (each.rows(types, listed) if each.added else None for each in (parts, pieces))
         self.rings = None
         if table.classes[:, 6].any():

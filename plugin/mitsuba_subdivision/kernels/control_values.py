@@ -30,6 +30,9 @@ class WeightedValues:
         Flat Dr.Jit array of the values, whose precision weights get; ``float`` for values in NumPy.
     """
 
+    # Properties that upload arrays when they are first used; see `shapes.device_state`.
+    UPLOADED_LATER = ("product", "transposed")
+
     def __init__(self, weights: sparse.csr_array, float_type: type) -> None:
         self._weights, self._float = weights, float_type
 

@@ -48,7 +48,7 @@ class DenseBatch:
             # transposed map needs the weight that makes rows sum to one for points, and to zero for tangents.
             # NumPy sums faster along the first axis.
             own[:, 0] = (1, 0, 0) - np.ascontiguousarray(own[:, 1:].transpose(1, 0, 2)).sum(axis=0)
-        self._weights = types.float(weights.ravel())
+        self._weights = types.floats(weights)
         self._weights_at = types.indices((begins * self.width)[vertices.class_of_kind])
         self._order = types.indices(vertices.samples)
         self._order_at, self._counts = types.indices(vertices.starts), types.indices(vertices.counts)

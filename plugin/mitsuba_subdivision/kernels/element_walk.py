@@ -67,7 +67,8 @@ class ElementWalk:
         """The location in an element with parameters seen from one of its corners."""
         types = self.types
         # Python's and NumPy's numbers, which loops of Dr.Jit refuse.
-        element, corner, u, v = types.index(element), types.index(corner), types.float(u), types.float(v)
+        element, corner = (types.given(types.index, value) for value in (element, corner))
+        u, v = (types.given(types.float, value) for value in (u, v))
         return Location(types.fetch(types.index, self._first, element, active) + corner, u, v)
 
     def row(self, half_edge: Index, active: Mask = True) -> Index4:

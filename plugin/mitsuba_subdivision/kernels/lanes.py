@@ -82,7 +82,7 @@ class Lanes:
         of_classes = [(each.first_control, *each.controls.shape) for each in vertices.classes]
         of_kinds = np.array(of_classes)[vertices.class_of_kind].T
         self._first_control, self._patch_count, self._control_count = (types.indices(values) for values in of_kinds)
-        self._frame_weights = types.float(TANGENT_ROUNDING[dr.type_v(types.float)] * np.ravel(vertices.frame_weights()))
+        self._frame_weights = types.floats(TANGENT_ROUNDING[dr.type_v(types.float)] * vertices.frame_weights())
         self._float = types.float
 
     def at(self, lane: Index) -> tuple[Index, Index, Index]:

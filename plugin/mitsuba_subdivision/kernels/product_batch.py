@@ -43,7 +43,7 @@ class ProductBatch:
         self._end_u, self._end_v = (types.indices(values) for values in np.split(begins + lengths, 2))
         # For each parameter values and then derivatives.
         lines = product.line_weights(np.concatenate(parameters)).transpose(1, 0, 2)
-        self._lines = types.float(lines.ravel())
+        self._lines = types.floats(lines)
 
     def sample(self, padded: FloatBuffer, emit: Emit) -> None:
         """See `Batch.sample`."""

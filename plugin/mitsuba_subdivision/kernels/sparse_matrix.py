@@ -30,7 +30,7 @@ class SparseMatrix:
         self._row_count = matrix.shape[0]
         self._is_relative = is_relative
         self._start, self._columns = types.indices(matrix.indptr), types.indices(matrix.indices)
-        self._entries = float_type(matrix.data)
+        self._entries = types.floats(matrix.data)
 
     def __call__(self, flat: FloatBuffer, size: int = 3) -> FloatBuffer:
         """The product as the flat components of ``n`` vectors, from those of ``m`` vectors.

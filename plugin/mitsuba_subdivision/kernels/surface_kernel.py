@@ -186,7 +186,7 @@ class SurfaceKernel:
         element, uv, corner, derivatives
             As for `evaluate`: where to begin.
         """
-        points = self.types.vector3(points)
+        points = self.types.given(self.types.vector3, points)
         search = NearestLocation(self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients)))
         start = self.walk.at(element, dr.detach(uv[0]), dr.detach(uv[1]), corner)
         location, nearest = search.found(dr.detach(points), start)

@@ -19,12 +19,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..kernels.alignment import aligned
 from ..kernels.types import FloatBuffer
 from ..mesh.shared import SharedArray
 from ..schemes.domain import FloatArray
 from ..variants import Variant
 from .attribute_parameters import mesh_name
+from .device_state import is_recording
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
 from .spectral_colors import SpectralUpsampling, holds_spectra
@@ -62,6 +62,9 @@ class CageAttributes:
     moving : set of str
         Names of the parameters that move vertices.
     """
+
+    # See `WeightedValues`.
+    UPLOADED_LATER = ("all_weights",)
 
     def __init__(self, variant: Variant, surface: LimitSurface, names: Iterable[str]) -> None:
         self._source = surface.cage.source.name
@@ -131,7 +134,8 @@ class CageAttributes:
 
     def renew(self, name: str, gradient: FloatBuffer, on_backward: OnBackward) -> None:
         """Attach the arrays computed from an attribute to its values again, after reverse mode has reached them."""
-        if self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"]) and dr.any(gradient != 0):
+        lost = self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"])
+        if lost and not is_recording() and dr.any(gradient != 0):
             warn_of_lost(self._source, f"{PREFIX}{name}")
         self._move(name, on_backward)
 
@@ -150,8 +154,7 @@ class CageAttributes:
     def _upload(self, values: FloatArray) -> SharedArray:
         """A mesh buffer; in JIT variants, meshes with equal values share one array."""
         if self._float is None:
-            # Rendering loads texture coordinates in packets.
-            return SharedArray(aligned(values, dtype=np.float32))
+            return SharedArray(values.astype(np.float32).ravel())
         from ..kernels.array_types import ArrayTypes
 
         return ArrayTypes.of(self._float).shared_floats(values.astype(np.float32))
@@ -165,17 +168,28 @@ class CageAttributes:
         if name not in self._moved:
             return self._uploaded[name].array
         values, channel = self._moved[name], self._channels[name]
+        weights = self._weights_of(channel)
+        size = channel.values.shape[1]
+        if self._float is not None:
+            return weights(values, size)
+        found = weights @ np.array(values, dtype=np.float64).reshape(-1, size)
+        return np.asarray(found, dtype=np.float32).ravel()
+
+    @property
+    def all_weights(self) -> dict[tuple, Any]:
+        """Weights of all attributes."""
+        for name in self._uploaded:
+            self._weights_of(self._channels[name])
+        return self._weights
+
+    def _weights_of(self, channel: Channel) -> Any:
         # Attributes that share control vertices and patches share weights.
         key = type(channel), id(channel.patches), channel.value_index.tobytes()
         if key not in self._weights:
-            self._weights[key] = self._weights_of(channel)
-        size = channel.values.shape[1]
-        if self._float is not None:
-            return self._weights[key](values, size)
-        found = self._weights[key] @ np.array(values, dtype=np.float64).reshape(-1, size)
-        return aligned(found, dtype=np.float32)
+            self._weights[key] = self._made_weights(channel)
+        return self._weights[key]
 
-    def _weights_of(self, channel: Channel) -> Any:
+    def _made_weights(self, channel: Channel) -> Any:
         weights: sparse.csr_array = channel.weights(*self._locations())
         if self._float is None:
             return weights
@@ -198,6 +212,6 @@ class CageAttributes:
             raise ValueError(
                 f"{dr.width(values)} numbers; expected {count * size}, {size} for each of {count} values at the cage"
             )
-        if not dr.all(dr.isfinite(values)):
+        if not is_recording() and not dr.all(dr.isfinite(values)):
             wrong = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
             raise ValueError(f"number {wrong[0]} is not finite; expected finite numbers ({len(wrong)} such in all)")

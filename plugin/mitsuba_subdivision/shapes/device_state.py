@@ -1,41 +1,57 @@
-"""Exposes the Dr.Jit arrays of a shape's helper objects to frozen functions.
+"""What frozen functions (``@dr.freeze``) need of a shape.
 
-A frozen function (``@dr.freeze``) has to know every array that it reads. Dr.Jit finds the arrays that a Python shape
-itself holds, but does not look into objects of other classes.
+A frozen function has to know every array that it reads. Dr.Jit finds the arrays that a Python shape itself holds, but
+does not look into objects of other classes. What its first call records runs again at the later ones, without Python.
+So nothing is read back while it records, checks of values among it, and all tables are on the device before.
 """
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
+from functools import partial
+from types import MethodType, SimpleNamespace
 from typing import Any
 
 import drjit as dr
+
+from ..mesh.shared import SharedArray
+from .garbage_collection import paused_collection
 
 # Packages whose objects hold Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
 _PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
 
 
+def is_recording() -> bool:
+    """Whether a frozen function is being recorded, so that values of arrays cannot be read."""
+    return bool(dr.flag(dr.JitFlag.FreezingScope))
+
+
 class DeviceState:
-    """Exposes the arrays of an object, and of the objects that it holds, to Dr.Jit; a shape keeps one.
+    """Exposes the arrays of a shape, and of the objects that it holds, to Dr.Jit; a shape keeps one.
 
     Parameters
     ----------
-    owner : object
+    shape : mi.Shape
+        Not kept alive.
     """
 
-    def __init__(self, owner: Any) -> None:
-        self._owner = owner
+    def __init__(self, shape: Any) -> None:
+        self._shape = weakref.ref(shape)
 
+    # A scene that the garbage collector frees while a frozen function is called ends the process.
+    @paused_collection()
     def _traverse_1_cb_ro(self, callback: Callable[..., Any]) -> None:
         dr.detail.traverse_py_cb_ro(self._arrays(), callback)
 
+    @paused_collection()
     def _traverse_1_cb_rw(self, callback: Callable[..., Any]) -> None:
         dr.detail.traverse_py_cb_rw(self._arrays(), callback)
 
     def _arrays(self) -> SimpleNamespace:
-        return SimpleNamespace(arrays=list(_arrays_in(self._owner, set())))
+        shape = self._shape()
+        return SimpleNamespace(arrays=[] if shape is None else list(_arrays_in(vars(shape), {id(self)})))
 
 
 def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
@@ -53,5 +69,11 @@ def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
     elif isinstance(value, (list, tuple)):
         for each in value:
             yield from _arrays_in(each, seen)
-    elif kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__"):
+    elif isinstance(value, partial):
+        yield from _arrays_in(value.func, seen)
+    elif isinstance(value, MethodType):
+        yield from _arrays_in(value.__self__, seen)
+    elif isinstance(value, SharedArray) or (kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__")):
+        for name in getattr(kind, "UPLOADED_LATER", ()):
+            getattr(value, name)
         yield from _arrays_in(vars(value), seen)

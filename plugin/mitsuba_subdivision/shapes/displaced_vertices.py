@@ -25,6 +25,7 @@ from ..kernels.vectors import unit
 from ..mesh.connectivity import IntArray
 from ..patches import PatchSampler, contracts_alike
 from ..schemes.domain import FloatArray
+from ..upload import upload
 
 if TYPE_CHECKING:
     from ..kernels.displacement import Displacement
@@ -251,7 +252,7 @@ class HostDisplacement:
 
 def _columns(rows: NDArray) -> list[Float]:
     """Columns of an array, the vector components that `displaced` takes."""
-    return [dr.scalar.ArrayXf64(np.ascontiguousarray(column, dtype=np.float64)) for column in rows.T]
+    return [upload(dr.scalar.ArrayXf64, column) for column in rows.T]
 
 
 def _rows(columns: list[Float]) -> FloatArray:

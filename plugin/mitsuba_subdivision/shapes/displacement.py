@@ -29,10 +29,13 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import DisplacementBound
+from ..upload import upload
 from ..variants import Variant
+from .device_state import is_recording
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
 
 if TYPE_CHECKING:
+    from ..patches import Channel
     from .exact_shading import ExactShading
 
 # Prefix of an attribute's name in the parameter, as in the texture `mesh_attribute`.
@@ -60,7 +63,7 @@ class ShapeDisplacement:
         Name of the cage's channel that the heights depend on: an attribute, or "texcoords".
     heights : SurfaceHeights
     channel : Channel
-        Its interpolation and its current values.
+        Its interpolation and its current values, which are read from the device.
     scale : flat array of one number
         The parameter ``displacement_scale``.
     host_scale : float
@@ -87,16 +90,18 @@ class ShapeDisplacement:
         self.heights: SurfaceHeights
         if isinstance(given, str):
             self.attribute = _attribute_named(given, surface)
-            self.channel = surface.channel(self.attribute)
-            self.heights = AttributeHeights(self.channel)
+            self._loaded = surface.channel(self.attribute)
+            self.heights = AttributeHeights(self._loaded)
         else:
             if TEXCOORDS not in surface.attribute_names:
                 raise ValueError(
                     f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
                     "with some, or the name of an attribute"
                 )
-            self.attribute, self.channel = TEXCOORDS, surface.channel(TEXCOORDS)
+            self.attribute, self._loaded = TEXCOORDS, surface.channel(TEXCOORDS)
             self.heights = TextureHeights(variant, given)
+        # On a device, once they have been updated.
+        self._values: FloatBuffer = None
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
         self.kernel: SurfaceKernel | None = None
         # The values of exact shading are updated by `CageAttributes` already.
@@ -106,20 +111,22 @@ class ShapeDisplacement:
         elif self._is_jit:
             self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
             self.kernel.load(positions)
-            channel = channel_kernel(self.channel, self.kernel.walk, variant.Float)
+            channel = channel_kernel(self._loaded, self.kernel.walk, variant.Float)
             self._own_values = channel.values
         if self.kernel is not None:
             self.kernel.displacement = Displacement(channel, self.heights, scale)
         self.take_scale(self.checked_scale())
 
     def checked_scale(self) -> float:
-        """The value of ``displacement_scale``.
+        """The value of ``displacement_scale``; NaN while a frozen function is recorded, which cannot read it.
 
         Raises
         ------
         ValueError
             If it is not a finite number.
         """
+        if is_recording():
+            return np.nan
         found = np.array(self.scale).ravel()
         if len(found) != 1 or not np.isfinite(found[0]):
             raise ValueError(f"{found.tolist()} was given; expected a finite number")
@@ -127,13 +134,24 @@ class ShapeDisplacement:
 
     def take_scale(self, checked: float) -> None:
         """Take over ``displacement_scale``, given its `checked_scale`."""
-        self.host_scale = checked
         if self._is_jit:
             # A literal would be compiled into kernels.
             dr.make_opaque(self.scale)
+        # A copy, as users assign the parameter in place, before it is checked.
+        self._scale = type(self.scale)(self.scale) if self._is_jit else checked
         if self.kernel is not None and self.kernel.displacement is not None:
-            # A copy, as users assign the parameter in place, before it is checked.
-            self.kernel.displacement.scale = type(self.scale)(self.scale) if self._is_jit else self.host_scale
+            self.kernel.displacement.scale = self._scale
+
+    @property
+    def host_scale(self) -> float:
+        return float(np.array(dr.detach(self._scale)).item())
+
+    @property
+    def channel(self) -> Channel:
+        if self._values is None:
+            return self._loaded
+        values = np.array(self._values, dtype=np.float64).reshape(self._loaded.values.shape)
+        return replace(self._loaded, values=values)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the scale; Mitsuba exposes a texture as an attribute of the shape."""
@@ -142,10 +160,9 @@ class ShapeDisplacement:
 
     def set_values(self, values: FloatBuffer) -> None:
         """Set new values, flat, of the channel that the heights depend on."""
-        given = np.array(dr.detach(values), dtype=np.float64).reshape(self.channel.values.shape)
-        self.channel = replace(self.channel, values=given)
-        if isinstance(self.heights, AttributeHeights):
-            self.heights = AttributeHeights(self.channel)
+        self._values = dr.detach(values)
+        if not self._is_jit:
+            self._loaded, self._values = self.channel, None
         if self._own_values is not None:
             self._own_values.set(values)
 
@@ -160,14 +177,15 @@ class ShapeDisplacement:
 
     def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
-        columns = [float_type(np.ascontiguousarray(column)) for column in self.channel.evaluate(start, uv).T]
+        columns = [upload(float_type, column) for column in self.channel.evaluate(start, uv).T]
         heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
         # A texture of one value has one number for all samples.
         return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))
 
     def range(self) -> HeightRange:
         """Interval of the scaled heights."""
-        found = self.heights.range()
+        heights = AttributeHeights(self.channel) if isinstance(self.heights, AttributeHeights) else self.heights
+        found = heights.range()
         low, high = sorted((found.low * self.host_scale, found.high * self.host_scale))
         return HeightRange(low, high)
 

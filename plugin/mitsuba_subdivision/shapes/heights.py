@@ -15,6 +15,7 @@ import numpy as np
 
 from ..kernels.displacement import Heights
 from ..kernels.types import Float, Mask, Value, Vector2
+from ..upload import upload
 from ..variants import Variant
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ class TextureHeights:
             return HeightRange(float(values.min()), float(values.max()))
         along = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
         float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
-        s, t = (float_type(each.ravel()) for each in np.meshgrid(along, along))
+        s, t = (upload(float_type, each) for each in np.meshgrid(along, along))
         values = np.array(self.height((s, t)))
         return HeightRange(float(values.min()), float(values.max()))
 

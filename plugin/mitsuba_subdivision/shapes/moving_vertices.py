@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..cage.errors import warn
 from ..kernels.types import FloatBuffer, Matrix4
+from .device_state import is_recording
 from .placement import Placement, RecentredPoints
 from .vertices import Vertices
 
@@ -119,7 +120,7 @@ class MovingVertices:
             By names of the arrays computed from the parameters. Gradients are zero for shapes of scenes out of use.
         """
         lost = self._computed - computed_ones(control_points, placement.matrix, *self._others())
-        if lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
+        if lost and not is_recording() and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
             parameters = "control_points, to_world or heights" if self._others() else "control_points or to_world"
             warn_of_lost(self._name, parameters)
 
@@ -217,7 +218,9 @@ def _placed(positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4) -> tu
         from ..kernels.array_types import ArrayTypes
 
         types = ArrayTypes.of(type(positions))
-        return placed(positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix), types.vector3)
+        return placed(
+            positions, normals, matrix if dr.is_jit_v(matrix) else types.matrix4(matrix.tolist()), types.vector3
+        )
     linear, offset = matrix[:3, :3], matrix[:3, 3]
     p = positions.reshape(-1, 3) @ linear.T.astype(np.float32)
     p += offset.astype(np.float32)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.types import FloatBuffer, Matrix4
+from ..upload import upload
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -75,9 +76,9 @@ class RecentredPoints:
         centre = ((low + high) / 2).astype(np.float32).astype(np.float64)
         if recentres and np.abs(centre).max() > FAR * (high - low).max() / 2:
             self.centre, self.positions = centre, positions - centre
-            self._loaded = float_type(positions.ravel())
-            self._relative = float_type(self.positions.ravel())
-            self._centres = float_type(np.tile(centre, len(positions)))
+            self._loaded = upload(float_type, positions)
+            self._relative = upload(float_type, self.positions)
+            self._centres = upload(float_type, np.tile(centre, len(positions)))
 
     def __call__(self, control_points: FloatBuffer) -> FloatBuffer:
         """Flat control points relative to the centre."""
@@ -125,11 +126,7 @@ class Placement:
         centre : (3,) float64 or None
         """
         is_jit = dr.is_jit_v(to_world.matrix)
-        matrix, inverse = to_world.matrix if is_jit else value, np.linalg.inv(value)
-        if centre is not None:
-            shift = np.eye(4)
-            shift[:3, 3] = centre
-            matrix = matrix @ (type(matrix)(shift) if is_jit else shift)
+        matrix, inverse = cls._recentred(to_world.matrix if is_jit else value, centre), np.linalg.inv(value)
         is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)
         return cls(
             matrix,
@@ -137,3 +134,19 @@ class Placement:
             is_identity,
             bool(np.linalg.det(value[:3, :3]) < 0),
         )
+
+    def recorded(self, to_world: mi.AffineTransform4f, centre: NDArray[np.float64] | None) -> Placement:
+        """The placement by a transformation whose value cannot be read, as a frozen function is being recorded.
+
+        It mirrors if this one does.
+        """
+        matrix = dr.detach(to_world.matrix)
+        return Placement(self._recentred(to_world.matrix, centre), dr.rcp(matrix), False, self.mirrors)
+
+    @staticmethod
+    def _recentred(matrix: Matrix4, centre: NDArray[np.float64] | None) -> Matrix4:
+        if centre is None:
+            return matrix
+        shift = np.eye(4)
+        shift[:3, 3] = centre
+        return matrix @ (type(matrix)(shift.tolist()) if dr.is_jit_v(matrix) else shift)

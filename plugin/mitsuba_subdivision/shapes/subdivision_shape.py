@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
 from ..llvm import llvm_problem
 from ..surface import TEXCOORDS
+from ..upload import upload
 from ..variants import Variant
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
+from .device_state import DeviceState, is_recording
 from .garbage_collection import paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
@@ -93,6 +95,7 @@ def make_subdivision(variant: Variant) -> type:
         """
 
         __doc__ = plugin_page()
+        _placement: Placement
 
         @on_shallow_stack
         @paused_collection()
@@ -138,7 +141,7 @@ def make_subdivision(variant: Variant) -> type:
                     )
             attributes = mesh_attributes(surface.cage)
             self._cage = self._cage_attributes(attributes)
-            self.control_points = kind(surface.cage.positions.ravel())
+            self.control_points = upload(kind, surface.cage.positions)
             # Of numbers: whether NumPy's memory is aligned would decide which kernel is compiled.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
             self._take_to_world(parameters.to_world)
@@ -153,12 +156,11 @@ def make_subdivision(variant: Variant) -> type:
                 has_vertex_texcoords=self._triangles.has_texcoords,
             )
             if self._exact is not None:
-                from .device_state import DeviceState
                 from .mitsuba_3_9_hook.interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
-                self._device_state = DeviceState(self._exact)
+            self._device_state = DeviceState(self) if is_jit else None
             # Values given here would be converted one by one from a list: there are none, and buffers are set later.
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
@@ -218,6 +220,8 @@ def make_subdivision(variant: Variant) -> type:
             Afterwards, call ``parameters_changed()`` of a scene that holds the shape. An update of the parameter that
             limits the tessellation does both.
             """
+            if is_recording():
+                raise RuntimeError("triangles cannot be chosen while a frozen function is recorded; choose them before")
             self._require_control_points()
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
@@ -237,19 +241,25 @@ def make_subdivision(variant: Variant) -> type:
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
             callback.put("patch_count", self._triangles.patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
+        @paused_collection()
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
             # Before anything changes.
             self._require_lengths(keys)
             if "control_points" in keys:
                 self._require_control_points()
-            to_world = checked_matrix(self.to_world) if "to_world" in keys else None
+            to_world = checked_matrix(self.to_world) if "to_world" in keys and not is_recording() else None
             scale = None
             if "displacement_scale" in keys and self._displacement is not None:
                 with errors_about("displacement_scale"):
                     scale = self._displacement.checked_scale()
             tessellation = self._tessellation
             if not _CHOOSING.isdisjoint(keys) and isinstance(tessellation, AdaptiveTessellation):
+                if is_recording():
+                    raise RuntimeError(
+                        f'parameter "{tessellation.limit}" chooses new triangles, which a frozen function cannot; '
+                        "update it outside"
+                    )
                 tessellation = tessellation.with_error(np.array(self._error).ravel())
             if "faces" in keys:
                 # Mitsuba discards its silhouette edges.
@@ -263,7 +273,7 @@ def make_subdivision(variant: Variant) -> type:
                 return
             if self._displacement is not None and scale is not None:
                 self._displacement.take_scale(scale)
-            if to_world is not None:
+            if "to_world" in keys:
                 self._take_to_world(to_world)
             if tessellation is not self._tessellation:
                 self._tessellation = tessellation
@@ -277,6 +287,11 @@ def make_subdivision(variant: Variant) -> type:
                 self._has_outlines = False
             self._set_buffers(buffers)
             is_attached = self._vertices.are_differentiable and dr.grad_enabled(buffers["vertex_positions"])
+            if is_attached and is_recording():
+                raise RuntimeError(
+                    f"{self._parameters.source}: vertices with derivatives cannot be updated in a frozen function, as "
+                    "Mitsuba reads a mesh's edges back; update them before, and freeze the picture and its gradients"
+                )
             if is_attached and self._triangles.weld_target is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
@@ -294,9 +309,13 @@ def make_subdivision(variant: Variant) -> type:
             with errors_about("control_points"):
                 require_control_points(self.control_points, self._parameters.surface.cage.vertex_count)
 
-        def _take_to_world(self, matrix: NDArray[np.float64]) -> None:
-            """Set the placement to the parameter's value, a checked matrix."""
-            self._placement = Placement.of(self.to_world, matrix, self._points.centre)
+        def _take_to_world(self, matrix: NDArray[np.float64] | None) -> None:
+            """Set the placement to the parameter's value, a checked matrix, if it can be read."""
+            centre = self._points.centre
+            if matrix is None:
+                self._placement = self._placement.recorded(self.to_world, centre)
+            else:
+                self._placement = Placement.of(self.to_world, matrix, centre)
             if is_jit:
                 # Literals would be compiled into kernels.
                 dr.make_opaque(self.to_world, self._placement.matrix, self._placement.inverse)
@@ -377,8 +396,8 @@ def make_subdivision(variant: Variant) -> type:
 
         def _turned_faces(self) -> IndexBuffer:
             """Triangles with reversed orientation."""
-            faces = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)
-            return np.ascontiguousarray(faces[:, [0, 2, 1]]).ravel()
+            turned = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)[:, [0, 2, 1]]
+            return upload(variant.UInt32, turned) if is_jit else turned.ravel()
 
         def surface_area(self) -> Float:
             """Area of the triangles, with derivatives, which Mitsuba's own method does not have."""

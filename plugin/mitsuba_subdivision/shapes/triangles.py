@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..kernels.alignment import aligned
 from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.shared import Content, Shared, SharedArray
+from ..upload import upload
 from ..variants import Variant
 from .vertices import split_weld_targets
 
@@ -58,7 +58,7 @@ class Triangles:
             triangles = triangles[:, [0, 2, 1]] if are_turned else triangles
             if not self._is_jit:
                 return SharedArray(triangles.ravel())
-            return SharedArray(self._variant.UInt32(aligned(triangles, dtype=np.uint32)))
+            return SharedArray(upload(self._variant.UInt32, triangles))
 
         return self._shared("faces", (self.layout, self._variant, are_turned, self._name), make)
 
@@ -67,8 +67,8 @@ class Triangles:
         """Element of each triangle, as floats."""
 
         def make() -> SharedArray:
-            element = aligned(self.table.element[self._kept], dtype=np.float32)
-            return SharedArray(self._variant.Float(element) if self._is_jit else element)
+            element = self.table.element[self._kept]
+            return SharedArray(upload(self._variant.Float, element) if self._is_jit else element.astype(np.float32))
 
         return self._shared("element", (self.table, self._variant, self._name), make)
 
@@ -78,7 +78,7 @@ class Triangles:
 
         def make() -> SharedArray:
             found = split_weld_targets(self.table, self._attributes)
-            return SharedArray(None if found is None else self._variant.UInt32(found))
+            return SharedArray(None if found is None else upload(self._variant.UInt32, found))
 
         return self._shared("weld_target", (self.table, self.layout, self._variant), make)
 

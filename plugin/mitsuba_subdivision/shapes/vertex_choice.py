@@ -14,6 +14,7 @@ from ..kernels.types import FloatBuffer
 from ..llvm import llvm_problem
 from ..mesh.shared import Shared
 from ..surface import LimitSurface
+from ..upload import upload
 from .vertices import Vertices, split_weld_targets
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def vertices_of(
         split = parameters.surface.attribute_table(table)
     evaluate, evaluate_tangents = _evaluators(table, parameters, float_type)
     if displacement is None:
-        return Vertices(evaluate, evaluate_tangents, copied=split.surface_vertex)
+        return Vertices(evaluate, evaluate_tangents, copied=split.surface_vertex, float_type=float_type)
     from .displaced_vertices import DeviceDisplacement, HostDisplacement, VertexLocations
 
     found = split_weld_targets(table, split)
@@ -70,7 +71,14 @@ def vertices_of(
     kept = None
     if attributes.surface_vertex is None and split.surface_vertex is not None:
         _, kept = np.unique(split.surface_vertex, return_index=True)
-    return Vertices(evaluate, evaluate_tangents, copied=split.surface_vertex, displacement=displaced, kept=kept)
+    return Vertices(
+        evaluate,
+        evaluate_tangents,
+        copied=split.surface_vertex,
+        displacement=displaced,
+        kept=kept,
+        float_type=float_type,
+    )
 
 
 def _evaluators(
@@ -87,7 +95,7 @@ def _evaluators(
     kernel_type = float_type or dr.llvm.Float
     kernel = _KERNELS.get((table, kernel_type), lambda: WeightKernel(table, kernel_type))
     if not is_jit:
-        return lambda points: kernel(kernel_type(np.array(points))), None
+        return lambda points: kernel(upload(kernel_type, np.array(points))), None
     return kernel, kernel.evaluated if dr.is_diff_v(kernel_type) else None
 
 
@@ -106,7 +114,7 @@ def _sampled(
     positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
     # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
     found = positions.ravel(), np.nan_to_num(normals).ravel()
-    return found if float_type is None else (float_type(found[0]), float_type(found[1]))
+    return found if float_type is None else (upload(float_type, found[0]), upload(float_type, found[1]))
 
 
 def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.connectivity import IntArray
+from .device_state import is_recording
 
 if TYPE_CHECKING:
     from ..kernels import EvaluatedVertices
@@ -35,6 +36,8 @@ class Vertices:
         Of the copied vertices.
     kept : (m,) int, optional
         Displaced vertices that the shape has. Exact shading needs one copy of each.
+    float_type : type, optional
+        Flat Dr.Jit array of JIT variants.
 
     Attributes
     ----------
@@ -50,9 +53,14 @@ class Vertices:
         copied: IntArray | None = None,
         displacement: DeviceDisplacement | HostDisplacement | None = None,
         kept: IntArray | None = None,
+        float_type: type | None = None,
     ) -> None:
         self._evaluate, self._evaluate_tangents = evaluate, evaluate_tangents
-        self._copies, self._displacement, self._kept = _Selection(copied), displacement, _Selection(kept)
+        self._copies, self._displacement, self._kept = (
+            _Selection(copied, float_type),
+            displacement,
+            _Selection(kept, float_type),
+        )
         self.are_differentiable = evaluate_tangents is not None
         if displacement is not None:
             self.are_differentiable = displacement.is_differentiable
@@ -93,21 +101,20 @@ class Vertices:
 class _Selection:
     """Selects rows of flat 3-vectors; all of them without an index."""
 
-    def __init__(self, index: IntArray | None) -> None:
-        self._index = index
-        self._uploaded: IndexBuffer | None = None
+    def __init__(self, index: IntArray | None, float_type: type | None) -> None:
+        self._index: IntArray | IndexBuffer | None = index
+        if index is not None and float_type is not None:
+            from ..kernels.array_types import ArrayTypes
+
+            self._types = ArrayTypes.of(float_type)
+            self._index = self._types.indices(index)
 
     def __call__(self, flat: FloatBuffer) -> FloatBuffer:
         if self._index is None:
             return flat
-        if not dr.is_jit_v(flat):
-            return flat.reshape(-1, 3)[self._index].ravel()
-        from ..kernels.array_types import ArrayTypes
-
-        types = ArrayTypes.of(type(flat))
-        if self._uploaded is None:
-            self._uploaded = types.indices(self._index)
-        return types.gathered(flat, self._uploaded)
+        if isinstance(self._index, np.ndarray):
+            return np.reshape(flat, (-1, 3))[self._index].ravel()
+        return self._types.gathered(flat, self._index)
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
@@ -122,7 +129,7 @@ def require_control_points(control_points: FloatBuffer, count: int) -> None:
         from ..kernels.apply_weights import coordinates_expected
 
         raise ValueError(coordinates_expected(len(control_points), count))
-    if dr.all(dr.isfinite(control_points)):
+    if is_recording() or dr.all(dr.isfinite(control_points)):
         return
     points = np.array(control_points)
     bad = np.unique(np.flatnonzero(~np.isfinite(points)) // 3)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, CageWarning
 from ..regression.scene import LoadedScene, load_scene
+from ..upload import upload
 from ..variants import SceneNode
 from .camera import outermost
 from .placed_points import points_at
@@ -202,6 +203,5 @@ def set_parameters(part: mi.Object, values: Mapping[str, Any]) -> None:
     parameters = mi.traverse(part)
     for name, value in values.items():
         kind = type(parameters[name])
-        flat = np.ascontiguousarray(value, np.float32).ravel() if isinstance(value, np.ndarray) else value
-        parameters[name] = kind(flat)
+        parameters[name] = upload(kind, value) if isinstance(value, np.ndarray) else kind(value)
     parameters.update()

@@ -503,8 +503,7 @@ class LimitSurface:
         float_type = float_type_of(variant_name(variant))
         cells = self._sampling_cells
         kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", cells=cells)
-        positions = self.cage.positions.ravel()
-        kernel.set_control_points(positions if float_type is float else float_type(positions))
+        kernel.set_control_points(self.cage.positions)
         return kernel
 
     def sampling(self, rate: int = 8) -> VertexTable:

@@ -1,0 +1,173 @@
+"""Updates and gradients of the shape inside and outside of functions that Dr.Jit freezes."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import Attribute, ControlCage
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.upload import upload
+
+# A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
+pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
+shadings = pytest.mark.parametrize(
+    "shading",
+    ["vertex", pytest.param("exact", marks=pytest.mark.skipif(hook_problem() is not None, reason="no exact shading"))],
+)
+KEYS = {"points": "control_points", "world": "to_world", "colour": "cage_colour", "scale": "displacement_scale"}
+# Dr.Jit adds gradients of pixels in no fixed order.
+ORDER_OF_SUMS = 1e-5
+
+
+def loaded(shading, **parameters):
+    """A scene, and its parameters, in which everything that may be updated matters."""
+    rng, cube = np.random.default_rng(0), named_cages.cube()
+    attributes = {"colour": Attribute(rng.random((8, 3)), "vertex"), "height": Attribute(rng.random((8, 1)), "vertex")}
+    cage = ControlCage(cube.positions, cube.face_vertices.reshape(-1, 4), attributes=attributes)
+    camera = mi.ScalarTransform4f().look_at([4, -6, 4], [0, 0, 0], [0, 0, 1])
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": {"type": "perspective", "to_world": camera, "film": {"type": "hdrfilm", "width": 8, "height": 8}},
+            "sky": {"type": "constant"},
+            "shape": {
+                "type": "subdivision",
+                **cage.as_properties(mi),
+                **({} if "tessellation" in parameters else {"tessellation_rate": 2}),
+                "shading": shading,
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}},
+                **parameters,
+            },
+        }
+    )
+    return scene, mi.traverse(scene)
+
+
+DISPLACED = {"displacement": "vertex_height", "displacement_scale": 0.1}
+# Kernels of displaced surfaces take longest to compile.
+NEEDED = {"scale": DISPLACED}
+
+
+def value(by, number):
+    """New values of a parameter on the device, which no kernel has compiled in."""
+    if by == "points":
+        return upload(mi.Float, named_cages.cube().positions * (1 + number / 10))
+    if by == "world":
+        return mi.Transform4f().translate([dr.opaque(mi.Float, number / 10), 0, 0])
+    if by == "colour":
+        return upload(mi.Float, np.full((8, 3), number / 5))
+    return dr.opaque(mi.Float, number / 10)
+
+
+def leaf(by, values):
+    return values.matrix if by == "world" else values
+
+
+@shadings
+@pytest.mark.parametrize("by", KEYS)
+def test_updates_inside_of_a_frozen_function_are_recorded(shading, by):
+    """Earlier, memory of NumPy that was dropped during the recording ended the process, and checks read arrays."""
+
+    def step(scene, parameters, values):
+        parameters[f"shape.{KEYS[by]}"] = values
+        parameters.update()
+        return mi.render(scene, spp=2)
+
+    expected = [np.array(step(*loaded(shading, **NEEDED.get(by, {})), value(by, number))) for number in range(1, 4)]
+    frozen, (scene, parameters) = dr.freeze(step), loaded(shading, **NEEDED.get(by, {}))
+    # Mitsuba renders what was recorded twice: once more when arrays have become the function's own.
+    for number in range(1, 3):
+        found = np.array(frozen(scene, parameters, value(by, number)))
+        np.testing.assert_array_equal(found, expected[number - 1])
+    assert frozen.n_recordings == 2
+    if by == "colour":
+        np.testing.assert_allclose(np.array(frozen(scene, parameters, value(by, 3))), expected[2], rtol=ORDER_OF_SUMS)
+        assert frozen.n_recordings == 2
+
+
+@shadings
+@pytest.mark.parametrize("by", KEYS)
+def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by):
+    def picture(scene, parameters, seed):
+        loss = dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None)
+        dr.backward(loss)
+        return dr.detach(loss)
+
+    def gradient(picture, scene, parameters, number):
+        values = value(by, number)
+        dr.enable_grad(leaf(by, values))
+        parameters[f"shape.{KEYS[by]}"] = values
+        parameters.update()
+        picture(scene, parameters, dr.opaque(mi.UInt32, number))
+        return np.array(dr.grad(leaf(by, values)))
+
+    plain, frozen = (loaded(shading, **NEEDED.get(by, {})) for _ in range(2))
+    function = dr.freeze(picture)
+    for number in range(1, 5):
+        expected = gradient(picture, *plain, number)
+        size = abs(expected).max()
+        assert size > 0
+        found = gradient(function, *frozen, number)
+        np.testing.assert_allclose(found, expected, atol=ORDER_OF_SUMS * size)
+    assert function.n_recordings == 2
+
+
+@shadings
+def test_steps_of_colours_are_frozen_whole(shading):
+    def step(scene, parameters, colours, seed):
+        dr.enable_grad(colours)
+        parameters["shape.cage_colour"] = colours
+        parameters.update()
+        dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None))
+        return dr.grad(colours)
+
+    plain, frozen, function = loaded(shading), loaded(shading), dr.freeze(step)
+    for number in range(1, 5):
+        seed = dr.opaque(mi.UInt32, number)
+        expected = np.array(step(*plain, value("colour", number), seed))
+        found = np.array(function(*frozen, value("colour", number), seed))
+        np.testing.assert_allclose(found, expected, atol=ORDER_OF_SUMS * abs(expected).max())
+    assert function.n_recordings == 2
+
+
+def test_what_a_frozen_function_cannot_do_is_told():
+    """Mitsuba's own meshes cannot, either."""
+
+    def step(scene, parameters, key, values):
+        dr.enable_grad(values)
+        parameters[key] = values
+        parameters.update()
+        return mi.render(scene, spp=1)
+
+    scene, parameters = loaded("vertex")
+    with pytest.raises(RuntimeError, match="recording") as error:
+        dr.freeze(step)(scene, parameters, "shape.control_points", value("points", 1))
+    assert "update them before" in str(error.value.__cause__)
+    scene, parameters = loaded("vertex", tessellation="adaptive", chord_error=0.1)
+    with pytest.raises(RuntimeError, match="recording") as error:
+        dr.freeze(step)(scene, parameters, "shape.chord_error", dr.opaque(mi.Float, 0.2))
+    assert "chord_error" in str(error.value.__cause__)
+
+
+def test_scales_and_heights_of_frozen_functions_bound_later_triangles():
+    """Python does not run when a frozen function is repeated: bounds read what is on the device."""
+
+    def step(scene, parameters, scale):
+        parameters["shape.displacement_scale"] = scale
+        parameters.update()
+        return mi.render(scene, spp=1)
+
+    scene, parameters = loaded("vertex", tessellation="adaptive", chord_error=0.01, **DISPLACED)
+    frozen, counts = dr.freeze(step), []
+    for scale in (0.1, 0.11, 0.8, 0.0):
+        frozen(scene, parameters, dr.opaque(mi.Float, scale))
+        shape = scene.shapes()[0]
+        shape.retessellate()
+        counts.append(shape.face_count())
+    assert frozen.n_recordings <= 3
+    expected, _ = loaded(
+        "vertex", tessellation="adaptive", chord_error=0.01, **{**DISPLACED, "displacement_scale": 0.0}
+    )
+    assert counts[-1] == expected.shapes()[0].face_count() < counts[-2]
