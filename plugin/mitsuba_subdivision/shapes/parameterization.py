@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..kernels.types import Mask, Vector2
+from ..upload import upload
 from ..variants import Variant
 
 if TYPE_CHECKING:
@@ -34,9 +35,8 @@ class Parameterization:
         uv = exact.texcoords_of_corners(shape.face_count())
         mesh = variant.Mesh("texture coordinates", vertex_count=len(uv), face_count=len(uv) // 3)
         parameters = mi.traverse(mesh)
-        positions = np.pad(uv, ((0, 0), (0, 1))).astype(np.float32).ravel()
-        parameters["vertex_positions"] = type(parameters["vertex_positions"])(positions)
-        parameters["faces"] = type(parameters["faces"])(np.arange(len(uv), dtype=np.uint32))
+        for name, values in (("vertex_positions", np.pad(uv, ((0, 0), (0, 1)))), ("faces", np.arange(len(uv)))):
+            parameters[name] = upload(type(parameters[name]), values)
         parameters.update()
         self._scene = mi.load_dict({"type": "scene", "mesh": mesh})
 

@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..kernels.array_types import ArrayTypes
 from ..kernels.types import Float, FloatBuffer, Index, Mask, Value
 from ..mesh.shared import Shared
+from ..upload import upload
 from ..variants import Variant
 
 TABLE = "data/srgb.coeff"
@@ -58,8 +58,7 @@ class SpectralUpsampling:
         content = Path(str(file_resolver().resolve(TABLE))).read_bytes()
         self._resolution = size = int(np.frombuffer(content, "<u4", 1, _MARK)[0])
         values = np.frombuffer(content, "<f4", size + 9 * size**3, _MARK + _WORD)
-        types = ArrayTypes.of(variant.Float)
-        self._levels, self._table = (types.owned(types.floats(each)) for each in (values[:size], values[size:]))
+        self._levels, self._table = (upload(variant.Float, each) for each in (values[:size], values[size:]))
 
     def stored(self, colors: FloatBuffer) -> FloatBuffer:
         """Coefficients of a mesh's buffer of colours, both flat."""
