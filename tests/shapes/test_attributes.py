@@ -11,6 +11,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.cage.named_cages import cube, torus
+from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import tagged
 
@@ -348,6 +349,25 @@ def test_spectra_have_derivatives_by_colours(tmp_path, shading):
         step = 1e-3 * np.eye(3)[i]
         change = np.array(spectrum(given + step) - spectrum(given - step)).ravel() @ [1, 2, 3, 4] / 2e-3
         np.testing.assert_allclose(gradient[i], change, rtol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["vertex_displayColor", "face_color"])
+@pytest.mark.usefixtures("variants_all")
+def test_meshes_of_polygons_have_spectra_as_well(name):
+    colors = np.array([[0.2, 0.5, 0.1], [0.2, 0.5, 0.1], [0.2, 0.5, 0.1]])[: 1 if name.startswith("face") else 3]
+    positions = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    mesh = mitsuba_mesh("triangle", np.array([[0, 1, 2]]), {"vertex_positions": positions, name: colors})
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p = mi.Point3f(0, 0, 0)
+    expected = [0.2, 0.5, 0.1]
+    if mi.is_spectral:
+        si.wavelengths = [450, 500, 550, 600]
+        expected = mi.load_dict({"type": "srgb", "color": expected}).eval(si)
+    elif mi.is_monochromatic:
+        expected = mi.luminance(mi.Color3f(expected))
+    np.testing.assert_allclose(
+        np.array(mesh.eval_attribute(name, si)).ravel(), np.array(expected).ravel(), atol=SPECTRUM
+    )
 
 
 @exact
