@@ -156,10 +156,19 @@ def test_a_changed_picture_is_saved_with_its_scene(tmp_path, texture):
     (tmp_path / "cube.obj").write_text("mtllib a.mtl\n" + (tmp_path / "cube.obj").read_text())
     scene = studio_scene(tmp_path / "cube.obj", size=(16, 12), spp=16, rate=2, shading="vertex")
     save_scene(scene, tmp_path / "saved.xml")
-    images = [
-        np.array(mi.render(each, spp=16)) for each in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))
-    ]
-    np.testing.assert_allclose(images[0], images[1], atol=1e-3)
+    found = [mi.traverse(each) for each in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))]
+    for name in ("data", "to_uv"):
+        values = [
+            np.array(getattr(each, "matrix", each))
+            for parameters in found
+            for key, each in parameters
+            if key.endswith(f"base_color.{name}")
+        ]
+        assert len(values) == 2
+        np.testing.assert_allclose(values[1], values[0], atol=1e-3)
+    # 0.5 + 0.25 c, in half floats.
+    data = np.sort(np.array(next(each for key, each in found[1] if key.endswith("base_color.data"))), axis=None)
+    assert data[[0, -1]] == pytest.approx([0.5, 0.75], abs=1e-3)
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
