@@ -31,6 +31,7 @@ import mitsuba_subdivision as msub
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.ball_fits import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
 from mitsuba_subdivision.fit.triangle_samples import triangle_samples
@@ -244,8 +245,8 @@ def mesh_shape(mesh: Triangles) -> mi.Mesh:
     props["bsdf"] = mi.load_dict(BSDF)
     shape = mi.Mesh("mesh", len(mesh.positions), len(mesh.triangles), props=props, has_vertex_normals=True)
     params = mi.traverse(shape)
-    params["vertex_positions"] = mi.Float(mesh.positions.ravel())
-    params["faces"] = mi.UInt32(mesh.triangles.ravel().astype(np.uint32))
+    params["vertex_positions"] = upload(mi.Float, mesh.positions)
+    params["faces"] = upload(mi.UInt32, mesh.triangles)
     params.update()
     return shape
 
@@ -301,7 +302,7 @@ def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int,
     start = Triangles(ball.positions, vertex_normals(ball.positions, ball.triangles), ball.triangles)
     scene = mi.load_dict({"type": "scene", **STAGE, "mesh": mesh_shape(start)})
     params, key = mi.traverse(scene), "mesh.vertex_positions"
-    targets = [mi.TensorXf(view.picture) for view in views]
+    targets = [upload(mi.TensorXf, view.picture) for view in views]
     cameras = [mi.load_dict(view.sensor) for view in views]
     for camera in cameras:
         camera.sampler().set_sample_count(SPP)

@@ -6,6 +6,7 @@ compile as those of users do.
 
 import ctypes
 import os
+import sys
 from pathlib import Path
 
 from mitsuba_subdivision.llvm import select_llvm
@@ -21,3 +22,8 @@ if library.path and (library.version or 0) >= LLVM:
     options = (b"pytest", b"-opt-bisect-limit=0", b"-opt-bisect-verbose=0", b"-optimize-regalloc=false")
     arguments = (ctypes.c_char_p * len(options))(*options)
     ctypes.CDLL(library.path).LLVMParseCommandLineOptions(len(options), arguments, None)
+
+# `.ci/run` runs some tests again, in which reading beyond an array ends the process.
+if os.environ.get("GUARDED_ARRAYS"):
+    sys.path.append(str(Path(__file__).parent))
+    import guarded_arrays  # noqa: F401

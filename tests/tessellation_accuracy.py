@@ -22,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor, UniformGrid, VertexTable
 from scipy.spatial import cKDTree
 
@@ -97,11 +98,11 @@ def chord_error(surface: LimitSurface, table: VertexTable) -> float:
         points = (weights @ positions[table.triangles[own]]).reshape(-1, 3)
         starts = (weights @ uv[own]).reshape(-1, 2)
         elements, corners = (
-            dr.llvm.ad.UInt32(np.repeat(each, len(weights)).astype(np.uint32))
+            upload(dr.llvm.ad.UInt32, np.repeat(each, len(weights)))
             for each in (element[own], corner[own] - first[own])
         )
-        u, v = (dr.llvm.ad.Float64(np.ascontiguousarray(each)) for each in starts.T)
-        p = kernel.types.vector3(*(dr.llvm.ad.Float64(np.ascontiguousarray(each)) for each in points.T))
+        u, v = (upload(dr.llvm.ad.Float64, each) for each in starts.T)
+        p = kernel.types.vector3(*(upload(dr.llvm.ad.Float64, each) for each in points.T))
         nearest = kernel.closest(p, elements, (u, v), corners)
         found = max(found, float(np.max(np.array(nearest.distance))))
     return found
@@ -173,7 +174,7 @@ class Outlines:
         scene = mi.load_dict({"type": "scene", "mesh": mesh_of(positions, triangles)})
         is_free = np.full(len(points), False)
         for side in (BESIDE * self.pixel, -BESIDE * self.pixel):
-            directions = mi.Vector3f(*(mi.Float(each) for each in (seen + side * beside).T.astype(np.float32)))
+            directions = mi.Vector3f(*(upload(mi.Float, each) for each in (seen + side * beside).T.astype(np.float32)))
             is_free |= ~np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*self.eye.tolist()), directions)))
         forward = self.target - self.eye
         right = np.cross(forward, [0, 0, 1])
@@ -186,8 +187,8 @@ def mesh_of(positions: np.ndarray, triangles: np.ndarray) -> mi.Mesh:
     """A mesh of Mitsuba's own."""
     mesh = mi.Mesh("outline", len(positions), len(triangles))
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = mi.Float(positions.ravel().astype(np.float32))
-    parameters["faces"] = mi.UInt32(triangles.ravel().astype(np.uint32))
+    parameters["vertex_positions"] = upload(mi.Float, positions)
+    parameters["faces"] = upload(mi.UInt32, triangles)
     parameters.update()
     return mesh
 

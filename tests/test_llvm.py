@@ -239,6 +239,34 @@ def test_the_shape_is_an_error_where_its_kernels_would_abort():
 
 
 @pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+@pytest.mark.parametrize(
+    "code",
+    [
+        "LimitSurface(cube()).on_device('llvm_ad_rgb')",
+        "upload(mi.Float, [0])",
+        "film = {'type': 'hdrfilm', 'width': 4, 'height': 4};"
+        "fit.CageFit(cube(), [fit.View({'type': 'perspective', 'film': film}, np.zeros((4, 4, 3)))], {})",
+        "usd_scene('none.usda', mi)",
+        "set_variant('llvm_mono')",
+    ],
+    ids=["on_device", "device_arrays", "fit", "usd_scene", "commands"],
+)
+def test_what_runs_kernels_is_an_error_where_they_would_abort(code):
+    """Earlier, the first evaluation of `on_device` ended the process."""
+    done = run(
+        "import mitsuba as mi, numpy as np, os; del os.environ['DRJIT_LIBLLVM_PATH']\n"
+        "from mitsuba_subdivision import LimitSurface, usd_scene\n"
+        "from mitsuba_subdivision.cage.named_cages import cube\n"
+        "from mitsuba_subdivision.device_arrays import upload; from mitsuba_subdivision.variants import set_variant\n"
+        f"mi.set_variant('llvm_ad_rgb'); from mitsuba_subdivision import fit\n{code}",
+        DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]),
+    )
+    assert done.returncode == 1
+    assert "RuntimeError: Dr.Jit has loaded LLVM" in done.stderr
+    assert "import mitsuba_subdivision before mitsuba and drjit" in done.stderr
+
+
+@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
 def test_a_library_that_aborts_does_not_matter_to_scalar_variants():
     done = run(
         "import mitsuba_subdivision, mitsuba as mi; mi.set_variant('scalar_rgb')",

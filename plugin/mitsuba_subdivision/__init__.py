@@ -23,6 +23,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from . import fit as fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
+    from .device_arrays import upload
     from .evaluation.limit_stencil import limit_stencil
     from .evaluation.scheme_check import register_scheme
     from .examples import example_file
@@ -64,6 +65,7 @@ __all__ = [
     "register_variant",
     "render_denoised",
     "studio_scene",
+    "upload",
     "usd_scene",
 ]
 
@@ -92,6 +94,7 @@ _MODULES = {
     "register_scheme": "evaluation.scheme_check",
     "render_denoised": "studio",
     "studio_scene": "studio",
+    "upload": "device_arrays",
     "usd_scene": "usd.scene",
 }
 

@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from .llvm import LlvmChoice, select_llvm
+from .llvm import LlvmChoice, lowest_version, select_llvm, version_without_package
 
 # Variants that are tried, and whether a machine is expected to have what they need.
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
@@ -73,6 +73,8 @@ class Diagnosis:
         Operating system and processor.
     llvm : LlvmChoice
         Which LLVM library this package has chosen, and why.
+    late_llvm : int or None
+        Major version of the library that programs get which import Mitsuba first. None if there is none.
     variants : dict of str to VariantReport
     extras : dict of str to dict of str to str or None
         Versions of the packages of each extra; None for missing ones.
@@ -81,6 +83,7 @@ class Diagnosis:
     versions: dict[str, str | None]
     machine: str
     llvm: LlvmChoice
+    late_llvm: int | None
     variants: dict[str, VariantReport]
     extras: dict[str, dict[str, str | None]] = field(default_factory=dict)
 
@@ -99,6 +102,10 @@ class Diagnosis:
         lines += [(name, version or "MISSING") for name, version in self.versions.items()]
         version = f", version {llvm.version}" if llvm.version else ""
         lines.append(("LLVM", f"{llvm.path or 'none chosen'}{version} ({llvm.reason})"))
+        late = f"version {self.late_llvm}" if self.late_llvm else "none"
+        if self.late_llvm and self.late_llvm < lowest_version():
+            late += ", whose kernels end the process: import mitsuba_subdivision before mitsuba and drjit"
+        lines.append(("LLVM, Mitsuba first", late))
         for name, found in self.variants.items():
             if found.works:
                 exact = "works" if found.exact_shading else f"does not work: {found.exact_problem}"
@@ -132,7 +139,7 @@ def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
 
     versions = {DISTRIBUTION: __version__, "Python": platform.python_version(), **{n: _version(n) for n in PACKAGES}}
     tried = {name: try_variant(name, needed) for name, needed in (VARIANTS if variants is None else variants).items()}
-    return Diagnosis(versions, platform.platform(), select_llvm(), tried, _extras())
+    return Diagnosis(versions, platform.platform(), select_llvm(), version_without_package(), tried, _extras())
 
 
 def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> VariantReport:

@@ -13,6 +13,7 @@ import os
 import platform
 import re
 import site
+import subprocess
 import sys
 import warnings
 from collections.abc import Iterable
@@ -131,12 +132,39 @@ def llvm_problem() -> str | None:
     return f"{why} ({choice.reason}): {INSTALL_HINT}"
 
 
+@functools.cache
+def require_llvm() -> None:
+    """Check that kernels of LLVM variants run: with a library that is too old, the first one ends the process.
+
+    Raises
+    ------
+    RuntimeError
+        If they do not; the message is that of `llvm_problem`.
+    """
+    problem = llvm_problem()
+    if problem:
+        raise RuntimeError(problem)
+
+
 def warn_if_unusable() -> None:
     """Warn if Dr.Jit has loaded an LLVM library that aborts the process. Imports Dr.Jit."""
     if loaded_version() is not None:
         problem = llvm_problem()
         if problem:
             warnings.warn(problem, RuntimeWarning, stacklevel=3)
+
+
+def version_without_package() -> int | None:
+    """Major version of the library that Dr.Jit loads in a program that imports Mitsuba before this package.
+
+    In a process of its own. None if Dr.Jit finds no library.
+    """
+    environment = dict(os.environ)
+    if not select_llvm().reason.startswith(ENVIRONMENT_VARIABLE):
+        environment.pop(ENVIRONMENT_VARIABLE, None)
+    code = "import drjit as dr; print(dr.detail.llvm_version()[0] if dr.has_backend(dr.JitBackend.LLVM) else 0)"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    return int(done.stdout.strip() or 0) or None
 
 
 def best_variant() -> str:

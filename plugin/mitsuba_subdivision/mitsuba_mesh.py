@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .upload import upload
+from .device_arrays import upload
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, TypeAlias
 
+from .llvm import require_llvm
+
 # The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
 Variant: TypeAlias = Any
 # A scene or an entry of one, as `mi.load_dict` takes it.
@@ -47,6 +49,8 @@ def set_variant(name: str) -> None:
     import drjit as dr
     import mitsuba
 
+    if name.startswith("llvm"):
+        require_llvm()
     mitsuba.set_variant(name)
     dr.set_thread_count(max(dr.thread_count(), OPENEXR_THREADS))
 
@@ -61,6 +65,8 @@ def variant_set(mi: ModuleType | str) -> Iterator[ModuleType]:
 
     variant_module(mi)
     before, name = mitsuba.variant(), variant_name(mi)
+    if name.startswith("llvm"):
+        require_llvm()
     if before != name:
         mitsuba.set_variant(name)
     try:

@@ -91,7 +91,7 @@ def stages(obj, binary, rate, repeats, _variant):
         kernel = WeightKernel(table, Float)
         points = Float(cage.positions.ravel())
         dr.eval(points)
-        clock.lap("upload")
+        clock.lap("device_arrays")
         found = kernel(points)
         dr.eval(found)
         dr.sync_thread()

@@ -26,6 +26,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from mitsuba_subdivision.device_arrays import upload
 
 ROOT = Path(__file__).parents[2]
 VARIANT = "llvm_ad_rgb"
@@ -222,7 +223,7 @@ def gradients(shading, repeats, cage):
     (key,) = (key for key in parameters.keys() if key.endswith("control_points"))  # noqa: SIM118
     dr.sync_thread()
     laps.end("load")
-    start = type(parameters[key])(parameters[key])
+    start = upload(type(parameters[key]), parameters[key])
     for step in range(repeats + 1):
         moved = start + 1e-4 * step
         dr.enable_grad(moved)

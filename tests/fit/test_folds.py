@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.fit.folds import LEAST_COSINE, folds
 
 # Of sums of float32 numbers.
@@ -30,7 +31,7 @@ def book(angle, pages=((0, 1, 2, 3), (1, 0, 4, 5))):
 
 def value(cage, points=None):
     points = cage.positions if points is None else points
-    return float(np.array(folds(cage)(mi.Float(np.ravel(points)))).ravel()[0])
+    return float(np.array(folds(cage)(upload(mi.Float, points))).ravel()[0])
 
 
 @pytest.mark.core
@@ -54,7 +55,7 @@ def test_size_and_cages_without_folds_and_edges_do_not_count():
 def test_gradients_are_those_of_differences(np_rng):
     cage = book(2.4)
     points = cage.positions + 0.1 * np_rng.standard_normal(cage.positions.shape)
-    flat = mi.Float(points.ravel())
+    flat = upload(mi.Float, points)
     dr.enable_grad(flat)
     dr.backward(folds(cage)(flat))
     found = np.array(dr.grad(flat))
@@ -69,7 +70,7 @@ def test_gradients_are_those_of_differences(np_rng):
 def test_a_folded_cage_opens():
     """Where nothing else holds it."""
     cage = book(2.9)
-    points = mi.Float(cage.positions.ravel())
+    points = upload(mi.Float, cage.positions)
     optimizer = mi.ad.Adam(lr=0.05, params={"points": points})
     energy = folds(cage)
     for _ in range(40):

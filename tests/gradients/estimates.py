@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.device_arrays import upload
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Pictures:
 
     def __init__(self, scene, start, along, spp, seeds=6):
         self.scene, self.parameters = scene, mi.traverse(scene)
-        self.start, self.along = ({k: mi.Float(np.ravel(v)) for k, v in each.items()} for each in (start, along))
+        self.start, self.along = ({k: upload(mi.Float, v) for k, v in each.items()} for each in (start, along))
         self.spp, self.seeds = spp, range(seeds)
 
     def mean(self, step, seed):
@@ -90,13 +91,13 @@ def gradients(scene, key, spp, seeds=6, kept=()):
     parameters = mi.traverse(scene)
     start, found = mi.Float(parameters[key]), []
     # Copies: what is the same array is no assignment.
-    others = {name: np.array(parameters[name]) for name in kept}
+    others = {name: dr.opaque(parameters[name]) for name in kept}
     for seed in range(seeds):
         points = mi.Float(start)
         dr.enable_grad(points)
         parameters[key] = points
         for name, values in others.items():
-            parameters[name] = mi.Float(values)
+            parameters[name] = dr.opaque(values)
         parameters.update()
         dr.backward(dr.mean(mi.render(scene, parameters, spp=spp, seed=seed), axis=None))
         found.append(np.array(dr.grad(points), dtype=np.float64).reshape(-1, 3))

@@ -24,7 +24,7 @@ LEFT_OUT, MOST_LEVELS = 1e-16, 200
 
 def of_triangles(types, positions, triangles):
     """Area of triangles, and volume and moments of what they bound, as sums of flat Dr.Jit arrays."""
-    a, b, c = (dr.gather(types.vector3, positions, types.index(triangles[:, i])) for i in range(3))
+    a, b, c = (dr.gather(types.vector3, positions, types.indices(triangles[:, i])) for i in range(3))
     area = dr.sum(dr.norm(dr.cross(b - a, c - a))) / 2
     volume = dr.dot(a, dr.cross(b, c)) / 6
     total = a + b + c
@@ -44,9 +44,9 @@ def derivatives_of(surface, directions, rate, types):
     kernel = WeightKernel(table, types.float)
     derivatives = []
     for direction in directions:
-        points = types.float(surface.cage.positions.ravel())
+        points = types.floats(surface.cage.positions.ravel())
         dr.enable_grad(points)
-        dr.set_grad(points, types.float(direction.ravel()))
+        dr.set_grad(points, types.floats(direction.ravel()))
         found = of_triangles(types, kernel(points)[0], table.triangles)
         dr.forward_to(found)
         derivatives.append(joined(dr.grad(found)))

@@ -134,7 +134,7 @@ def test_the_derivative_of_volume_by_the_placement_is_that_of_the_determinant(su
     arrays = sys.modules["drjit.llvm.ad"]
     to_world = arrays.Matrix4f64(matrix)
     dr.enable_grad(to_world)
-    vertices = WeightKernel(table, types.float)(types.float(surface.cage.positions.ravel()))
+    vertices = WeightKernel(table, types.float)(types.floats(surface.cage.positions.ravel()))
     positions, _ = placed(*vertices, to_world, types.vector3)
     found = solids.of_triangles(types, positions, table.triangles)
     volume = found["volume"][0]
@@ -162,7 +162,7 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     fields["right"] = (right, 3)
     exact = surface.stiffness(solids.STIFFNESS_ORDER) @ positions
     kernel, table = WeightKernel(surface.sampling(3), types.float), surface.sampling(3)
-    points = types.float(positions.ravel())
+    points = types.floats(positions.ravel())
     dr.enable_grad(points)
     dr.backward(solids.of_triangles(types, kernel(points)[0], table.triangles)["area"][0])
     found = np.array(dr.grad(points)).reshape(-1, 3)

@@ -8,6 +8,7 @@ from gradients.estimates import Estimate, Pictures, along, gradients
 from gradients.outlines import RATE, SURFACES, change, covered, properties
 from gradients.scenes import POINTS, outline
 from gradients.surfaces import motions
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -72,7 +73,7 @@ def test_outlines_are_the_same_when_the_same_faces_are_set_again():
     scene = outline(properties(surface))
     before = gradients(scene, POINTS, 1, 2)
     parameters = mi.traverse(scene)
-    parameters["shape.faces"] = mi.UInt32(np.array(parameters["shape.faces"]))
+    parameters["shape.faces"] = upload(mi.UInt32, np.array(parameters["shape.faces"]))
     parameters.update()
     after = gradients(scene, POINTS, 1, 2)
     np.testing.assert_allclose(after, before, rtol=0, atol=SUMS * np.abs(before).max())

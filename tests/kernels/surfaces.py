@@ -10,6 +10,7 @@ import drjit as dr
 import numpy as np
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.device_arrays import upload
 from patches.closed_cages import bumpy, cage_of, mixed_torus, trapezohedron, triangulated
 from peers.fidelity_cages import book
 from reference.refined_cages import half_disc, sheet, spokes, tagged, upper_half
@@ -104,7 +105,7 @@ def random_locations(surface, rng, count, deepest=23):
 
 def on_device(types, element, uv, corner):
     """The arguments of `SurfaceKernel.evaluate`."""
-    return types.index(element), types.vector2(*map(types.float, uv.T)), types.index(corner)
+    return types.indices(element), upload(types.vector2, uv), types.indices(corner)
 
 
 def vectors(found):

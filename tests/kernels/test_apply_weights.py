@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import WeightKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import bumpy
@@ -63,7 +64,7 @@ def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     copies = np.flatnonzero(table.weld_target != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
     assert len(copies) == 16
-    positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(float_type(cage.positions.ravel())))
+    positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(upload(float_type, cage.positions)))
     assert np.array_equal(positions[copies], positions[table.weld_target[copies]])
     assert ((normals[copies] * normals[table.weld_target[copies]]).sum(axis=1) < 0.9).all()
     assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
@@ -74,9 +75,9 @@ def vectors(flat):
 
 
 def forward_derivatives(kernel, float_type, positions, direction):
-    points = float_type(positions.ravel())
+    points = upload(float_type, positions)
     dr.enable_grad(points)
-    dr.set_grad(points, float_type(direction.ravel()))
+    dr.set_grad(points, upload(float_type, direction))
     outputs = kernel(points)
     dr.enqueue(dr.ADMode.Forward, points)
     dr.traverse(dr.ADMode.Forward)
@@ -87,7 +88,7 @@ def forward_derivatives(kernel, float_type, positions, direction):
 @pytest.mark.parametrize("rate", [1, 5])
 def test_equals_sampling_table(surface, rate, float_type):
     table = surface.sampling(rate)
-    positions, normals = WeightKernel(table, float_type)(float_type(surface.cage.positions.ravel()))
+    positions, normals = WeightKernel(table, float_type)(upload(float_type, surface.cage.positions))
     expected = table.apply(surface.cage.positions)
     np.testing.assert_allclose(vectors(positions), expected[0], atol=tolerance(float_type))
     # Normals lose the digits that cancel in the cross product of two nearly parallel tangents.
@@ -99,8 +100,8 @@ def test_far_from_the_origin_loses_only_the_rounding_of_points(surface, float_ty
     # Exact in float32, like the control points rounded to 2**-10.
     points = np.round(surface.cage.positions * 1024) / 1024
     shift = np.array([1024.0, -2048.0, 512.0])
-    near = vectors(kernel(float_type(points.ravel()))[1])
-    far = vectors(kernel(float_type((points + shift).ravel()))[1])
+    near = vectors(kernel(upload(float_type, points))[1])
+    far = vectors(kernel(upload(float_type, points + shift))[1])
     np.testing.assert_array_equal(near, far)
 
 
@@ -120,12 +121,12 @@ def test_classes_share_kernels(surface, kernels, float_type):
         sizes = {-(-stencils.controls.shape[1] // 4) for stencils in general}
         expected = 1 + (len(general) < len(table.classes)) + len(sizes)
     kernel = WeightKernel(table, float_type)
-    assert len(launched(kernel, float_type(surface.cage.positions.ravel()))) == expected
+    assert len(launched(kernel, upload(float_type, surface.cage.positions))) == expected
 
 
 def test_kernels_do_not_depend_on_where_arrays_lie(surface, float_type):
     """Dr.Jit takes NumPy's memory as it lies; else shapes of the same kind would be compiled again and again."""
-    points = float_type(surface.cage.positions.ravel())
+    points = upload(float_type, surface.cage.positions)
     found, kept = set(), []
     for count in range(5):
         # What lies between them moves the arrays of the next table.
@@ -136,7 +137,7 @@ def test_kernels_do_not_depend_on_where_arrays_lie(surface, float_type):
 
 def test_values_are_the_same_with_and_without_derivatives(surface, float_type):
     kernel = WeightKernel(surface.sampling(3), float_type)
-    points = float_type(surface.cage.positions.ravel())
+    points = upload(float_type, surface.cage.positions)
     without = kernel(points)
     dr.enable_grad(points)
     for one, other in zip(without, kernel(points), strict=True):
@@ -150,10 +151,10 @@ def test_forward_and_backward_derivatives_agree(surface, float_type, np_rng):
     forward = forward_derivatives(kernel, float_type, surface.cage.positions, direction)
     seeds = [np_rng.normal(size=f.shape) for f in forward]
 
-    points = float_type(flat)
+    points = upload(float_type, flat)
     dr.enable_grad(points)
     positions, normals = kernel(points)
-    dr.backward(dr.dot(positions, float_type(seeds[0].ravel())) + dr.dot(normals, float_type(seeds[1].ravel())))
+    dr.backward(dr.dot(positions, upload(float_type, seeds[0])) + dr.dot(normals, upload(float_type, seeds[1])))
     backward = np.array(dr.grad(points))
 
     expected = sum((f * s).sum() for f, s in zip(forward, seeds, strict=True))
@@ -188,8 +189,8 @@ def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
 def test_normals_do_not_depend_on_scale(surface, float_type, scale):
     kernel = WeightKernel(surface.sampling(3), float_type)
-    normals = vectors(kernel(float_type(surface.cage.positions.ravel()))[1])
-    scaled = vectors(kernel(float_type((scale * surface.cage.positions).ravel()))[1])
+    normals = vectors(kernel(upload(float_type, surface.cage.positions))[1])
+    scaled = vectors(kernel(upload(float_type, scale * surface.cage.positions))[1])
     np.testing.assert_allclose(scaled, normals, atol=50 * tolerance(float_type))
 
 
@@ -210,4 +211,4 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     gc.collect()
     gc.unfreeze()
     assert [found() for found in seen] == [None] * len(seen)
-    dr.eval(kernel(float_type(surface.cage.positions.ravel())))
+    dr.eval(kernel(upload(float_type, surface.cage.positions)))

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 
 ROW_COUNT = 6
@@ -21,7 +22,7 @@ def test_a_row_is_where_it_was_written(size, variants_all_ad_rgb, np_rng):  # no
     types = ArrayTypes.of(mi.Float)
     buffer, rows = buffer_and_rows(size, types)
     index, active = np_rng.integers(0, ROW_COUNT, 20), np_rng.random(20) < 0.7
-    found = types.row(buffer, size, types.index(index.astype(np.uint32)), mi.Mask(active))
+    found = types.row(buffer, size, types.indices(index), upload(mi.Mask, active))
     np.testing.assert_array_equal(np.array(found).T, rows[index] * active[:, None])
 
 
@@ -39,8 +40,8 @@ def test_derivatives_by_a_row_return_to_it(size, variants_all_ad_rgb, np_rng):  
     buffer, _ = buffer_and_rows(size, types)
     dr.enable_grad(buffer)
     index, weights = np_rng.integers(0, ROW_COUNT, 20), np_rng.integers(1, 5, (size, 20)).astype(np.float32)
-    found = types.row(buffer, size, types.index(index.astype(np.uint32)))
-    dr.backward(dr.sum(sum(number * mi.Float(weight) for number, weight in zip(found, weights, strict=True))))
+    found = types.row(buffer, size, types.indices(index))
+    dr.backward(dr.sum(sum(number * upload(mi.Float, weight) for number, weight in zip(found, weights, strict=True))))
     expected = np.zeros((ROW_COUNT, size))
     np.add.at(expected, index, weights.T)
     np.testing.assert_array_equal(np.array(dr.grad(buffer)).reshape(ROW_COUNT, size), expected)

@@ -80,7 +80,7 @@ def evaluated(surface, name, variant, element, uv, corner):
     """``(s, k)`` value, and derivatives by u and v."""
     kernel = kernel_of(surface, variant)
     types, channel = kernel.types, channel_kernel(surface.channel(name), kernel.walk, float_type_of(variant))
-    found = channel(kernel.walk.at(types.index(element), *map(types.float, uv.T), types.index(corner)))
+    found = channel(kernel.walk.at(types.indices(element), *map(types.floats, uv.T), types.indices(corner)))
     dr.eval(found)
     return [np.array(each).astype(np.float64).reshape(-1, len(element)).T for each in found]
 

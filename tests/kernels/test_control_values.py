@@ -6,6 +6,7 @@ from functools import partial
 import drjit as dr
 import numpy as np
 import pytest
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
 from mitsuba_subdivision.llvm import llvm_problem
@@ -43,16 +44,16 @@ def test_weighted_values_and_derivatives_are_products(float_type, weights, size,
     values, change = np_rng.random((2, COLUMNS, size))
     gradient = np_rng.random((ROWS, size))
     for is_forward in (False, True):
-        flat = float_type(values.ravel())
+        flat = upload(float_type, values)
         dr.enable_grad(flat)
         found = weighted(flat, size)
         np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=atol)
         if is_forward:
-            dr.set_grad(flat, float_type(change.ravel()))
+            dr.set_grad(flat, upload(float_type, change))
             dr.forward_to(found)
             np.testing.assert_allclose(np.array(dr.grad(found)), (weights @ change).ravel(), rtol=0, atol=atol)
         else:
-            dr.backward(dr.sum(found * float_type(gradient.ravel())))
+            dr.backward(dr.sum(found * upload(float_type, gradient)))
             expected = (weights.T @ gradient).ravel()
             np.testing.assert_allclose(np.array(dr.grad(flat)), expected, rtol=0, atol=10 * atol)
 
@@ -63,7 +64,7 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights
     first, second = np_rng.random((2, COLUMNS, 3))
     values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
     flat = values.flat
-    given = float_type(second.ravel())
+    given = upload(float_type, second)
     dr.enable_grad(given)
     assert not values.are_moving
     values.set(given)
@@ -88,7 +89,7 @@ def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, 
     assert first.flat is not second.flat
     assert first.flat.index == second.flat.index
     assert len({each.flat.index for each in (first, other, apart)}) == 3
-    first.set(float_type(np.ravel(2 * values)))
+    first.set(upload(float_type, 2 * values))
     np.testing.assert_array_equal(second.flat, kept)
     np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding(float_type))
 

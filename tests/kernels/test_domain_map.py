@@ -27,7 +27,7 @@ def types(request):
 def on_device(function, types, *numbers):
     """Results of a function for each number, one after the other in a scalar variant."""
     if types.is_jit:
-        return [np.array(each) for each in function(*map(types.float, numbers))]
+        return [np.array(each) for each in function(*map(types.floats, numbers))]
     return [np.array(each) for each in zip(*(function(*row) for row in zip(*numbers, strict=True)), strict=True)]
 
 

@@ -42,7 +42,7 @@ def beside(domain, side, t, depth):
 
 
 def locations(types, half_edge, uv):
-    return Location(types.index(half_edge), types.float(uv[:, 0]), types.float(uv[:, 1]))
+    return Location(types.indices(half_edge), types.floats(uv[:, 0]), types.floats(uv[:, 1]))
 
 
 def carried(kernel, location):

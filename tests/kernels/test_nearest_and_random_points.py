@@ -6,6 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, on_device, surface_named, vectors
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.patches import PieceTable
 
@@ -54,7 +55,7 @@ def points_near(surface, count, np_rng, away=0.03):
 
 
 def device_points(types, points):
-    return types.vector3(*map(types.float, points.T))
+    return upload(types.vector3, points)
 
 
 @EVERY_KIND
@@ -108,16 +109,16 @@ def test_derivatives_follow_nearest_points(name, np_rng):
     moves, ways = np_rng.normal(size=positions.shape), np_rng.normal(size=points.shape)
 
     def found_at(step):
-        kernel.set_control_points(types.float((positions + step * moves).ravel()))
+        kernel.set_control_points(types.floats((positions + step * moves).ravel()))
         found = kernel.closest(device_points(types, points + step * ways), *locations)
         # In one kernel.
         dr.eval(found)
         return [vectors(found.p), vectors(found.n), np.array(found.distance)]
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(found_at(STEP), found_at(-STEP), strict=True)]
-    control_points, targets = types.float(positions.ravel()), device_points(types, points)
+    control_points, targets = types.floats(positions.ravel()), device_points(types, points)
     dr.enable_grad(control_points, targets)
-    dr.set_grad(control_points, types.float(moves.ravel()))
+    dr.set_grad(control_points, types.floats(moves.ravel()))
     dr.set_grad(targets, device_points(types, ways))
     kernel.set_control_points(control_points)
     found = kernel.closest(targets, *locations)
@@ -143,7 +144,7 @@ def test_scalar_variants_find_the_same(np_rng):
 def drawn_points(kernel, count, np_rng):
     types = kernel.types
     numbers = np_rng.random((3, count))
-    found = kernel.sample(types.float(numbers[0]), types.vector2(*map(types.float, numbers[1:])))
+    found = kernel.sample(types.floats(numbers[0]), types.vector2(*map(types.floats, numbers[1:])))
     dr.eval(found)
     return found
 
@@ -182,7 +183,7 @@ def test_densities_are_those_of_the_moved_surface(np_rng):
     kernel = surface.on_device(DOUBLE)
     positions = surface.cage.positions * [1.0, 2.0, 0.5]
     drawn_points(kernel, 10, np_rng)
-    kernel.set_control_points(kernel.types.float(positions.ravel()))
+    kernel.set_control_points(kernel.types.floats(positions.ravel()))
     weight = 1 / np.array(drawn_points(kernel, COUNT, np_rng).pdf)
     expected = type(surface)(surface.cage.with_positions(positions)).area()
     assert abs(weight.mean() - expected) <= ERRORS * weight.std() / COUNT**0.5

@@ -14,6 +14,7 @@ import pytest
 from kernels.surfaces import SURFACES, kernel_named, on_device, random_locations, surface_named, vectors
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, tetrahedron, torus
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS
 from mitsuba_subdivision.kernels.line_intersection import ON_NORMAL
@@ -207,7 +208,7 @@ def test_levels_of_tips_are_the_same_surface_as_pieces_and_as_sums(name, levels,
     rows = surface.cage.cut_mesh.vertex, surface.cage.vertex_count
     float_type = kernel_named(name, DOUBLE).types.float
     kernel = SurfaceKernel(PieceTable.build(surface.patches, *rows, levels), float_type)
-    kernel.set_control_points(float_type(surface.cage.positions.ravel()))
+    kernel.set_control_points(upload(float_type, surface.cage.positions))
     found, expected = evaluated(kernel, *on_device(kernel.types, *locations)), surface.evaluate(*locations)
     has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
     np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
@@ -315,24 +316,24 @@ def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
     s = surface.evaluate(element, uv, corner)
     o, d = s.p - s.n, s.n + np_rng.uniform(-0.3, 0.3, s.n.shape)
     values = {"points": positions, "parameters": uv, "rays": o}
-    direction = types.float(np_rng.normal(size=values[by].size))
+    direction = types.floats(np_rng.normal(size=values[by].size))
 
     def found(step):
-        flat = {name: types.float(value.ravel()) for name, value in values.items()}
+        flat = {name: types.floats(value.ravel()) for name, value in values.items()}
         flat[by] = flat[by] + step * direction
         p, w, origin = flat.values()
         kernel.set_control_points(p)
-        place = types.index(element), dr.unravel(types.vector2, w), types.index(corner)
+        place = types.indices(element), dr.unravel(types.vector2, w), types.indices(corner)
         if by != "rays":
             return kernel.evaluate(*place, derivatives=2)
-        ray = SimpleNamespace(o=dr.unravel(types.vector3, origin), d=types.vector3(*map(types.float, d.T)))
+        ray = SimpleNamespace(o=dr.unravel(types.vector3, origin), d=upload(types.vector3, d))
         return kernel.intersect(ray, *place, derivatives=2)
 
-    step = types.float(0)
+    step = types.floats(0)
     dr.enable_grad(step)
     at = found(step)
-    (change,) = forward([at.dn_du + 2 * at.dn_dv], [step], [types.float(1)])
-    ends = [vectors(each.dn_du + 2 * each.dn_dv) for each in (found(types.float(STEP)), found(types.float(-STEP)))]
+    (change,) = forward([at.dn_du + 2 * at.dn_dv], [step], [types.floats(1)])
+    ends = [vectors(each.dn_du + 2 * each.dn_dv) for each in (found(types.floats(STEP)), found(types.floats(-STEP)))]
     difference = (ends[0] - ends[1]) / (2 * STEP)
     assert np.abs(difference).max() > 0.1
     np.testing.assert_allclose(change, difference, rtol=0, atol=THIRD * np.abs(difference).max())
@@ -350,7 +351,7 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
         return s.p, s.n, s.dp_du
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(samples(STEP), samples(-STEP), strict=True)]
-    points = kernel.types.float(positions.ravel())
+    points = kernel.types.floats(positions.ravel())
     dr.enable_grad(points)
 
     def outputs():
@@ -358,7 +359,7 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
         found = kernel.evaluate(*on_device(kernel.types, *locations))
         return [found.p, found.n, found.dp_du]
 
-    change = kernel.types.float(direction.ravel())
+    change = kernel.types.floats(direction.ravel())
     forwards = forward(outputs(), [points], [change])
     for one, other in zip(forwards, differences, strict=True):
         assert np.abs(one).max() > 0.1
@@ -410,7 +411,7 @@ def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
 
 
 def rays_of(types, o, d):
-    return SimpleNamespace(o=types.vector3(*map(types.float, o.T)), d=types.vector3(*map(types.float, d.T)))
+    return SimpleNamespace(o=upload(types.vector3, o), d=upload(types.vector3, d))
 
 
 HIT = ["mixed torus", "sheet", "corner", "chaikin", "loop corner", "doo_sabin mixed torus"]
@@ -456,8 +457,8 @@ def met_past_a_border(kernel, surface, beyond, turns=0):
     u, v = uv[:, 0], uv[:, 1] + 0.03
     for _ in range(turns):
         u, v, corner = v, 1 - u, (corner + 1) % 4
-    start = kernel.walk.at(types.index(element), types.float(u), types.float(v), types.index(corner))
-    met = kernel.line_hits(types.vector3(*map(types.float, p.T)), types.vector3(*map(types.float, d.T)), start)
+    start = kernel.walk.at(types.indices(element), types.floats(u), types.floats(v), types.indices(corner))
+    met = kernel.line_hits(upload(types.vector3, p), upload(types.vector3, d), start)
     dr.eval(met.location, met.kind, met.values.value)
     return p, met
 
@@ -549,13 +550,13 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
 
     def met(step):
         points, *ray = (each + step * direction for each, direction in zip(values, directions, strict=True))
-        kernel.set_control_points(types.float(points.ravel()))
+        kernel.set_control_points(types.floats(points.ravel()))
         rays = rays_of(types, *ray)
         found = computed(kernel.intersect(rays, *locations))
         return vectors(found.p), vectors(found.n), np.array(found.t)
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(met(STEP), met(-STEP), strict=True)]
-    inputs = [types.float(values[0].ravel()), vector3(*o.T), vector3(*d.T)]
+    inputs = [types.floats(values[0].ravel()), upload(vector3, o), upload(vector3, d)]
     dr.enable_grad(inputs)
 
     def hits():
@@ -563,7 +564,7 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
         found = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *locations)
         return found.p, found.n, found.t
 
-    changes = [types.float(directions[0].ravel()), *(vector3(*each.T) for each in directions[1:])]
+    changes = [types.floats(directions[0].ravel()), *(upload(vector3, each) for each in directions[1:])]
     outputs = hits()
     is_hit = np.isfinite(np.array(dr.detach(outputs[2])))
     assert is_hit.mean() > 0.95
@@ -601,7 +602,7 @@ def test_control_points_can_be_others_but_not_more():
     surface = LimitSurface(cube())
     kernel = surface.on_device(SINGLE)
     moved = bumpy(cube())
-    kernel.set_control_points(kernel.types.float(moved.positions.ravel()))
+    kernel.set_control_points(kernel.types.floats(moved.positions.ravel()))
     uv = np.array([[0.3, 0.4]])
     found = evaluated(kernel, *on_device(kernel.types, np.array([1]), uv, np.array([2])))
     expected = LimitSurface(moved).evaluate(1, uv, 2)
@@ -615,8 +616,8 @@ def test_control_points_and_places_have_any_natural_form(variant):
     kernel, p = LimitSurface(cube()).on_device(variant), 2 * cube().positions
     forms = [p, p.ravel(), p.astype(np.float32).tolist()]
     if variant == SINGLE:
-        tensor, point = dr.llvm.ad.TensorXf(p), kernel.types.vector3(*map(kernel.types.float, p.T))
-        forms += [tensor, point, kernel.types.float(p.ravel())]
+        tensor, point = upload(dr.llvm.ad.TensorXf, p), upload(kernel.types.vector3, p)
+        forms += [tensor, point, kernel.types.floats(p.ravel())]
     for each in forms:
         kernel.set_control_points(cube().positions)
         kernel.set_control_points(each)

@@ -41,7 +41,7 @@ def test_corners_of_triangles_are_vertices(name, rate):
     count = len(table.triangles)
     triangle = np.repeat(np.arange(count), 3)
     b1, b2 = (np.tile(weights, count).astype(float) for weights in ((0, 1, 0), (0, 0, 1)))
-    found = locations(types.index(triangle), types.float(b1), types.float(b2))
+    found = locations(types.indices(triangle), types.floats(b1), types.floats(b2))
     dr.eval(found)
     elements = surface.patches.elements
     np.testing.assert_array_equal(elements.face[np.array(found.half_edge)], table.element[triangle])
@@ -65,7 +65,7 @@ def test_triangles_that_share_an_edge_have_its_points_in_common(name, rate, np_r
         triangle, k = np.array([pair[number] for pair in pairs]).T
         weights = np.zeros((len(pairs), 3))
         weights[np.arange(len(pairs)), k], weights[np.arange(len(pairs)), (k + 1) % 3] = 1 - share, share
-        found = locations(types.index(triangle), types.float(weights[:, 1]), types.float(weights[:, 2]))
+        found = locations(types.indices(triangle), types.floats(weights[:, 1]), types.floats(weights[:, 2]))
         dr.eval(found)
         uv = np.array([found.u, found.v])
         assert surface.scheme.domain.inside(uv.T).min() >= 0

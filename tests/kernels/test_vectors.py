@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.vectors import unit
 
 # A few units in the last place of single precision.
@@ -15,7 +16,7 @@ def test_only_zero_has_no_unit_vector(variant_llvm_ad_rgb, np_rng):  # noqa: ARG
     directions /= np.linalg.norm(directions, axis=0)
     # Squares vanish at one end, and overflow at the other.
     lengths = 10.0 ** np.linspace(-35, 35, 20)
-    found = np.array(unit(mi.Vector3f(*(directions * lengths).astype(np.float32))))
+    found = np.array(unit(upload(mi.Vector3f, (directions * lengths).T)))
     np.testing.assert_allclose(found, directions, atol=ROUNDING)
     np.testing.assert_array_equal(np.array(unit(mi.Vector3f(0, -0.0, 0))).ravel(), 0)
     # The inverse of the smallest numbers is infinite.

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.schemes import CatmullClark, StencilTable, add_scheme
 
@@ -42,7 +43,7 @@ def turned_normals(valence):
     angle = np.radians(0.1)
     turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
     normals[vertices] = normals[vertices] @ turn.T
-    mesh["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+    mesh["vertex_normals"] = upload(mi.Float, normals)
     mesh.update()
     return scene
 
@@ -53,7 +54,7 @@ def moved_vertex(valence):
     mesh = subdivision(scene)
     points = np.array(mesh["control_points"])
     points[2] += 1e-3
-    mesh["control_points"] = mi.Float(points)
+    mesh["control_points"] = upload(mi.Float, points)
     mesh.update()
     return scene
 

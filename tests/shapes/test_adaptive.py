@@ -8,6 +8,7 @@ from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface, pixel_error_for
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.shapes.tessellation_parameters import ViewingSensor
 from patches.closed_cages import bumpy
@@ -178,7 +179,7 @@ def test_gradients_are_those_of_the_weights(np_rng):
     weights = np_rng.normal(size=buffer(shape, "vertex_positions").shape)
     dr.enable_grad(parameters["control_points"])
     parameters.update()
-    dr.backward(dr.sum(parameters["vertex_positions"] * mi.Float(weights.ravel())))
+    dr.backward(dr.sum(parameters["vertex_positions"] * upload(mi.Float, weights)))
     from mitsuba_subdivision.tessellation import Criterion, Measure
 
     table = surface.adaptive_sampling(Criterion(Measure.CHORD, 1e-2), 32)
@@ -283,7 +284,7 @@ def test_sensors_of_other_kinds_are_refused():
 def test_control_points_that_are_wrong_choose_no_triangles(count, message, limit):
     shape = make(named_cages.cube(), chord_error=1e-2)
     parameters, faces = mi.traverse(shape), buffer(shape, "faces")
-    parameters["control_points"] = type(parameters["control_points"])(np.full(count, np.nan))
+    parameters["control_points"] = upload(type(parameters["control_points"]), np.full(count, np.nan))
     if limit is not None:
         parameters[limit] = 1e-1
     with pytest.raises(ValueError, match=f'parameter "control_points": .*{message}'):

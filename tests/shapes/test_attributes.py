@@ -11,6 +11,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.cage.named_cages import cube, torus
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import tagged
@@ -144,7 +145,7 @@ def test_gradients_reach_the_control_points_across_seams(np_rng):
     for each in (cage, plain):
         shape = make(each)
         parameters = mi.traverse(shape)
-        points = type(parameters["control_points"])(cage.positions.ravel())
+        points = upload(type(parameters["control_points"]), cage.positions)
         dr.enable_grad(points)
         parameters["control_points"] = points
         parameters.update()
@@ -215,7 +216,7 @@ def test_errors_say_what_was_expected(parameters, message):
         parameters = {**parameters, "texcoords": np.zeros((8, 2))}
         message = 'parameters "filename" and "texcoords" contradict each other'
     for name, value in parameters.items():
-        description[name] = mi.TensorXf(value) if isinstance(value, np.ndarray) else value
+        description[name] = upload(mi.TensorXf, value) if isinstance(value, np.ndarray) else value
     description = {name: value for name, value in description.items() if value is not None}
     with pytest.raises(RuntimeError, match=re.escape(message)):
         mi.load_dict(description)

@@ -13,6 +13,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import refine_first
@@ -104,7 +105,7 @@ def values_of(cage):
 def assign(parameters, cage):
     for name, values in values_of(cage).items():
         key = f"cage_{name}"
-        parameters[key] = type(parameters[key])(values.ravel())
+        parameters[key] = upload(type(parameters[key]), values)
     parameters.update()
 
 
@@ -146,7 +147,7 @@ def test_a_frozen_function_sees_new_values(shading, interpolation, by):
     cage = ControlCage(cube.positions, faces, texcoords=texcoords, attributes={"heat": heat})
     shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "shading": shading})
     scene = mi.load_dict({"type": "scene", "shape": shape})
-    parameters, x = mi.traverse(shape), mi.Float(np.linspace(-0.4, 0.4, 9, dtype=np.float32))
+    parameters, x = mi.traverse(shape), upload(mi.Float, np.linspace(-0.4, 0.4, 9, dtype=np.float32))
 
     def seen(scene, x):
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.1, 5), mi.Vector3f(0, 0, -1)))
@@ -190,7 +191,8 @@ def hits(shape):
     """What is asked of the surface at some hits: texture coordinates, their directions, attributes."""
     scene, found = mi.load_dict({"type": "scene", "shape": shape}), []
     places, is_jit = np.array([(0.05, 0.11), (0.31, -0.2), (-0.17, 0.27)], dtype=np.float32), dr.is_jit_v(mi.Float)
-    origins = [mi.Point3f(mi.Float(places[:, 0]), mi.Float(places[:, 1]), 5)] if is_jit else [[*xy, 5] for xy in places]
+    origins = np.insert(places, 2, 5, axis=1)
+    origins = [upload(mi.Point3f, origins)] if is_jit else origins.tolist()
     for origin in origins:
         si = scene.ray_intersect(mi.Ray3f(origin, [0, 0, -1]))
         each = [si.uv.x, si.uv.y, *si.dp_du, *si.dp_dv]
@@ -241,7 +243,7 @@ def test_values_stay_when_triangles_are_chosen_anew(shading):
 def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated():
     shape = make(cube())
     parameters = mi.traverse(shape)
-    own = type(parameters["vertex_colour"])(0.5 * np.array(parameters["vertex_colour"]))
+    own = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
     parameters["vertex_colour"] = own
     parameters["cage_weight"] = parameters["cage_weight"] * 2
     parameters.update()
@@ -293,7 +295,7 @@ def test_errors_say_what_was_expected(values, message):
     parameters = mi.traverse(shape)
     if not dr.is_jit_v(mi.Float) and len(values) != len(parameters["cage_colour"]):
         pytest.skip("Mitsuba compares the values before it assigns them")
-    parameters["cage_colour"] = type(parameters["cage_colour"])(values.astype(np.float32))
+    parameters["cage_colour"] = upload(type(parameters["cage_colour"]), values)
     with pytest.raises(ValueError, match=re.escape(message)):
         parameters.update()
 
@@ -333,7 +335,7 @@ def test_gradients_of_sums_over_vertices_are_column_sums_of_weights(cage, np_rng
     for name, size in NAMES.items():
         weights = weights_of(made(), name, options.get("scheme"))
         factors = np_rng.random((len(weights), size)).astype(np.float32)
-        loss += dr.sum(parameters[f"vertex_{name}"] * mi.Float(factors.ravel()))
+        loss += dr.sum(parameters[f"vertex_{name}"] * upload(mi.Float, factors))
         expected[name] = weights.T @ factors
     dr.backward(loss)
     # In one kernel.
@@ -347,7 +349,7 @@ def test_gradients_of_sums_over_vertices_are_column_sums_of_weights(cage, np_rng
 def ramp():
     """A bitmap that is linear over the islands: gradients of texture coordinates are its slopes."""
     texels = np.array([[[0.1], [0.9]], [[0.4], [0.6]]], dtype=np.float32)
-    return {"type": "bitmap", "data": mi.TensorXf(texels), "raw": True, "wrap_mode": "clamp"}
+    return {"type": "bitmap", "data": upload(mi.TensorXf, texels), "raw": True, "wrap_mode": "clamp"}
 
 
 def picture_of(cage, name, **parameters):
@@ -421,8 +423,8 @@ def test_gradients_of_renders_are_central_differences(cage, name, shading, np_rn
     scene = picture_of(made(), name, shading=shading, **options)
     parameters, key = mi.traverse(scene), f"shape.cage_{name}"
     start = mi.Float(parameters[key])
-    along = mi.Float(np_rng.normal(size=dr.width(start)).astype(np.float32))
-    factors = mi.TensorXf(np_rng.random((RESOLUTION, RESOLUTION, 3)).astype(np.float32))
+    along = upload(mi.Float, np_rng.normal(size=dr.width(start)))
+    factors = upload(mi.TensorXf, np_rng.random((RESOLUTION, RESOLUTION, 3)))
 
     def assign(step):
         parameters[key] = start + step * along

@@ -7,6 +7,7 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
@@ -70,7 +71,7 @@ CAGES = {
 
 def bitmap(image=IMAGE, **more):
     to_uv = mi.ScalarTransform3f().rotate(TURN)
-    return {"type": "bitmap", "data": mi.TensorXf(image[..., None]), "raw": True, "to_uv": to_uv, **more}
+    return {"type": "bitmap", "data": upload(mi.TensorXf, image[..., None]), "raw": True, "to_uv": to_uv, **more}
 
 
 def make(cage, displacement, to_world=None, **parameters):
@@ -346,12 +347,12 @@ def moving(parameters, by, rng, along=None):
     """Function that moves a parameter along a direction by so many steps."""
     is_matrix = by.endswith("to_world")
     start = parameters[by].matrix if is_matrix else parameters[by]
-    start = type(start)(start)
+    start = dr.opaque(start)
     if along is None:
-        along = rng.normal(size=np.array(start).shape).astype(np.float32)
+        along = rng.normal(size=np.array(start).shape)
     if is_matrix:
         along[3] = 0
-    along = type(start)(along)
+    along = type(start)(along.tolist()) if is_matrix else upload(type(start), along)
 
     def assign(step):
         value = start + along * step
@@ -389,7 +390,7 @@ def derivatives(assign, loss):
 def test_derivatives_of_vertices_are_central_differences(name, by, of, np_rng):
     parameters = mi.traverse(make(CAGES[name](), bitmap(), MATRIX))
     size = dr.width(parameters[f"vertex_{of}"])
-    weights = mi.Float(np_rng.normal(size=size).astype(np.float32) / np.sqrt(size))
+    weights = upload(mi.Float, np_rng.normal(size=size).astype(np.float32) / np.sqrt(size))
     backward, forward, difference = derivatives(
         moving(parameters, by, np_rng), lambda: dr.sum(weights * parameters[f"vertex_{of}"])
     )
@@ -406,7 +407,7 @@ def test_derivatives_of_normals_at_hits_are_central_differences(by, np_rng):
     scene = mi.load_dict({"type": "scene", "shape": make(CAGES["cube"](), "vertex_height", shading="exact")})
     parameters = mi.traverse(scene)
     rays = view(32, fov=12)
-    weights = mi.Normal3f(np_rng.normal(size=(3, 32 * 32)).astype(np.float32) / 32)
+    weights = upload(mi.Normal3f, (np_rng.normal(size=(3, 32 * 32)).astype(np.float32) / 32).T)
 
     def loss():
         si = scene.ray_intersect(rays, int(mi.RayFlags.All), coherent=True)
@@ -424,7 +425,7 @@ def test_derivatives_of_normals_at_hits_reach_a_bitmap(np_rng):
     scene = mi.load_dict({"type": "scene", "shape": make(CAGES["cube"](), bitmap(), shading="exact")})
     parameters = mi.traverse(scene)
     rays = view(32, fov=12)
-    weights = mi.Normal3f(np_rng.normal(size=(3, 32 * 32)).astype(np.float32) / 32)
+    weights = upload(mi.Normal3f, (np_rng.normal(size=(3, 32 * 32)).astype(np.float32) / 32).T)
 
     def loss():
         # Where points stay on the surface, it does not matter to derivatives that slopes jump between texels.
@@ -445,7 +446,7 @@ def test_each_of_two_losses_after_one_update_has_its_gradient(by, np_rng):
     parameters.set_dirty(by)
     parameters.update()
     size = dr.width(parameters["vertex_positions"])
-    weights = [mi.Float(np_rng.normal(size=size).astype(np.float32)) for _ in range(2)]
+    weights = [upload(mi.Float, np_rng.normal(size=size)) for _ in range(2)]
     for name in ("positions", "normals"):
         found = []
         for weight in [*weights, weights[0] + weights[1]]:
@@ -496,7 +497,7 @@ def test_updates_of_heights_and_scale_move_the_surface():
     shape = make(cage, bitmap())
     parameters = mi.traverse(shape)
     other = 1 - IMAGE[..., None]
-    parameters["displacement.data"] = mi.TensorXf(other)
+    parameters["displacement.data"] = upload(mi.TensorXf, other)
     parameters.update()
     for found, expected in zip(vertices(shape), vertices(make(cage, bitmap(other[..., 0]))), strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -561,7 +562,7 @@ def other_values(cage):
 def assign_cage(shape, cage):
     parameters = mi.traverse(shape)
     for name, given in {**cage.attributes, "texcoords": cage.texcoords}.items():
-        parameters[f"cage_{name}"] = type(parameters[f"cage_{name}"])(given.values.ravel())
+        parameters[f"cage_{name}"] = upload(type(parameters[f"cage_{name}"]), given.values)
     parameters.update()
 
 
@@ -621,7 +622,7 @@ def test_hits_follow_what_heights_depend_on(kind):
 def test_derivatives_of_vertices_by_heights_at_the_cage_are_central_differences(name, of, np_rng):
     parameters = mi.traverse(make(CAGES[name](), "vertex_height", MATRIX))
     size = dr.width(parameters[f"vertex_{of}"])
-    weights = mi.Float(np_rng.normal(size=size).astype(np.float32) / np.sqrt(size))
+    weights = upload(mi.Float, np_rng.normal(size=size).astype(np.float32) / np.sqrt(size))
     backward, forward, difference = derivatives(
         moving(parameters, "cage_height", np_rng), lambda: dr.sum(weights * parameters[f"vertex_{of}"])
     )
@@ -637,7 +638,7 @@ def test_each_of_two_losses_has_its_gradient_by_heights_at_the_cage(shading, np_
     parameters.set_dirty("cage_height")
     parameters.update()
     size = dr.width(parameters["vertex_positions"])
-    weights = [mi.Float(np_rng.normal(size=size).astype(np.float32)) for _ in range(2)]
+    weights = [upload(mi.Float, np_rng.normal(size=size)) for _ in range(2)]
     found = []
     for weight in [*weights, weights[0] + weights[1]]:
         dr.backward(dr.sum(weight * parameters["vertex_positions"]))

@@ -7,6 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 if hook_problem():
@@ -224,7 +225,7 @@ def test_hits_are_no_farther_from_their_triangles_than_these_are_large(np_rng):
     low, high = cage.positions.min(axis=0), cage.positions.max(axis=0)
     o = (low + high) / 2 + np.linalg.norm(high - low) * np_rng.normal(size=(8000, 3))
     d = np_rng.uniform(low, high, o.shape) - o
-    rays = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f((d / np.linalg.norm(d, axis=1)[:, None]).T))
+    rays = mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d / np.linalg.norm(d, axis=1)[:, None]))
     shape = make(cage, tessellation_rate=1)
     found, coarse = hits(shape, rays), hits(shape | {"shading": "vertex"}, rays)
     met = np.array(coarse.is_valid())
@@ -240,7 +241,7 @@ def test_parameters_run_on_over_all_triangles_of_an_element():
     # Along the middle of face 0.
     t = np.linspace(0.02, 0.98, 200)
     expected = surface.evaluate(0, np.stack([t, 0.3 + 0 * t], axis=1), derivatives=2)
-    rays = mi.Ray3f(mi.Point3f((expected.p + 0.5 * expected.n).T), mi.Vector3f(-expected.n.T))
+    rays = mi.Ray3f(upload(mi.Point3f, expected.p + 0.5 * expected.n), upload(mi.Vector3f, -expected.n))
     si = hits(shape, rays)
     np.testing.assert_allclose(rows(si.uv), np.stack([t, 0.3 + 0 * t], axis=1), atol=DERIVATIVE)
     np.testing.assert_allclose(rows(si.dp_du), expected.dp_du, atol=SECOND)
@@ -252,7 +253,7 @@ def test_derivatives_of_normals_are_differences():
     shape, surface = make(cube(), tessellation_rate=2), LimitSurface(cube())
     uv, step = np.random.default_rng(0).uniform(0.1, 0.9, (50, 2)), 1e-4
     at = surface.evaluate(1, uv)
-    si = hits(shape, mi.Ray3f(mi.Point3f((at.p + at.n).T), mi.Vector3f(-at.n.T)))
+    si = hits(shape, mi.Ray3f(upload(mi.Point3f, at.p + at.n), upload(mi.Vector3f, -at.n)))
     for axis, found in enumerate((si.dn_du, si.dn_dv)):
         ahead, behind = (surface.evaluate(1, uv + side * step * np.eye(2)[axis]).n for side in (1, -1))
         np.testing.assert_allclose(rows(found), (ahead - behind) / (2 * step), atol=SECOND)
@@ -264,7 +265,7 @@ def test_texture_coordinates_are_those_of_the_surface_with_derivatives_by_them()
     surface = LimitSurface(cage)
     uv = np.random.default_rng(0).uniform(0.1, 0.9, (50, 2))
     at = surface.evaluate(1, uv)
-    si = hits(make(cage, tessellation_rate=2), mi.Ray3f(mi.Point3f((at.p + at.n).T), mi.Vector3f(-at.n.T)))
+    si = hits(make(cage, tessellation_rate=2), mi.Ray3f(upload(mi.Point3f, at.p + at.n), upload(mi.Vector3f, -at.n)))
     np.testing.assert_allclose(rows(si.uv), surface.evaluate_attribute("texcoords", 1, uv), atol=1e-5)
     # The chain rule, by differences of texture coordinates.
     ahead, behind = (
@@ -398,7 +399,7 @@ def heat_and_colour():
     """Attributes at the vertices of a cube."""
     heat = np.linspace(0.1, 0.6, 8, dtype=np.float32)[:, None]
     colour = np.random.default_rng(0).uniform(0.2, 0.8, (8, 3)).astype(np.float32)
-    return {"vertex_heat": mi.TensorXf(heat), "vertex_colour": mi.TensorXf(colour)}
+    return {"vertex_heat": upload(mi.TensorXf, heat), "vertex_colour": upload(mi.TensorXf, colour)}
 
 
 def attribute(name):
@@ -504,7 +505,7 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)}
     texels, points, means = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32), [], []
     for shading in ("exact", "vertex"):
-        radiance = {"data": mi.TensorXf(texels), "raw": True} if kind == "bitmap" else {}
+        radiance = {"data": upload(mi.TensorXf, texels), "raw": True} if kind == "bitmap" else {}
         shape = {**make(cage, tessellation_rate=4, shading=shading, **given)}
         shape["emitter"] = {"type": "area", "radiance": {"type": kind, **radiance}}
         view = sensor(resolution=12)
@@ -532,7 +533,7 @@ def test_hidden_emitters_are_passed(integrator):
 @llvm
 def test_attributes_are_those_of_the_surface_on_both_sides(eye):
     """`twosided` turns the direction to the viewer over where it shows the back."""
-    heat = mi.TensorXf(np.random.default_rng(2).uniform(size=(81, 1)).astype(np.float32))
+    heat = upload(mi.TensorXf, np.random.default_rng(2).uniform(size=(81, 1)))
     shown = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_heat"}}
     view = {"origin": eye, "target": (0, 0, 0.3), "fov": 12}
     coarse, fine = (
@@ -648,7 +649,7 @@ def test_normals_follow_placement_and_control_points(mirror, flips):
     n *= (-1 if flips else 1) / np.linalg.norm(n, axis=1, keepdims=True)
     p = at.p @ linear.T
     d = n if flips else -n
-    si = hits(shape, mi.Ray3f(mi.Point3f((p - 0.5 * d).T), mi.Vector3f(d.T)))
+    si = hits(shape, mi.Ray3f(upload(mi.Point3f, p - 0.5 * d), upload(mi.Vector3f, d)))
     np.testing.assert_allclose(rows(si.sh_frame.n), n, atol=2 * NORMAL)
     np.testing.assert_allclose(rows(si.p), p, atol=2 * SINGLE)
     np.testing.assert_allclose(rows(si.uv), uv, atol=DERIVATIVE)
@@ -669,7 +670,7 @@ def test_a_mirror_image_has_the_mirror_images_of_all_hits():
     def found(*mirror):
         shape = mi.load_dict(make(cage, tessellation_rate=1, to_world=mi.ScalarTransform4f().scale(mirror)))
         scene = mi.load_dict({"type": "scene", "shape": shape})
-        si = scene.ray_intersect(mi.Ray3f(mi.Point3f((o * mirror).T), mi.Vector3f((d * mirror).T)))
+        si = scene.ray_intersect(mi.Ray3f(upload(mi.Point3f, o * mirror), upload(mi.Vector3f, d * mirror)))
         return np.array(si.is_valid()), rows(si.sh_frame.n) * mirror
 
     (hit, n), (mirrored_hit, mirrored) = found(1, 1, 1), found(-1, 1, 1)
@@ -696,7 +697,7 @@ def test_derivatives_of_normals_follow_placement(mirror):
         return n / np.linalg.norm(n, axis=1, keepdims=True)
 
     p, n = surface.evaluate(1, uv).p @ linear.T + offset, normals(uv)
-    si = hits(shape, mi.Ray3f(mi.Point3f((p + n).T), mi.Vector3f(-n.T)))
+    si = hits(shape, mi.Ray3f(upload(mi.Point3f, p + n), upload(mi.Vector3f, -n)))
     np.testing.assert_allclose(rows(si.sh_frame.n), n, atol=2 * NORMAL)
     for axis, found in enumerate((si.dn_du, si.dn_dv)):
         ahead, behind = (normals(uv + side * step * np.eye(2)[axis]) for side in (1, -1))
@@ -764,7 +765,7 @@ def test_stams_form_goes_wrong_as_it_is_published(valence):
     distance = 1e-3
     uv = distance * np.random.default_rng(0).uniform(0.5, 1, (400, 2))
     at = surface.evaluate(0, uv)
-    rays = mi.Ray3f(mi.Point3f((at.p + 0.1 * at.n).T), mi.Vector3f(-at.n.T))
+    rays = mi.Ray3f(upload(mi.Point3f, at.p + 0.1 * at.n), upload(mi.Vector3f, -at.n))
     stam = {"evaluator": "stam", "sample_offset": distance}
     errors = {
         name: np.linalg.norm(rows(hits(make(cage, tessellation_rate=2, **options), rays).sh_frame.n) - at.n, axis=1)
@@ -784,7 +785,7 @@ SIZE = "shape.control_points"
 def derivative(scene, mode, spp, direction):
     """Of the mean of an image by moving control points."""
     parameters = mi.traverse(scene)
-    start = mi.Float(np.array(parameters[SIZE]))
+    start = mi.Float(parameters[SIZE])
 
     def mean(step, count):
         parameters[SIZE] = start + step * direction
@@ -821,7 +822,7 @@ def test_gradients_inside_an_outline_are_differences(material):
     scene = scene_of(
         {**make(cube(), tessellation_rate=2), "bsdf": bsdf}, integrator, sky(), {"fov": 10, "resolution": 16}
     )
-    direction = mi.Float(np.random.default_rng(1).normal(size=24))
+    direction = upload(mi.Float, np.random.default_rng(1).normal(size=24))
     forward, backward, difference = (
         derivative(scene, mode, 256, direction) for mode in ("forward", "backward", "difference")
     )
@@ -837,7 +838,7 @@ def test_gradients_of_outlines_are_differences():
         cube().positions, cube().face_vertices.reshape(-1, 4), creases=RING, texcoords=textured().texcoords
     )
     scene = scene_of(make(cage, tessellation_rate=4), integrator, view={"resolution": 24})
-    grow = mi.Float(cage.positions.ravel())
+    grow = upload(mi.Float, cage.positions)
     backward, difference = (derivative(scene, mode, 512, grow) for mode in ("backward", "difference"))
     # Noise of about one per cent.
     assert backward == pytest.approx(difference, rel=0.03)
@@ -867,13 +868,15 @@ def test_derivatives_of_hits_by_parameters_are_differences(by):
     scene = scene_of(make(cube(), tessellation_rate=4, to_world=mi.ScalarTransform4f(matrix)))
     parameters, rng = mi.traverse(scene), np.random.default_rng(0)
     is_matrix = by.endswith("to_world")
-    start = mi.Matrix4f(matrix) if is_matrix else mi.Float(cube().positions.ravel())
+    start = mi.Matrix4f(matrix.tolist()) if is_matrix else upload(mi.Float, cube().positions)
     along = (
-        mi.Matrix4f(np.vstack([rng.normal(size=(3, 4)), np.zeros(4)])) if is_matrix else mi.Float(rng.normal(size=24))
+        mi.Matrix4f([*rng.normal(size=(3, 4)).tolist(), [0.0] * 4])
+        if is_matrix
+        else upload(mi.Float, rng.normal(size=24))
     )
     middle = matrix[:3, 3].tolist()
     rays = camera_rays(32, origin=np.add(EYE, middle).tolist(), target=middle, fov=8)
-    weights = [mi.Vector3f(rng.normal(size=(3, 32 * 32)) / 32) for _ in range(2)]
+    weights = [upload(mi.Vector3f, (rng.normal(size=(3, 32 * 32)) / 32).T) for _ in range(2)]
 
     def loss(step):
         value = start + along * step

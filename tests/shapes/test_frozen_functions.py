@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, ControlCage
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
-from mitsuba_subdivision.upload import upload
 
 # A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")

@@ -7,6 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.heights import AttributeHeights, TextureHeights
 
 IMAGE = np.random.default_rng(5).random((4, 7, 1)).astype(np.float32)
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("variants_all_rgb")
 
 
 def bitmap(image=IMAGE, **more):
-    return {"type": "bitmap", "data": mi.TensorXf(image), "raw": True, **more}
+    return {"type": "bitmap", "data": upload(mi.TensorXf, image), "raw": True, **more}
 
 
 def variant():
@@ -35,7 +36,7 @@ def heights_of(texture):
 
 def arrays(*values):
     kind = mi.Float if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf64
-    return [kind(np.asarray(value, dtype=np.float64)) for value in values]
+    return [upload(kind, value) for value in values]
 
 
 def waves():

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes import exact_shading
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook import hook_trial, interaction_hook, machine_code
 
@@ -216,7 +217,7 @@ def test_mitsubas_own_errors_are_those_of_vertex_shading():
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_errors_about_attributes_are_raised(monkeypatch):
-    shape = make(vertex_heat=mi.TensorXf(np.arange(8.0, dtype=np.float32)[:, None]))
+    shape = make(vertex_heat=upload(mi.TensorXf, np.arange(8.0, dtype=np.float32)[:, None]))
     si = interaction(shape)
     exact = shape.eval_attribute_1("vertex_heat", si)[0]
     with monkeypatch.context() as during:
@@ -292,7 +293,7 @@ def test_an_interruption_inside_an_answer_is_raised(monkeypatch):
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_frozen_functions_render_as_others(parameters):
     if "vertex_heat" in parameters:
-        heat = mi.TensorXf(np.arange(8.0, dtype=np.float32)[:, None])
+        heat = upload(mi.TensorXf, np.arange(8.0, dtype=np.float32)[:, None])
         bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_heat"}}
         parameters = {"vertex_heat": heat, "bsdf": bsdf}
     for shading in ("vertex", "exact"):
@@ -380,7 +381,8 @@ def test_shapes_of_other_groups_do_not_answer(asked):
 def test_groups_side_by_side_are_as_each_alone():
     """Points, normals and their derivatives, of exact and of other shapes; in a frozen function, too."""
     x = np.linspace(-0.7, 0.7, 60, dtype=np.float32)
-    ray = mi.Ray3f(mi.Point3f(6 + x, 0.3 * x, np.tile([5, -1, -3], len(x) // 3)), mi.Vector3f(0.1, 0, -1))
+    origins = np.stack([6 + x, 0.3 * x, np.tile([5, -1, -3], len(x) // 3)], axis=1)
+    ray = mi.Ray3f(upload(mi.Point3f, origins), mi.Vector3f(0.1, 0, -1))
     key = "group1.m1_0.control_points"
 
     def scene_of(*groups):

@@ -7,6 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
@@ -79,7 +80,7 @@ def remove_attribute(at):
 
 
 def texture_attribute(at):
-    texture = mi.load_dict({"type": "bitmap", "data": mi.TensorXf(np.full((2, 2, 1), 0.25))})
+    texture = mi.load_dict({"type": "bitmap", "data": upload(mi.TensorXf, np.full((2, 2, 1), 0.25))})
     at.shape.add_texture_attribute("vertex_t", texture)
     close(at.shape.eval_attribute_1("vertex_t", at.si), 0.25)
     assert at.shape.texture_attribute("vertex_t") == texture
@@ -101,7 +102,7 @@ def bbox(at):
 def edges(at):
     """Each half of an edge is the other of its other; the cage is closed."""
     at.shape.build_directed_edges()
-    edge = mi.UInt32(np.arange(3 * at.shape.face_count()))
+    edge = dr.arange(mi.UInt32, 3 * at.shape.face_count())
     other = at.shape.opposite_dedge(edge)
     np.testing.assert_array_equal(np.array(at.shape.opposite_dedge(other)), np.array(edge))
     faces = np.array(at.shape.faces_buffer()).reshape(-1, 3)
@@ -185,7 +186,7 @@ def surface_area(at):
 def silhouettes(at):
     with_gradients = Place("exact" if at.is_exact else "vertex", has_gradients=True).shape
     given = np.random.default_rng(0).random((3, 1000))
-    sample = with_gradients.sample_silhouette(mi.Point3f(given), EDGES)
+    sample = with_gradients.sample_silhouette(upload(mi.Point3f, given.T), EDGES)
     # Edges are silhouettes from few directions each.
     is_valid = np.array(sample.is_valid())
     assert is_valid.sum() > 50

@@ -5,6 +5,7 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from mitsuba_subdivision.device_arrays import upload
 from peers.fidelity_cages import book, cube, fan, joined, pole
 
 pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
@@ -65,7 +66,7 @@ def test_gradients_of_points_are_differences(name):
     params["control_points"] = points
     params.update()
     assert dr.width(params["vertex_positions"]) == weights.size
-    dr.backward(dr.sum(params["vertex_positions"] * mi.Float(weights)))
+    dr.backward(dr.sum(params["vertex_positions"] * upload(mi.Float, weights)))
     gradient = np.array(dr.grad(points)).reshape(-1, 3)
     direction = np.random.default_rng(2).uniform(-1, 1, cage.positions.shape)
     expected = total(cage.positions + direction) - total(cage.positions)

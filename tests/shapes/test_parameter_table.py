@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.rules import RULES
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes import register_variant
 from mitsuba_subdivision.shapes.attribute_parameters import is_attribute_parameter
 from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
@@ -19,8 +20,8 @@ ROWS = (*PARAMETERS, *STATE_PARAMETERS)
 def shown_by(**parameters):
     """Flags by name of what `traverse` shows, but for parameters of objects within."""
     cube = named_cages.cube()
-    texcoords = mi.TensorXf(cube.positions[:, :2].astype(np.float32))
-    values = {"texcoords": texcoords, "vertex_NAME": mi.TensorXf(np.ones((8, 1), dtype=np.float32))}
+    texcoords = upload(mi.TensorXf, cube.positions[:, :2])
+    values = {"texcoords": texcoords, "vertex_NAME": upload(mi.TensorXf, np.ones((8, 1), dtype=np.float32))}
     found = mi.traverse(mi.load_dict({"type": "subdivision", **cube.as_properties(mi), **values, **parameters}))
     return {name: found.flags(name) for name in found.keys() if "." not in name}  # noqa: SIM118
 

@@ -9,6 +9,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.llvm import llvm_problem
 
 SINGLE = 2e-6
@@ -106,7 +107,7 @@ def test_control_points_of_a_far_cage_keep_their_digits_where_they_stay():
     parameters = mi.traverse(shape)
     given = np.array(parameters["control_points"])
     given[0] += 0.5
-    parameters["control_points"] = type(parameters["control_points"])(given)
+    parameters["control_points"] = upload(type(parameters["control_points"]), given)
     parameters.update()
     moved = cage.positions + SHIFT
     moved[0, 0] = given[0]
@@ -114,7 +115,7 @@ def test_control_points_of_a_far_cage_keep_their_digits_where_they_stay():
     assert largest_angle(buffer(shape, "vertex_normals"), expected.normals) <= NORMAL_ERROR
     assert np.abs(buffer(shape, "vertex_normals") - normals).max() > 0.1
     given[0] = np.float32(cage.positions[0, 0] + SHIFT[0])
-    parameters["control_points"] = type(parameters["control_points"])(given)
+    parameters["control_points"] = upload(type(parameters["control_points"]), given)
     parameters.update()
     np.testing.assert_array_equal(buffer(shape, "vertex_normals"), normals)
 
@@ -207,11 +208,11 @@ def test_a_refused_update_leaves_faces_and_normals_in_step():
     shape = make(named_cages.cube())
     parameters = mi.traverse(shape)
     points = np.array(parameters["control_points"])
-    parameters["control_points"] = type(parameters["control_points"])(points * np.nan)
+    parameters["control_points"] = upload(type(parameters["control_points"]), points * np.nan)
     parameters["to_world"] = transformation("mirrored")
     with pytest.raises(ValueError, match="finite"):
         parameters.update()
-    parameters["control_points"] = type(parameters["control_points"])(points)
+    parameters["control_points"] = upload(type(parameters["control_points"]), points)
     parameters.update()
     expected = make(named_cages.cube(), to_world=transformation("mirrored"))
     for each in ("vertex_positions", "vertex_normals", "faces"):
@@ -263,7 +264,7 @@ def test_an_impossible_to_world_is_an_error_and_changes_nothing(value, message):
     shape = make(named_cages.cube())
     before = buffer(shape, "vertex_positions")
     parameters = mi.traverse(shape)
-    parameters["to_world"] = type(parameters["to_world"])(value())
+    parameters["to_world"] = upload(type(parameters["to_world"]), value())
     with pytest.raises(ValueError, match=re.escape(f'parameter "to_world" {message}')):
         parameters.update()
     np.testing.assert_array_equal(buffer(shape, "vertex_positions"), before)
@@ -277,7 +278,7 @@ def test_control_points_that_are_not_finite_are_an_error_and_change_nothing(valu
     parameters = mi.traverse(shape)
     given = np.array(parameters["control_points"])
     given[7 : 7 + len(values)] = values
-    parameters["control_points"] = type(parameters["control_points"])(given)
+    parameters["control_points"] = upload(type(parameters["control_points"]), given)
     count = {1: "1 such vertex", 4: "2 such vertices"}[len(values)]
     message = f'parameter "control_points": vertex 2 has the coordinates {tuple(given[6:9].tolist())}; expected finite'
     with pytest.raises(ValueError, match=rf"{re.escape(message)} numbers \({count} in all\)"):
@@ -311,13 +312,13 @@ def test_derivatives_by_to_world_and_control_points_are_differences(np_rng, cage
     expected = (exact(step) - exact(-step)) / (2 * step)
 
     def loss(parameter):
-        parameters["control_points"] = mi.Float(points) + parameter * mi.Float(change)
+        parameters["control_points"] = upload(mi.Float, points) + parameter * upload(mi.Float, change)
         if name != "none":
-            matrix = dr.detach(mi.AffineTransform4f(transform).matrix) + parameter * mi.Matrix4f(turn)
+            matrix = dr.detach(mi.AffineTransform4f(transform).matrix) + parameter * mi.Matrix4f(turn.tolist())
             parameters["to_world"] = mi.AffineTransform4f(matrix)
         parameters.update()
         names = ("vertex_positions", "vertex_normals")
-        return sum(dr.dot(parameters[n], mi.Float(w.ravel())) for n, w in zip(names, weights, strict=True))
+        return sum(dr.dot(parameters[n], upload(mi.Float, w)) for n, w in zip(names, weights, strict=True))
 
     for derivative in ("forward", "backward"):
         # As a constant, Dr.Jit would widen it.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface, example_file
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.llvm import llvm_problem
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
 from reference.exact_samples import SCHEMES, angle, samples_at
@@ -172,8 +173,10 @@ def test_to_string_says_what_it_is():
 def test_errors_say_what_was_expected(parameters, message):
     description = {"type": "subdivision", **named_cages.cube().as_properties(mi)}
     for name, value in parameters.items():
-        kind = mi.ScalarTransform4f if name == "to_world" else mi.TensorXf
-        description[name] = kind(value) if isinstance(value, np.ndarray) else value
+        if isinstance(value, np.ndarray):
+            description[name] = mi.ScalarTransform4f(value) if name == "to_world" else upload(mi.TensorXf, value)
+        else:
+            description[name] = value
     description = {name: value for name, value in description.items() if value is not None}
     with pytest.raises(RuntimeError, match=re.escape(message)):
         mi.load_dict(description)
@@ -266,7 +269,7 @@ def test_update_equals_a_new_shape(np_rng, mirror):
     shape = make(cage, to_world=to_world)
     moved = cage.with_positions(cage.positions + 0.1 * np_rng.normal(size=cage.positions.shape))
     parameters = mi.traverse(shape)
-    parameters["control_points"] = type(parameters["control_points"])(moved.positions.ravel())
+    parameters["control_points"] = upload(type(parameters["control_points"]), moved.positions)
     parameters.update()
     expected = make(moved, to_world=to_world)
     for name in ("vertex_positions", "vertex_normals"):
@@ -452,7 +455,7 @@ def test_a_buffer_of_another_length_is_refused(name):
     shape = mi.load_dict({"type": "subdivision", "filename": example_file("cages/jar.obj"), "tessellation_rate": 1})
     parameters = mi.traverse(shape)
     whole = mi.Float(parameters[name])
-    parameters[name] = mi.Float(np.array(whole)[:10])
+    parameters[name] = upload(mi.Float, np.array(whole)[:10])
     with pytest.raises(ValueError, match=f'parameter "{name}": 10 numbers; expected {len(whole)}'):
         parameters.update()
     parameters[name] = whole

@@ -6,6 +6,7 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, studio_scene
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.studio.obj_materials import material_bsdf, read_materials
 from mitsuba_subdivision.studio.scene_file import save_scene
 
@@ -80,7 +81,7 @@ PIXELS = np.array([[1.0, 0.0], [0.25, 0.0]])
 @pytest.fixture
 def texture(tmp_path):
     """Function that makes the texture of a statement of a map, and one that looks it up."""
-    mi.util.write_bitmap(str(tmp_path / "a b 01#.exr"), mi.TensorXf(PIXELS[..., None]), write_async=False)
+    mi.util.write_bitmap(str(tmp_path / "a b 01#.exr"), upload(mi.TensorXf, PIXELS[..., None]), write_async=False)
 
     def make(statement, library="a.mtl"):
         (tmp_path / "a.obj").write_text("mtllib a.mtl\n")

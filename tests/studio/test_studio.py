@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageError, named_cages
 from mitsuba_subdivision.cage.errors import CageWarning
+from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
@@ -72,7 +73,7 @@ def test_mitsubas_sensor_has_every_limit_point_on_its_film(up, view):
         scene = studio_scene(surface.cage, view=view, up=up, size=size)
         sensor = mi.load_dict(scene["sensor"])
         found = mi.Interaction3f()
-        found.p = mi.Point3f(points.T)
+        found.p = upload(mi.Point3f, points)
         places = np.array(sensor.sample_direction(found, mi.Point2f(0))[0].uv).T / size
         assert (places > MARGIN / 2).all()
         assert (places < 1 - MARGIN / 2).all()

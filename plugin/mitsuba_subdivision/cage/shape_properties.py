@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..upload import upload
+from ..device_arrays import upload
 from .contents import CageContents
 
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
+from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.triangle_samples import triangle_samples
 from ..shapes.views import loss_of_views
 from ..surface import LimitSurface
-from ..upload import upload
 from ..variants import SceneNode
 from .figure_scenes import make_mesh
 

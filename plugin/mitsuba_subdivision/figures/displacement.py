@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
 from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
-from ..upload import upload
 from ..variants import SceneNode
 from .figure_scenes import in_8_bits, load_stage, render, staged
 from .output import FigureOptions, save_png, scene_path, write_pixels

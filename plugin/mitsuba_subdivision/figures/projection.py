@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..upload import upload
+from ..device_arrays import upload
 
 # Points are lifted off their surface by this part of their distance to the camera, before they are tested.
 LIFT = 2e-3

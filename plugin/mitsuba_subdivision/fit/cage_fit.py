@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import Attribute, ControlCage
+from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built
 from ..refinement.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from ..upload import upload
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
 from .crease_sharpness import refined_points
 from .fitting import Fit

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
 from ..whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def adam_state(optimizer: mi.ad.Optimizer, name: str) -> State:
 def restore_adam(optimizer: mi.ad.Optimizer, name: str, state: State) -> None:
     """Give a state to a variable of ``mi.ad.Adam``."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
-    optimizer[name] = type(value)(state["value"])
+    optimizer[name] = upload(type(value), state["value"])
     value, promoted, rate, (*_, more) = optimizer.state[name]
-    moments = type(steps)(state["steps"]), type(first)(state["first"]), type(second)(state["second"])
+    moments = [upload(type(now), state[key]) for key, now in (("steps", steps), ("first", first), ("second", second))]
     optimizer.state[name] = value, promoted, rate, (*moments, more)

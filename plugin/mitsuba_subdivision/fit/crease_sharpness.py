@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import upload
 from ..refinement.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
-from ..upload import upload
 
 
 def refined_points(variable: VariableSharpness, sharpness: dr.ArrayBase, points: dr.ArrayBase) -> mi.Float:

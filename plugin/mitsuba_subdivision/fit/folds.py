@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..cage import ControlCage
+from ..device_arrays import upload
 from ..mesh.connectivity import IntArray, Topology
-from ..upload import upload
 
 # Faces count from this cosine between their normals on, 107 degrees. Where a part is about to grow, those on both sides
 # of its end turn by a right angle and more.

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..upload import upload
+from ..device_arrays import upload
 
 if TYPE_CHECKING:
     from scipy import sparse

@@ -10,10 +10,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import upload
 from ..kernels.sparse_matrix import SparseMatrix
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from ..upload import upload
 from .folds import folds
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import ControlCage
+from ..device_arrays import upload
 from ..shapes.views import loss_of_views
-from ..upload import upload
 
 # The name of the fitted shape in its scene.
 SHAPE = "surface"

@@ -12,8 +12,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
+from ..llvm import require_llvm
 from ..mesh.shared import Content, Shared, SharedArray
-from ..upload import upload
 from .types import Float, FloatBuffer, Index, IndexBuffer, Mask, Vector3
 
 # For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
@@ -59,11 +60,13 @@ class ArrayTypes:
     def of(cls, float_type: type) -> ArrayTypes:
         """The types of the same backend and precision as a flat array, such as ``drjit.llvm.ad.Float``.
 
-        ``float`` stands for scalar variants.
+        ``float`` stands for scalar variants. Raises RuntimeError if kernels of the backend would end the process.
         """
         if float_type is float:
             scalar = dr.scalar
             return cls(float, int, scalar.Array2f64, scalar.Array3f64, scalar.Array4f64, scalar.Array2u, scalar.Array4u)
+        if dr.backend_v(float_type) == dr.JitBackend.LLVM:
+            require_llvm()
         arrays = sys.modules[float_type.__module__]
         suffix = "64" if dr.type_v(float_type) == dr.VarType.Float64 else ""
         vector2, vector3, vector4 = (getattr(arrays, f"Array{size}f{suffix}") for size in (2, 3, 4))

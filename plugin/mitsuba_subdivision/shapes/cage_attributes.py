@@ -19,6 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import take_over
 from ..kernels.types import FloatBuffer
 from ..mesh.shared import SharedArray
 from ..schemes.domain import FloatArray
@@ -212,6 +213,9 @@ class CageAttributes:
             raise ValueError(
                 f"{dr.width(values)} numbers; expected {count * size}, {size} for each of {count} values at the cage"
             )
-        if not is_recording() and not dr.all(dr.isfinite(values)):
+        if is_recording():
+            return
+        take_over(values)
+        if not dr.all(dr.isfinite(values)):
             wrong = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
             raise ValueError(f"number {wrong[0]} is not finite; expected finite numbers ({len(wrong)} such in all)")

@@ -15,6 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..kernels.array_types import ArrayTypes
 from ..kernels.displacement import displaced
@@ -25,7 +26,6 @@ from ..kernels.vectors import unit
 from ..mesh.connectivity import IntArray
 from ..patches import PatchSampler, contracts_alike
 from ..schemes.domain import FloatArray
-from ..upload import upload
 
 if TYPE_CHECKING:
     from ..kernels.displacement import Displacement

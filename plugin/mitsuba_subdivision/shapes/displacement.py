@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import upload
 from ..kernels.channel_kernel import channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.displacement import Displacement
@@ -29,7 +30,6 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import DisplacementBound
-from ..upload import upload
 from ..variants import Variant
 from .device_state import is_recording
 from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights

@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import upload
 from ..kernels.displacement import Heights
 from ..kernels.types import Float, Mask, Value, Vector2
-from ..upload import upload
 from ..variants import Variant
 
 if TYPE_CHECKING:

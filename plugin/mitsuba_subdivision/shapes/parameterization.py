@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import upload
 from ..kernels.types import Mask, Vector2
-from ..upload import upload
 from ..variants import Variant
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
 from ..kernels.types import FloatBuffer, Matrix4
-from ..upload import upload
 
 if TYPE_CHECKING:
     import mitsuba as mi

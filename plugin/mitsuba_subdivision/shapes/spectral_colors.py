@@ -13,9 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..device_arrays import upload
 from ..kernels.types import Float, FloatBuffer, Index, Mask, Value
 from ..mesh.shared import Shared
-from ..upload import upload
 from ..variants import Variant
 
 TABLE = "data/srgb.coeff"

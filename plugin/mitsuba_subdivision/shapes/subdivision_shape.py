@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
-from ..llvm import llvm_problem
+from ..llvm import require_llvm
 from ..surface import TEXCOORDS
-from ..upload import upload
 from ..variants import Variant
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
@@ -100,10 +100,8 @@ def make_subdivision(variant: Variant) -> type:
         @on_shallow_stack
         @paused_collection()
         def __init__(self, props: mi.Properties) -> None:
-            problem = llvm_problem() if runs_on_llvm else None
-            if problem:
-                # The first kernel would crash the process.
-                raise RuntimeError(problem)
+            if runs_on_llvm:
+                require_llvm()
             parameters = read_parameters(props)
             surface, is_exact = parameters.surface, _is_exact(parameters, variant)
             self._parameters, self._tessellation = parameters, parameters.tessellation

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
+from ..device_arrays import upload
 from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.shared import Content, Shared, SharedArray
-from ..upload import upload
 from ..variants import Variant
 from .vertices import split_weld_targets
 

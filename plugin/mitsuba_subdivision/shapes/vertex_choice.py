@@ -10,11 +10,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import upload
 from ..kernels.types import FloatBuffer
 from ..llvm import llvm_problem
 from ..mesh.shared import Shared
 from ..surface import LimitSurface
-from ..upload import upload
 from .vertices import Vertices, split_weld_targets
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..device_arrays import take_over
 from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.connectivity import IntArray
 from .device_state import is_recording
@@ -118,7 +119,7 @@ class _Selection:
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
-    """Check flat coordinates of so many control points, on any device.
+    """Check flat coordinates of so many control points, on any device, and move them to Dr.Jit's memory.
 
     Raises
     ------
@@ -129,7 +130,10 @@ def require_control_points(control_points: FloatBuffer, count: int) -> None:
         from ..kernels.apply_weights import coordinates_expected
 
         raise ValueError(coordinates_expected(len(control_points), count))
-    if is_recording() or dr.all(dr.isfinite(control_points)):
+    if is_recording():
+        return
+    take_over(control_points)
+    if dr.all(dr.isfinite(control_points)):
         return
     points = np.array(control_points)
     bad = np.unique(np.flatnonzero(~np.isfinite(points)) // 3)

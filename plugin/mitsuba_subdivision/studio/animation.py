@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import CageError, CageWarning
+from ..device_arrays import upload
 from ..regression.scene import LoadedScene, load_scene
-from ..upload import upload
 from ..variants import SceneNode
 from .camera import outermost
 from .placed_points import points_at

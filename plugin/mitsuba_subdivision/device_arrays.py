@@ -14,6 +14,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .llvm import require_llvm
+
 
 def upload(kind: type, *parts: ArrayLike) -> Any:
     """Copy arrays into one of Dr.Jit.
@@ -30,7 +32,14 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
     Returns
     -------
     array of the type ``kind``
+
+    Raises
+    ------
+    RuntimeError
+        If Dr.Jit has loaded an LLVM library whose kernels end the process.
     """
+    if dr.backend_v(kind) == dr.JitBackend.LLVM:
+        require_llvm()
     if dr.is_tensor_v(kind):
         (values,) = parts
         return kind(upload(dr.array_t(kind), values), np.shape(values))
@@ -41,3 +50,12 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
         return dr.unravel(kind, upload(dr.array_t(dr.value_t(kind)), array))
     # A copy by Dr.Jit: it reads no more than the array has, and is complete before NumPy's memory is freed.
     return dr.opaque(kind(array))
+
+
+def take_over(array: Any) -> None:
+    """Move an array of Dr.Jit to Dr.Jit's own memory, in place.
+
+    For arrays that users assign to parameters: they are often made of NumPy's. One with derivatives stays where it is.
+    """
+    if dr.is_jit_v(array) and not dr.grad_enabled(array):
+        array[:] = dr.opaque(array)
