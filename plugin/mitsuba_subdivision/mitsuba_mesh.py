@@ -60,7 +60,12 @@ def mitsuba_mesh(
             mesh.add_attribute(key, values.shape[1], [0.0] * values.size)
     parameters = mi.traverse(mesh)
     for key, values in {"faces": triangles, **buffers}.items():
-        parameters[key] = upload(type(parameters[key]), values)
+        stored = values
+        if mi.is_spectral and key not in OWN_BUFFERS and values.shape[1] == 3 and "color" in key.lower():
+            # Of colours, Mitsuba's meshes store spectra.
+            colors, row = np.unique(values, axis=0, return_inverse=True)
+            stored = np.array([mi.srgb_model_fetch(color) for color in colors.tolist()])[row.ravel()]
+        parameters[key] = upload(type(parameters[key]), stored)
     parameters.update()
     if averages_normals:
         mesh.recompute_vertex_normals()

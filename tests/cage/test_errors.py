@@ -1,11 +1,15 @@
-"""Warnings of cages."""
+"""Warnings and messages of cages."""
 
 import _thread
+import re
 import time
 import warnings
 
+import numpy as np
 import pytest
-from mitsuba_subdivision.cage.errors import CageWarning, warn
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.errors import CageError, CageWarning, in_digits, warn
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.files.losses import warn_of_losses
 
 
@@ -26,3 +30,28 @@ def test_a_thread_without_a_caller_can_warn(monkeypatch):
         while not shown and time.monotonic() < end:
             time.sleep(0.01)
     assert shown == ["odd"]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "expected"),
+    [
+        (5.0, "5"),
+        (3, "3"),
+        (1.000000001, "1.000000001"),
+        (np.float32(0.1), "0.1"),
+        (np.nan, "nan"),
+        (1e300, "1e+300"),
+        ([1.000000001, 0.5], "(1.000000001, 0.5)"),
+        (np.array([1, 2]), "(1, 2)"),
+    ],
+)
+def test_numbers_have_all_their_digits(numbers, expected):
+    assert in_digits(numbers) == expected
+
+
+def test_numbers_just_outside_a_range_do_not_look_as_if_within():
+    surface = LimitSurface(cube())
+    with pytest.raises(ValueError, match=re.escape("uv of sample 0 is (1.000000001, 0.5); expected parameters in")):
+        surface.evaluate([0], [[1.000000001, 0.5]])
+    with pytest.raises(CageError, match="has sharpness -1e-09; expected 0"):
+        ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), creases=[(0, 1, -1e-9)])

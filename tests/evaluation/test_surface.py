@@ -49,7 +49,7 @@ def test_corners_name_the_same_point():
         ({"element": [0, -1], "uv": [[0, 0]]}, "element of sample 1 is -1; expected 0 to 5"),
         ({"element": 0.5, "uv": [[0, 0]]}, "element has type float64; expected integers"),
         ({"element": 0, "uv": [[0, 0]], "corner": 4}, "corner of sample 0 is 4; expected a corner of its element"),
-        ({"element": 0, "uv": [[0.5, 1.5]]}, r"uv of sample 0 is \[0.5 1.5\]; expected parameters in the unit square"),
+        ({"element": 0, "uv": [[0.5, 1.5]]}, r"uv of sample 0 is \(0.5, 1.5\); expected parameters in the unit square"),
         ({"element": 0, "uv": [[0.5, np.nan]]}, "expected parameters in the unit square"),
         ({"element": 0, "uv": [0.5, 0.5, 0.5]}, r"uv has shape \(3,\); expected \(s, 2\)"),
         (

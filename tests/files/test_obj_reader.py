@@ -329,3 +329,25 @@ def test_every_cut_of_a_file_reads_or_names_the_file(obj_file):
         else:
             assert len(positions) == 9
             assert 1 <= len(sizes) <= 9
+
+
+def test_names_of_materials_may_have_a_number_sign(tmp_path):
+    # Quadrilaterals side by side.
+    quads = "".join(f"v {i} 0 0 # {i}\nv {i} 1 0\n" for i in range(6))
+    uses = [
+        "usemtl a#1",
+        "\tusemtl\tMaterial #25 # a comment",
+        "# usemtl none",
+        "usemtl plain # comment",
+        "usemtl # none",
+    ]
+    (tmp_path / "a.obj").write_text(
+        quads + "".join(f"{each}\nf {2 * i + 1} {2 * i + 3} {2 * i + 4} {2 * i + 2}\n" for i, each in enumerate(uses))
+    )
+    found = ControlCage.from_file(tmp_path / "a.obj").materials
+    assert {name: faces.tolist() for name, faces in found.items()} == {
+        "a#1": [0],
+        "Material #25": [1, 2],
+        "plain": [3],
+        "": [4],
+    }

@@ -37,8 +37,8 @@ def test_materials_are_read_back(tmp_path):
     assert [faces.tolist() for faces in found.materials.values()] == list(materials.values())
     found.save(tmp_path / "again.obj")
     assert ControlCage.from_file(tmp_path / "again.obj").materials.keys() == found.materials.keys()
-    with pytest.warns(CageWarning, match='no place for material "a#b", further materials of a face of the cage'):
-        ControlCage(cube().positions, square, materials={"a": [0, 1], "a#b": [1]}).save(tmp_path / "cage.obj")
+    with pytest.warns(CageWarning, match='no place for material "a # b", further materials of a face of the cage'):
+        ControlCage(cube().positions, square, materials={"a": [0, 1], "a # b": [1]}).save(tmp_path / "cage.obj")
     found = ControlCage.from_file(tmp_path / "cage.obj").materials
     assert {name: faces.tolist() for name, faces in found.items()} == {"": [1, 2, 3, 4, 5], "a": [0]}
 

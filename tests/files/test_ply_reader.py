@@ -11,6 +11,7 @@ from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlC
 from mitsuba_subdivision.cage.equality import same
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
 from mitsuba_subdivision.files.ply_header import PlyHeader
+from mitsuba_subdivision.files.ply_names import grouped
 from mitsuba_subdivision.files.ply_reader import read_ply
 from mitsuba_subdivision.files.ply_writer import write_polygons
 
@@ -191,17 +192,47 @@ def test_attributes(read):
     properties += ["double flow_1", "double flow_0", "short group_1"]
     cage = read(with_data(properties, [f"0 0 1 255 51 {i} {i / 2} 1 {i} 7" for i in range(5)]))
     assert {name: attribute.interpolation for name, attribute in cage.attributes.items()} == dict.fromkeys(
-        ["color", "quality", "flow", "group_1"], "vertex"
+        ["color", "quality", "flow", "group"], "vertex"
     )
     np.testing.assert_array_equal(cage.attributes["color"].values, [[1, 0.2, i / 255] for i in range(5)])
     np.testing.assert_array_equal(cage.attributes["quality"].values, [[i / 2] for i in range(5)])
     np.testing.assert_array_equal(cage.attributes["flow"].values, [[i, 1] for i in range(5)])
-    np.testing.assert_array_equal(cage.attributes["group_1"].values, np.full((5, 1), 7))
+    np.testing.assert_array_equal(cage.attributes["group"].values, np.full((5, 1), 7))
 
 
 def test_colors_of_floats_are_taken_as_they_are(read):
     cage = read(with_data([f"float {name}" for name in ("red", "green", "blue", "alpha")], ["2 0 0 .5"] * 5))
-    np.testing.assert_array_equal(cage.attributes["color"].values, [[2, 0, 0, 0.5]] * 5)
+    np.testing.assert_array_equal(cage.attributes["color"].values, [[2, 0, 0]] * 5)
+    np.testing.assert_array_equal(cage.attributes["alpha"].values, [[0.5]] * 5)
+
+
+@pytest.mark.parametrize(
+    ("properties", "expected"),
+    [
+        ("r g b a", {"color": "rgb", "alpha": "a"}),
+        ("alpha red", {"alpha": ["alpha"], "red": ["red"]}),
+        ("red green blue r g b", {"color": ["red", "green", "blue"], "r": "r", "g": "g", "b": "b"}),
+        ("color red green blue", {each: [each] for each in ("color", "red", "green", "blue")}),
+        ("n_x n_y n_z n_w", {"n": ["n_x", "n_y", "n_z"], "n_w": ["n_w"]}),
+        ("n_x n_y", {"n_x": ["n_x"], "n_y": ["n_y"]}),
+        ("k_r k_g k_b", {"k_color": ["k_r", "k_g", "k_b"]}),
+        ("n_2 n_3 n_1 m_0 m_2", {"n": ["n_1", "n_2", "n_3"], "m_0": ["m_0"], "m_2": ["m_2"]}),
+        ("heat_0 heat", {"heat_0": ["heat_0"], "heat": ["heat"]}),
+        ("heat_0", {"heat": ["heat_0"]}),
+    ],
+)
+def test_names_of_columns(properties, expected):
+    found = grouped(properties.split())
+    assert {name: list(columns) for name, columns in found.items()} == {
+        name: list(columns) for name, columns in expected.items()
+    }
+
+
+def test_colors_with_opacity_are_scaled(read):
+    """As Blender and MeshLab write them."""
+    cage = read(with_data([f"uchar {name}" for name in ("red", "green", "blue", "alpha")], ["255 51 0 102"] * 5))
+    np.testing.assert_array_equal(cage.attributes["color"].values, [[1, 0.2, 0]] * 5)
+    np.testing.assert_array_equal(cage.attributes["alpha"].values, [[0.4]] * 5)
 
 
 def test_a_warning_names_what_is_left_out(read):
@@ -390,11 +421,13 @@ def test_missing_file_is_an_os_error(tmp_path):
 
 
 @pytest.mark.core
-def test_round_trip_is_exact(any_cage, tmp_path, np_rng):
+@pytest.mark.parametrize("size", [1, 3, 4])
+def test_round_trip_is_exact(any_cage, tmp_path, np_rng, size):
     count = any_cage.vertex_count
     attributes = {
-        "color": Attribute(np_rng.random((count, 4))),
-        "weight": Attribute(np_rng.normal(size=(count, 1))),
+        "color": Attribute(np_rng.random((count, size))),
+        "alpha": Attribute(np_rng.random((count, 1))),
+        **{name: Attribute(np_rng.normal(size=(count, 1))) for name in ("weight", "weight_0", "r", "u", "b_x", "x")},
         "flow": Attribute(np_rng.normal(size=(count, 12))),
     }
     cage = ControlCage.from_arrays(
@@ -467,15 +500,13 @@ def test_a_warning_names_what_has_no_place(tmp_path):
         texcoords=Attribute(np.zeros((12, 2)), "face_varying"),
         attributes={
             "a b": vertex,
-            "x": vertex,
-            "color": vertex,
             "kept": vertex,
             "v": Attribute(vertex.values, "varying"),
         },
     )
     message = (
         r'tags.ply": .ply files have no place for creases, corners, holes, boundary, triangle_rule, scheme, texcoords, '
-        r'attribute "a b", attribute "x", attribute "color", attribute "v" of the cage; written without'
+        r'attribute "a b", attribute "v" of the cage; written without'
     )
     with pytest.warns(CageWarning, match=message):
         cage.save(tmp_path / "tags.ply")

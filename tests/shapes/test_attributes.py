@@ -12,7 +12,11 @@ from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import tagged
+
+exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
 
 SINGLE = 2e-6
 # Each face of the cube is an island.
@@ -252,3 +256,137 @@ def test_a_texture_is_seen():
     np.testing.assert_array_equal(albedo[covered], is_white)
     assert covered.sum() > 200
     assert 0.3 < is_white.mean() < 0.7
+
+
+# The square that both faces cover, with its corners; values linear in x and y, which subdivision keeps.
+SQUARE = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+{properties}
+element face 2
+property list uchar int vertex_indices
+end_header
+{rows}
+3 0 1 2
+3 0 2 3
+"""
+OF_MITSUBA = {
+    "color": ["r", "g", "b"],
+    "k_color": ["k_r", "k_g", "k_b"],
+    "flow": ["flow_x", "flow_y", "flow_z"],
+    "n": ["n_0", "n_1", "n_2"],
+    "heat": ["heat_1"],
+}
+# Spectra of colours by Mitsuba's table, evaluated in single precision at two places.
+SPECTRUM = 1e-5
+
+
+def square(path):
+    rows = []
+    for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+        linear = [0.5 + 0.25 * x, 0.5 - 0.1 * y, 0.3 + 0.1 * (x + y)]
+        rows.append([x, y, 0, 0.2, 0.5, 0.1, 0.3, 0.3, 0.3, *linear, *linear, linear[2]])
+    names = [name for columns in OF_MITSUBA.values() for name in columns]
+    properties = "\n".join(f"property float {name}" for name in names)
+    path.write_text(SQUARE.format(properties=properties, rows="\n".join(" ".join(map(str, row)) for row in rows)))
+    return path
+
+
+@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+@pytest.mark.usefixtures("variants_all")
+def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(tmp_path, shading):
+    path = str(square(tmp_path / "square.ply"))
+    ours = mi.load_dict({"type": "subdivision", "filename": path, "shading": shading, "boundary": "edge_and_corner"})
+    own = mi.load_dict({"type": "ply", "filename": path})
+    wavelengths = [450, 500, 550, 600] if mi.is_spectral else []
+    found = []
+    for shape in (ours, own):
+        scene = mi.load_dict({"type": "scene", "shape": shape})
+        si = scene.ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, wavelengths))
+        values = {}
+        for name, columns in OF_MITSUBA.items():
+            assert dr.all(shape.has_attribute(f"vertex_{name}")), name
+            raw = shape.eval_attribute_3 if len(columns) == 3 else shape.eval_attribute_1
+            values[name] = np.array(raw(f"vertex_{name}", si)).ravel()
+            # In spectral variants, Mitsuba takes other attributes of three numbers for spectra, too.
+            if "color" in name or len(columns) == 1 or not mi.is_spectral:
+                values[f"spectrum of {name}"] = np.array(shape.eval_attribute(f"vertex_{name}", si)).ravel()
+        found.append(values)
+    for name, expected in found[1].items():
+        np.testing.assert_allclose(found[0][name], expected, rtol=SPECTRUM, atol=SPECTRUM, err_msg=name)
+    # Of 0.2, 0.5, 0.1: green.
+    assert mi.is_monochromatic or found[0]["spectrum of color"][[1, 2]].max() > 0.45
+    if not mi.is_spectral:
+        # The values of the file.
+        np.testing.assert_allclose(found[0]["color"], [0.2, 0.5, 0.1], atol=SPECTRUM)
+    parameters = mi.traverse(ours)
+    np.testing.assert_allclose(np.array(parameters["cage_color"]), np.tile([0.2, 0.5, 0.1], 4), atol=SPECTRUM)
+
+
+@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+@pytest.mark.usefixtures("variant_llvm_ad_spectral")
+def test_spectra_have_derivatives_by_colours(tmp_path, shading):
+    """Of one constant colour, against differences."""
+    path = str(square(tmp_path / "square.ply"))
+    shape = mi.load_dict({"type": "subdivision", "filename": path, "shading": shading, "boundary": "edge_and_corner"})
+    scene, parameters = mi.load_dict({"type": "scene", "shape": shape}), mi.traverse(shape)
+
+    def spectrum(color):
+        parameters["cage_color"] = dr.ravel(mi.Color3f(color) + dr.zeros(mi.Color3f, 4))
+        parameters.update()
+        si = scene.ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, [450, 500, 550, 600]))
+        return shape.eval_attribute("vertex_color", si)
+
+    given = np.array([0.21, 0.53, 0.12])
+    color = mi.Color3f(given)
+    dr.enable_grad(color)
+    dr.backward(dr.sum(spectrum(color) * mi.Spectrum(1, 2, 3, 4)))
+    gradient = np.array(dr.grad(color)).ravel()
+    for i in range(3):
+        # Within one cell of the table, where the spectrum is nearly linear.
+        step = 1e-3 * np.eye(3)[i]
+        change = np.array(spectrum(given + step) - spectrum(given - step)).ravel() @ [1, 2, 3, 4] / 2e-3
+        np.testing.assert_allclose(gradient[i], change, rtol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["vertex_displayColor", "face_color"])
+@pytest.mark.usefixtures("variants_all")
+def test_meshes_of_polygons_have_spectra_as_well(name):
+    colors = np.array([[0.2, 0.5, 0.1], [0.2, 0.5, 0.1], [0.2, 0.5, 0.1]])[: 1 if name.startswith("face") else 3]
+    positions = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    mesh = mitsuba_mesh("triangle", np.array([[0, 1, 2]]), {"vertex_positions": positions, name: colors})
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.p = mi.Point3f(0, 0, 0)
+    expected = [0.2, 0.5, 0.1]
+    if mi.is_spectral:
+        si.wavelengths = [450, 500, 550, 600]
+        expected = mi.load_dict({"type": "srgb", "color": expected}).eval(si)
+    elif mi.is_monochromatic:
+        expected = mi.luminance(mi.Color3f(expected))
+    np.testing.assert_allclose(
+        np.array(mesh.eval_attribute(name, si)).ravel(), np.array(expected).ravel(), atol=SPECTRUM
+    )
+
+
+@exact
+@pytest.mark.usefixtures("variant_llvm_ad_spectral")
+def test_frozen_functions_look_up_spectra(tmp_path):
+    path = str(square(tmp_path / "square.ply"))
+    scene = mi.load_dict({"type": "scene", "shape": {"type": "subdivision", "filename": path, "shading": "exact"}})
+    parameters = mi.traverse(scene)
+
+    def spectrum(scene, x):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.1, 5), [0, 0, -1], 0, mi.Spectrum(450, 500, 550, 600)))
+        return si.shape.eval_attribute("vertex_color", si)
+
+    frozen = dr.freeze(spectrum)
+    for grey in (0.25, 0.75, 0.5):
+        parameters["shape.cage_color"] = dr.full(mi.Float, grey, 12)
+        parameters.update()
+        found = frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))
+        np.testing.assert_allclose(np.array(found), grey, atol=SPECTRUM)
+    # The last values were looked up without Python.
+    assert frozen.n_recordings < 3

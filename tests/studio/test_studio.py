@@ -1,5 +1,6 @@
 """The studio: what the camera frames, scenes of models, and scenes as XML."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 
 import mitsuba as mi
@@ -304,3 +305,73 @@ def test_mitsuba_takes_as_many_samples_as_it_is_given():
     counts = [sampler(spp)["sample_count"] for spp in range(1, 101)]
     assert [mi.load_dict(sampler(spp)).sample_count() for spp in range(1, 101)] == counts
     assert all(spp <= count <= spp + np.sqrt(spp) for spp, count in enumerate(counts, 1))
+
+
+def coloured(cage, attribute):
+    """Red at vertices with x above 0, blue at others."""
+    colours = np.where(cage.positions[:, :1] > 0, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
+    return msub.ControlCage(
+        cage.positions, cage.face_vertices.reshape(-1, 4), attributes={attribute: colours, "weight": np.ones((8, 1))}
+    )
+
+
+@pytest.mark.parametrize("attribute", ["color", "displayColor"])
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_colours_of_vertices_are_seen(attribute, tmp_path):
+    """Red is on the right and blue on the left, from a file and from memory."""
+    cage = coloured(named_cages.cube(), attribute)
+    given = [cage]
+    if attribute == "color":
+        pytest.importorskip("plyfile")
+        cage.save(tmp_path / "cube.ply")
+        given.append(tmp_path / "cube.ply")
+    for each in given:
+        scene = studio_scene(each, view="front", up="z", **SMALL)
+        image = np.array(mi.render(mi.load_dict(scene)))[..., :3]
+        left, right = image[9, 9], image[9, 14]
+        # Subdivision mixes the colours of the corners.
+        assert left[2] > 1.5 * left[0]
+        assert right[0] > 1.5 * right[2]
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_a_checkerboard_goes_before_colours():
+    cage = coloured(named_cages.cube(), "color")
+    with_texcoords = msub.ControlCage(
+        cage.positions, cage.face_vertices.reshape(-1, 4), texcoords=np.zeros((8, 2)), attributes=cage.attributes
+    )
+    colour = studio_scene(with_texcoords, checker=True, **SMALL)["surface"]["bsdf"]["bsdf"]["base_color"]
+    assert colour["type"] == "checkerboard"
+    # Other numbers are no colours.
+    plain = msub.ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), attributes={"color": np.zeros((8, 1))})
+    assert studio_scene(plain, **SMALL)["surface"]["bsdf"]["bsdf"]["base_color"]["type"] == "rgb"
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        (0, 'cube.obj": bounds from (1, 1, 1) to (1, 1, 1); expected a box with a size, below 1e+37'),
+        (1e300, 'cube.obj": bounds from (-8.3'),
+    ],
+)
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_messages_about_boxes_name_the_file(tmp_path, scale, message):
+    cage = named_cages.cube()
+    msub.ControlCage(cage.positions * scale + (scale == 0), cage.face_vertices.reshape(-1, 4)).save(
+        tmp_path / "cube.obj"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        studio_scene(tmp_path / "cube.obj", **SMALL)
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_the_message_about_a_size_names_the_file(tmp_path):
+    cage = named_cages.cube()
+    msub.ControlCage(1e12 * cage.positions, cage.face_vertices.reshape(-1, 4)).save(tmp_path / "cube.obj")
+    with pytest.warns(CageWarning, match=r'cube.obj": a model [0-9.]+ units large'):
+        studio_scene(tmp_path / "cube.obj", **SMALL)
+
+
+def test_numbers_in_messages_differ_from_what_was_expected():
+    with pytest.raises(ValueError, match=r"elevation 90.00000001; expected -90 to 90"):
+        msub.studio_scene(named_cages.cube(), view=(0, 90.00000001))

@@ -9,6 +9,9 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from types import FrameType
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 _PACKAGE = __name__.partition(".")[0]
 _noted: ContextVar[list[str]] = ContextVar("noted")
 _warns: ContextVar[bool] = ContextVar("warns", default=True)
@@ -59,6 +62,14 @@ def without_warnings() -> Iterator[None]:
 def shortened(text: str, length: int = 80) -> str:
     """Text from a file or a library as a message shows it: cut off, with an ellipsis, where it is long."""
     return text if len(text) <= length else f"{text[:length]}..."
+
+
+def in_digits(numbers: ArrayLike) -> str:
+    """A number, or a tuple of numbers, as a message shows it: with all digits that tell it from others."""
+    found = np.asarray(numbers)
+    if found.ndim:
+        return f"({', '.join(map(in_digits, found))})"
+    return str(found[()]).removesuffix(".0")
 
 
 def number_of(count: int, noun: str) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import INFINITE, Sharpness
-from .errors import CageError
+from .errors import CageError, in_digits
 from .source import CageSource
 from .validation import read_only
 
@@ -184,6 +184,6 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
 def _require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
     for row in np.flatnonzero(~(values >= 0))[:1]:
         raise CageError(
-            f"{where(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "
+            f"{where(row)} has sharpness {in_digits(values[row])}; expected 0 for smooth, up to {INFINITE:g} for "
             "semi-sharp, or more for infinitely sharp"
         )

@@ -15,6 +15,9 @@ from ..mesh.connectivity import IntArray
 SPACE, _NEWLINE = b" \n"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _COMMENT = re.compile(rb"#[^\n]*")
+# The name of a material may have a "#" in it, but for one between spaces.
+_MATERIAL = re.compile(rb"usemtl[ \t][^\n]*#[^\n]*")
+_COMMENT_OF_NAME = re.compile(rb"[ \t]#(?=\s|$)")
 _CONTINUATION = rb"\\\r?\n"
 # If other statements interrupt those of a kind more often than this, a mask over all bytes is faster than a loop over
 # the interruptions.
@@ -73,7 +76,7 @@ class ObjText:
         line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
         text, statement_end = content, line_end
         if b"#" in text:
-            text = _COMMENT.sub(_blank, text)
+            text = _with_names(_COMMENT.sub(_blank, text), text)
         if b"\\" in text:
             if text.rstrip().endswith(b"\\"):
                 line = np.searchsorted(line_end, len(text.rstrip())) + 1
@@ -184,3 +187,14 @@ def run_starts(inside: NDArray[np.bool_]) -> IntArray:
 
 def _blank(match: re.Match[bytes]) -> bytes:
     return b" " * len(match[0])
+
+
+def _with_names(text: bytes, content: bytes) -> bytes:
+    """Text without comments, with the names of materials as they were."""
+    found = bytearray(text)
+    for statement in _MATERIAL.finditer(content):
+        start = statement.start()
+        if not content[content.rfind(b"\n", 0, start) + 1 : start].strip():
+            name = _COMMENT_OF_NAME.split(statement[0])[0]
+            found[start : start + len(name)] = name
+    return bytes(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -99,7 +100,8 @@ def _cage_text(contents: CageContents, texcoords: Attribute | None) -> str:
 
 def _is_possible(name: str) -> bool:
     """Whether a ``usemtl`` statement with this name of a material is read back as it was."""
-    return name == name.strip() and name.isprintable() and "#" not in name and not name.endswith("\\")
+    is_comment = re.search(r"(^|\s)#(\s|$)", name)
+    return name == name.strip() and name.isprintable() and not is_comment and not name.endswith("\\")
 
 
 def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:

@@ -20,7 +20,7 @@ from ..cage.source import CageSource
 from ..mesh.connectivity import IntArray
 from .ply_header import EXPECTED, PlyHeader
 from .ply_lists import lists_of_rows
-from .ply_names import COLOR, MATERIAL, NORMAL, POSITION, TEXCOORDS, grouped
+from .ply_names import MATERIAL, NORMAL, POSITION, TEXCOORDS, color_of, grouped
 
 if TYPE_CHECKING:
     from plyfile import PlyElement
@@ -36,9 +36,11 @@ def read_ply(path: str | Path) -> CageContents:
 
     - ``x``, ``y`` and ``z`` are the position.
     - ``s`` and ``t``, or ``u`` and ``v``, or ``texture_u`` and ``texture_v`` are texture coordinates.
-    - ``red``, ``green``, ``blue`` and ``alpha`` are the attribute "color"; unsigned integers are scaled to 0 to 1.
+    - ``red``, ``green`` and ``blue``, or ``r``, ``g`` and ``b``, are the attribute "color", and ``alpha`` or ``a``
+      beside them the attribute "alpha"; unsigned integers are scaled to 0 to 1.
     - ``nx``, ``ny`` and ``nz`` are dropped, as the normals of the surface follow from its points.
-    - ``name_0``, ``name_1`` and so on are one attribute "name".
+    - ``name_0``, ``name_1`` and so on, from 0 or from 1, and ``name_x``, ``name_y`` and ``name_z`` are one attribute
+      "name"; ``name_r``, ``name_g`` and ``name_b`` are "name_color".
     - Any other number is an attribute of its own.
 
     Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
@@ -201,13 +203,12 @@ def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | Non
     """Texture coordinates and attributes, which are among the properties that are numbers."""
     names = [name for name in numbers if name not in (*POSITION, *NORMAL)]
     pair = next((pair for pair in TEXCOORDS if set(pair) <= set(names)), None)
-    color = [name for name in COLOR if name in names] if set(COLOR[:3]) <= set(names) else []
-    groups = {"color": color} if color else {}
-    groups.update(grouped([name for name in names if name not in (*(pair or ()), *color)]))
-    attributes = {
-        name: Attribute(_columns(data, members, scaled=name == "color" and bool(color)))
-        for name, members in groups.items()
-    }
+    names = [name for name in names if name not in (pair or ())]
+    color = color_of(names)
+    attributes = {}
+    for name, columns in grouped(names).items():
+        is_color = {*columns} <= {*color} or name.endswith("_color")
+        attributes[name] = Attribute(_columns(data, columns, scaled=is_color))
     return None if pair is None else Attribute(_columns(data, pair)), attributes
 
 

@@ -41,7 +41,7 @@ def write_ply(contents: CageContents, path: str | Path) -> None:
     attributes = {
         name: attribute.values
         for name, attribute in contents.attributes.items()
-        if attribute.interpolation == "vertex" and is_possible(name, attribute.values.shape[1])
+        if attribute.interpolation == "vertex" and is_possible(name)
     }
     numbers, owner = _material_numbers(contents.materials), contents.material_of_face
     warn_of_losses(
@@ -85,7 +85,7 @@ def write_ply_triangles(
     attributes: Mapping[str, NDArray],
 ) -> None:
     """Write triangles to a PLY file in single precision; see `triangle_writer.write_triangles`."""
-    possible = {name: value for name, value in attributes.items() if is_possible(name, value.shape[1])}
+    possible = {name: value for name, value in attributes.items() if is_possible(name)}
     warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
     properties = dict(zip((*POSITION, *NORMAL), [*positions.T, *normals.T], strict=True))
     if texcoords is not None:

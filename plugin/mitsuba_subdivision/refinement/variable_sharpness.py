@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage.control_cage import ControlCage
-from ..cage.errors import CageError
+from ..cage.errors import CageError, in_digits
 from ..cage.tags import validated_edges, validated_vertices
 from ..mesh.connectivity import IntArray
 from ..mesh.sharpness import Sharpness
@@ -252,8 +252,8 @@ class VariableSharpness:
         for edge in np.flatnonzero(is_longer)[:1]:
             name = given.source.edge(t.face_vertices[edge], t.face_vertices[t.next[edge]])
             raise CageError(
-                f"{given.source.name}: {name} has sharpness {given.tags.edges[edge]:g}; expected at most the highest, "
-                f'{self.highest}, with crease_method "chaikin"'
+                f"{given.source.name}: {name} has sharpness {in_digits(given.tags.edges[edge])}; expected at most the "
+                f'highest, {self.highest}, with crease_method "chaikin"'
             )
 
     def _refine(self) -> None:
@@ -334,7 +334,8 @@ class VariableSharpness:
             source, at = self._given.source, row - len(self.edges)
             name = source.edge(*self.edges[row]) if at < 0 else source.vertex(self.corners[at])
             raise CageError(
-                f"{source.name}: {name} has sharpness {values[row]:g}; expected 0 up to the highest, {self.highest}"
+                f"{source.name}: {name} has sharpness {in_digits(values[row])}; expected 0 up to the highest, "
+                f"{self.highest}"
             )
         return values
 

@@ -6,7 +6,8 @@
     displacement.py          uses them as heights
 
 The parameter ``cage_NAME`` holds the control values of attribute NAME, flat. The buffer ``vertex_NAME`` holds its
-values at the vertices of the tessellation: a sparse weight matrix times the control values.
+values at the vertices of the tessellation: a sparse weight matrix times the control values. In spectral variants, it
+holds spectra of colours.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from .attribute_parameters import mesh_name
 from .device_state import is_recording
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
+from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -76,6 +78,12 @@ class CageAttributes:
             f"{PREFIX}{name}": kind(given.array) for name, given in self._given.items()
         }
         self.moving: set[str] = set()
+        self._colors = {
+            name
+            for name, channel in self._channels.items()
+            if holds_spectra(variant, mesh_name(name), channel.values.shape[1])
+        }
+        self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
         self._followers: list[tuple[str, Callable[[FloatBuffer], None]]] = []
         # Attributes that differ from their loaded values, with their derivatives.
         self._moved: dict[str, FloatBuffer] = {}
@@ -135,7 +143,7 @@ class CageAttributes:
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
         """Mesh buffers of some attributes, by default of all, keyed by buffer name."""
         chosen = self._channels if names is None else names
-        return {mesh_name(name): self._at_vertices(name) for name in chosen if name in self._loaded}
+        return {mesh_name(name): self._stored(name) for name in chosen if name in self._loaded}
 
     def _control_values(self, channel: Channel) -> SharedArray:
         if self._float is None:
@@ -151,6 +159,11 @@ class CageAttributes:
         from ..kernels.array_types import ArrayTypes
 
         return ArrayTypes.of(self._float).shared_floats(values.astype(np.float32))
+
+    def _stored(self, name: str) -> FloatBuffer:
+        """What the mesh stores of an attribute."""
+        values = self._at_vertices(name)
+        return self._upsampling.stored(values) if self._upsampling and name in self._colors else values
 
     def _at_vertices(self, name: str) -> FloatBuffer:
         if name not in self._moved:

@@ -32,6 +32,7 @@ from ..tessellation import AttributeLayout, AttributeTable
 from ..variants import Variant
 from .attribute_parameters import WIDTHS, mesh_name
 from .placement import Placement
+from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
     from ..tessellation import VertexTable
@@ -112,6 +113,10 @@ class ExactShading:
             for name, attribute in surface.cage.attributes.items()
             if self._is_jit and attribute.values.shape[1] in WIDTHS
         }
+        self._colors = {
+            name for name, channel in self._attributes.items() if holds_spectra(variant, name, channel.values.size)
+        }
+        self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
         self.side: Callable[[], Side] = lambda: Side.OPAQUE
         self._sign = 1.0
 
@@ -254,7 +259,7 @@ class ExactShading:
         return counts
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
-        """Value of an attribute as Mitsuba asks for it."""
+        """Value of an attribute as a mesh stores it; in spectral variants the coefficients of a colour's spectrum."""
         if name not in self._attributes:
             return None
         vector3 = self.kernel.types.vector3
@@ -271,7 +276,26 @@ class ExactShading:
         is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
         mirrored = to_world.inverse_direction(self._direction(si, type(wi)(wi.x, wi.y, -wi.z)))
         location = location.chosen(is_other, self.kernel.line_hits(hit, mirrored, start, is_other).location)
-        return self._attributes[name](location, active)[0]
+        value = self._attributes[name](location, active)[0]
+        return self._upsampling(value) if self._upsampling and name in self._colors else value
+
+    def texcoords_of_corners(self, face_count: int) -> FloatArray:
+        """Texture coordinates ``(3 n, 2)`` at the corners of all triangles, in their order in the mesh."""
+        if self._texcoords is None:
+            raise RuntimeError(f"{self._name} has no texture coordinates")
+        index, b1, b2 = np.repeat(np.arange(face_count), 3), *np.tile(np.eye(3)[1:], face_count)
+        if self._are_turned:
+            b1, b2 = b2, b1
+        if not self._is_jit:
+            found = [
+                self._texcoords(self._triangles(*corner, True), True)[0]
+                for corner in zip(index.tolist(), b1.tolist(), b2.tolist(), strict=True)
+            ]
+            return np.array(found)
+        types = self.kernel.types
+        with dr.suspend_grad():
+            location = self._triangles(types.indices(index), types.floats(b1), types.floats(b2), True)
+            return np.array(self._texcoords(location, True)[0]).T
 
     def _is_moving(self) -> bool:
         """Whether there are derivatives by anything that moves the surface."""

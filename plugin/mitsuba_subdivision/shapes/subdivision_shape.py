@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import upload
-from ..kernels.types import Float, FloatBuffer, IndexBuffer, Matrix4
+from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
 from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
@@ -33,6 +33,7 @@ from .vertices import require_control_points
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
+    from .parameterization import Parameterization
 
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
@@ -115,6 +116,8 @@ def make_subdivision(variant: Variant) -> type:
             self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
+            self._parameterization: Parameterization | None = None
+            self._has_texcoords = TEXCOORDS in surface.attribute_names
             if is_exact:
                 from .exact_shading import ExactShading
 
@@ -195,6 +198,7 @@ def make_subdivision(variant: Variant) -> type:
             vertices = vertices_of(table, attributes, parameters, self._displacement, float_type, is_exact=is_exact)
             self._vertices = MovingVertices(vertices, self._points, parameters.source, self._exact, self._displacement)
             self._has_outlines = False
+            self._parameterization = None
 
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
@@ -259,6 +263,7 @@ def make_subdivision(variant: Variant) -> type:
                 # Mitsuba discards its silhouette edges.
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
+            self._parameterization = None
             if (_MOVING | _CHOOSING | self._cage.moving).isdisjoint(keys):
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
@@ -403,6 +408,76 @@ def make_subdivision(variant: Variant) -> type:
             # Where a triangle has no area, its derivative is not a number.
             doubled = dr.select(squared > 0, dr.sqrt(dr.select(squared > 0, squared, 1)), 0)
             return dr.replace_grad(area, dr.sum(doubled) / 2)
+
+        def vertex_normal(self, index: Index, active: Mask = True) -> Vector3:
+            """Normal at a vertex of the mesh.
+
+            Raises
+            ------
+            RuntimeError
+                If the mesh has none, whose buffer Mitsuba would read beyond its end.
+            """
+            self._require_at_vertices("vertex_normal", "normals", self.has_vertex_normals())
+            return super().vertex_normal(index, active)
+
+        def vertex_texcoord(self, index: Index, active: Mask = True) -> Vector2:
+            """Texture coordinates at a vertex of the mesh.
+
+            Raises
+            ------
+            RuntimeError
+                If the mesh has none, whose buffer Mitsuba would read beyond its end.
+            """
+            self._require_at_vertices("vertex_texcoord", "texture coordinates", self.has_vertex_texcoords())
+            return super().vertex_texcoord(index, active)
+
+        def eval_parameterization(
+            self, uv: Vector2, ray_flags: int = int(mi.RayFlags.All), active: Mask = True
+        ) -> mi.SurfaceInteraction3f:
+            """Interaction where the surface has some texture coordinates; invalid where it has not.
+
+            Raises
+            ------
+            RuntimeError
+                If the cage has no texture coordinates.
+            """
+            if self.has_vertex_texcoords():
+                return super().eval_parameterization(uv, ray_flags, active)
+            self._require_at_vertices("eval_parameterization", "texture coordinates", self._has_texcoords)
+            if self._parameterization is None and self._exact is not None:
+                from .parameterization import Parameterization
+
+                self._parameterization = Parameterization(variant, self, self._exact)
+            assert self._parameterization is not None
+            return self._parameterization.hit(self, variant.Point2f(uv), int(ray_flags), variant.Mask(active))
+
+        def recompute_vertex_normals(self) -> None:
+            """Replace the normals of the limit surface by means of those of the triangles.
+
+            Raises
+            ------
+            RuntimeError
+                If the mesh has no normals.
+            """
+            self._require_at_vertices("recompute_vertex_normals", "normals", self.has_vertex_normals())
+            super().recompute_vertex_normals()
+
+        def merge(self, other: mi.Mesh) -> mi.Mesh:  # noqa: ARG002
+            """Refuse: merged meshes would not follow control points."""
+            raise RuntimeError(
+                f"{self._parameters.source}: merge: the shape's vertices follow its control points; expected meshes "
+                "without any, such as those of files that write_ply writes"
+            )
+
+        def _require_at_vertices(self, method: str, what: str, is_there: bool) -> None:
+            if is_there:
+                return
+            reason = "it has face normals" if what == "normals" else "the cage has none"
+            if self._exact is not None and (what == "normals" or self._has_texcoords):
+                reason = 'exact shading evaluates them at hits; expected the shading "vertex"'
+            raise RuntimeError(
+                f"{self._parameters.source}: {method}: the mesh has no {what} at its vertices, as {reason}"
+            )
 
         def to_string(self) -> str:
             box = self.bbox()

@@ -21,6 +21,7 @@ from ..cage.equality import same_topology
 from ..cage.errors import warn
 from ..files.formats import read_file
 from ..regression.scene import LoadedScene
+from ..shapes.attribute_parameters import mesh_name
 from ..variants import SceneNode
 from .animation import load_quietly, set_parameters
 from .frame_files import FrameFiles
@@ -34,6 +35,8 @@ CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
 # Squares along a texture coordinate from 0 to 1.
 CHECKER_SQUARES = 16
+# Attributes that are shown in place of clay: of PLY files, and of USD's meshes.
+COLOURS = ("color", "displayColor")
 WIRE_COLOUR = (0.015, 0.05, 0.12)
 WIRE_RATE = 2
 
@@ -141,7 +144,7 @@ class CageScenes:
         points = self.points(contents) if points is None else points
         up, view, size = self.framing(contents)
         bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-        staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points)
+        staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points, name=self.name)
         triangles = None
         if follows_sensor and look.rate is None and look.shading == "exact":
             triangles = model.triangles_for(staged["sensor"])
@@ -200,7 +203,7 @@ class CageScenes:
         triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
         surface = model.as_shape(triangles, look.shading, in_memory=in_memory)
         surfaces = {} if look.checker else _in_materials(model, surface, in_memory)
-        surfaces = surfaces or {"surface": {**surface, "bsdf": _material(look.checker)}}
+        surfaces = surfaces or {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
         if not look.cage:
             return surfaces
         wire = {
@@ -226,14 +229,19 @@ def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNod
         found["surface" if not found else f"surface_{len(found) + 1}"] = {
             **surface,
             **(shown if len(model.cage.materials) > 1 else {}),
-            "bsdf": _material(False) if material is None else material_bsdf(material, name),
+            "bsdf": _material(model.cage) if material is None else material_bsdf(material, name),
             **({} if emitter is None else {"emitter": emitter}),
         }
     return found
 
 
-def _material(checker: bool) -> SceneNode:
+def _material(cage: ControlCage, checker: bool = False) -> SceneNode:
+    """A checkerboard, or the colours at the vertices of a cage, or clay."""
+    attributes = cage.attributes
+    shown = next((name for name in COLOURS if name in attributes and attributes[name].values.shape[1] == 3), None)
     colour: SceneNode = {"type": "rgb", "value": list(CLAY)}
+    if shown is not None:
+        colour = {"type": "mesh_attribute", "name": mesh_name(shown)}
     if checker:
         colour = {
             "type": "checkerboard",

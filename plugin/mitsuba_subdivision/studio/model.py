@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, ControlCage
 from ..cage.contents import CageContents
+from ..cage.errors import shortened, warn
 from ..surface import LimitSurface
 from ..tessellation import VertexTable
 from ..variants import SceneNode
@@ -80,7 +81,13 @@ class Model:
         """Materials that the libraries of an OBJ file describe, by name."""
         is_obj = self.path is not None and self.path.suffix.lower() == ".obj"
         by_face = self.surface.scheme.element == "face" or len(self.cage.materials) == 1
-        return read_materials(self.path) if self.path and is_obj and self.cage.materials and by_face else {}
+        if not (self.path and is_obj and self.cage.materials and by_face):
+            return {}
+        found = read_materials(self.path)
+        missing = ", ".join(f'"{name}"' for name in self.cage.materials if name and name not in found)
+        if found and missing:
+            warn(f'"{self.path}": no material library has {shortened(missing, 200)}; their faces are grey')
+        return found
 
     @property
     def cage(self) -> ControlCage:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from ..cage.errors import shortened, warn
 from ..variants import SceneNode
@@ -18,7 +21,64 @@ _WITHOUT_EFFECT = ("Ka", "map_Ka", "Ni")
 # Models of the entry "illum" without highlights.
 _MATTE = (0, 1)
 
-Material = dict[str, list[float] | Path]
+# Options of a map, with the number of their values; of the last three, all but the first value may be missing.
+_OPTIONS = {
+    **dict.fromkeys(("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type"), 1),
+    "-mm": 2,
+    **dict.fromkeys(("-o", "-s", "-t"), 3),
+}
+# Those that a picture of colours does not need: strengths of bumps, sharpness of small pictures and their size.
+_OPTIONS_WITHOUT_EFFECT = ("-bm", "-boost", "-cc", "-texres")
+_EXPECTED = "Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, illum, Pr and Pm"
+
+
+@dataclass
+class Picture:
+    """A picture that is mapped onto a surface.
+
+    Attributes
+    ----------
+    path : Path
+    scale, offset : list of float
+        The picture is looked up at ``scale * uv + offset``.
+    base, gain : float
+        Its linear values ``c`` become ``base + gain * c``.
+    is_clamped : bool
+        Whether it is continued by its edges, rather than repeated.
+    is_blended : bool
+        Whether pixels are interpolated.
+    """
+
+    path: Path
+    scale: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
+    offset: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    base: float = 0.0
+    gain: float = 1.0
+    is_clamped: bool = False
+    is_blended: bool = True
+
+    def texture(self) -> SceneNode:
+        """The picture as a texture of Mitsuba."""
+        # OBJ's v points up, a bitmap's down.
+        to_uv = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])
+        to_uv = to_uv.translate([*self.offset[:2], 0]).scale([*self.scale[:2], 1])
+        picture: SceneNode = {"filename": str(self.path.resolve())}
+        if (self.base, self.gain) != (0, 1):
+            bitmap = mi.Bitmap(str(self.path)).convert(
+                mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False
+            )
+            values = np.clip(self.base + self.gain * np.array(bitmap), 0, 1)
+            picture = {"bitmap": mi.Bitmap(values.astype(np.float32))}
+        return {
+            "type": "bitmap",
+            **picture,
+            "to_uv": to_uv,
+            "wrap_mode": "clamp" if self.is_clamped else "repeat",
+            "filter_type": "bilinear" if self.is_blended else "nearest",
+        }
+
+
+Material = dict[str, list[float] | Picture]
 
 
 def read_materials(path: Path) -> dict[str, Material]:
@@ -32,14 +92,32 @@ def read_materials(path: Path) -> dict[str, Material]:
     content = path.read_bytes()
     found: dict[str, Material] = {}
     for names in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)\s*$", content, re.MULTILINE):
-        library = path.parent / names.decode(errors="replace").replace("\\", "/")
-        try:
-            text = library.read_text(encoding="utf-8", errors="replace")
-        except OSError:
-            warn(f'"{path}": there is no material library "{library.name}"; its materials are grey')
-            continue
-        found.update(_parsed(library, text))
+        for library in _libraries(path.parent, names.decode(errors="replace")):
+            try:
+                text = library.read_text(encoding="utf-8", errors="replace")
+            except OSError:
+                warn(f'"{path}": there is no material library "{library.name}"; its materials are grey')
+                continue
+            found.update(_parsed(library, text))
     return found
+
+
+def _libraries(folder: Path, names: str) -> list[Path]:
+    """Files that a statement ``mtllib`` names: one whose name may have spaces, or several that end in ".mtl"."""
+    names = _without_comment(names)
+    whole = _file(folder, names)
+    if whole.is_file():
+        return [whole]
+    return [_file(folder, name) for name in re.split(r"(?<=\.mtl)\s+", names, flags=re.IGNORECASE)]
+
+
+def _file(folder: Path, name: str) -> Path:
+    return folder / name.strip().strip('"').replace("\\", "/")
+
+
+def _without_comment(line: str) -> str:
+    """A line without its comment; a name may have a "#" in it, but for one between spaces."""
+    return re.sub(r"(^#|\s#(?=\s|$)).*", "", line.strip()).strip()
 
 
 def _parsed(library: Path, text: str) -> dict[str, Material]:
@@ -47,27 +125,61 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
     material: Material = {}
     left_out: dict[str, None] = {}
     for line in text.splitlines():
-        key, _, rest = line.split("#", 1)[0].strip().partition(" ")
+        key, rest = [*_without_comment(line).split(None, 1), "", ""][:2]
         if key == "newmtl":
-            found[rest.strip()] = material = {}
+            found[rest] = material = {}
         elif key in _NUMBERS:
-            try:
-                values = [float(word) for word in rest.split()[: _NUMBERS[key]]]
-            except ValueError:
-                values = []
+            values = _leading_numbers(rest.split(), _NUMBERS[key])
             # A grey may be one number.
             values = values * 3 if len(values) == 1 and _NUMBERS[key] == 3 else values
             if len(values) == _NUMBERS[key]:
                 material.setdefault(key, values)
             else:
                 left_out[f'"{shortened(line.strip())}"'] = None
-        elif key == _TEXTURE and not rest.strip().startswith("-"):
-            material[key] = library.parent / rest.strip().replace("\\", "/")
+        elif key == _TEXTURE:
+            material[key] = _picture(library.parent, rest, left_out)
         elif key and key not in _WITHOUT_EFFECT:
             left_out[key] = None
     if left_out:
         names = shortened(", ".join(left_out), 200)
-        warn(f'"{library}": {names} left out; expected Kd, map_Kd, Ks, Ns, Ke, d, Tr, illum, Pr and Pm')
+        warn(f'"{library}": {names} left out; expected {_EXPECTED}')
+    return found
+
+
+def _leading_numbers(words: list[str], most: int) -> list[float]:
+    """The first words, as long as they are finite numbers."""
+    found: list[float] = []
+    for word in words[:most]:
+        try:
+            found.append(float(word))
+        except ValueError:
+            break
+        if not math.isfinite(found[-1]):
+            return found[:-1]
+    return found
+
+
+def _picture(folder: Path, text: str, left_out: dict[str, None]) -> Picture:
+    """The picture of a map: options and the name of a file, which may have spaces."""
+    found = Picture(folder)
+    while (option := text.split(None, 1)[0] if text else "") in _OPTIONS:
+        words = text.split(None, 1 + _OPTIONS[option])[1:]
+        numbers = _leading_numbers(words, _OPTIONS[option])
+        count = max(len(numbers), 1) if _OPTIONS[option] == 3 else _OPTIONS[option]
+        text = "".join(text.split(None, 1 + count)[1 + count :])
+        is_on = words[:1] == ["on"]
+        if option in ("-s", "-o") and numbers:
+            values = found.scale if option == "-s" else found.offset
+            values[: len(numbers)] = numbers
+        elif option == "-mm" and len(numbers) == 2:
+            found.base, found.gain = numbers
+        elif option == "-clamp":
+            found.is_clamped = is_on
+        elif option in ("-blendu", "-blendv"):
+            found.is_blended &= is_on
+        elif option not in _OPTIONS_WITHOUT_EFFECT and any(numbers or [1]):
+            left_out[f'"{shortened(" ".join([option, *words[:count]]))}" of {_TEXTURE}'] = None
+    found.path = _file(folder, text)
     return found
 
 
@@ -79,13 +191,11 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
     """
     colour: SceneNode = {"type": "rgb", "value": _clipped(material.get("Kd", [0.8] * 3))}
     texture = material.get(_TEXTURE)
-    if isinstance(texture, Path):
-        if texture.is_file():
-            # OBJ's v points up, a bitmap's down; pictures repeat.
-            upright = mi.ScalarTransform4f().scale([1, -1, 1])
-            colour = {"type": "bitmap", "filename": str(texture.resolve()), "to_uv": upright}
+    if isinstance(texture, Picture):
+        if texture.path.is_file():
+            colour = texture.texture()
         else:
-            warn(f'material "{name}": there is no picture "{texture}"; its colour is Kd')
+            warn(f'material "{name}": there is no picture "{texture.path}"; its colour is Kd')
     (exponent,), (illumination,) = _numbers(material, "Ns", [0.0]), _numbers(material, "illum", [2.0])
     specular = sum(_clipped(material.get("Ks", [0.0] * 3))) / 3
     bsdf: SceneNode = {
@@ -111,5 +221,5 @@ def _numbers(material: Material, key: str, default: list[float]) -> list[float]:
     return found if isinstance(found, list) else default
 
 
-def _clipped(values: list[float] | Path) -> list[float]:
+def _clipped(values: list[float] | Picture) -> list[float]:
     return [min(max(value, 0.0), 1.0) for value in values] if isinstance(values, list) else [0.8] * 3

@@ -132,7 +132,7 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     if (
         not has_tags
         and all(each.interpolation == "vertex" for each in data.values())
-        and all(ply_names.is_possible(key, each.values.shape[1]) for key, each in contents.attributes.items())
+        and all(map(ply_names.is_possible, contents.attributes))
         and importlib.util.find_spec("plyfile")
     ):
         return ".ply"

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..cage.errors import warn
+from ..cage.errors import in_digits, warn
 from ..variants import SceneNode
 from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
@@ -21,6 +21,8 @@ DEFAULT_SPP = 64
 LARGEST_SIDE = 1 << 14
 # Sizes of models that Mitsuba renders alike, as measured: lengths are squared in single precision.
 SIZES = (1e-9, 5e8)
+# Of boxes: points beyond are infinite in single precision.
+LARGEST_BOX = 1e37
 
 # Positions of lights, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
 # sides, their radiance, and their sampling weights, chosen for least noise.
@@ -47,6 +49,7 @@ def studio(
     size: tuple[int, int] = DEFAULT_SIZE,
     spp: int = DEFAULT_SPP,
     points: ArrayLike | None = None,
+    name: str | None = None,
 ) -> SceneNode:
     """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
 
@@ -68,6 +71,8 @@ def studio(
         Samples per pixel.
     points : (n, 3) array, optional
         Points of the model in the world, within the bounds. The camera frames these; by default, the box.
+    name : str, optional
+        Of the model, or of its file, with which messages begin.
 
     Returns
     -------
@@ -87,7 +92,8 @@ def studio(
         If the model is so small or large that Mitsuba's single precision does not render it.
     """
     variant_in_use()
-    box = _checked_bounds(bounds)
+    prefix = "" if name is None else f"{name}: "
+    box = _checked_bounds(bounds, prefix)
     _check_film(size, spp)
     azimuth, elevation = angles_of(view)
     axes = studio_axes(up)
@@ -96,8 +102,8 @@ def studio(
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     if not SIZES[0] < 2 * radius < SIZES[1]:
         warn(
-            f"a model {2 * radius:.3g} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which Mitsuba's "
-            "single precision loses light and surfaces"
+            f"{prefix}a model {in_digits(2 * radius)} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which "
+            "Mitsuba's single precision loses light and surfaces"
         )
     camera = framed(in_world @ axes, azimuth, elevation, size)
     from_below = elevation < 0
@@ -186,12 +192,16 @@ def _rgb(value: tuple[float, ...]) -> SceneNode:
     return {"type": "rgb", "value": list(value)}
 
 
-def _checked_bounds(bounds: ArrayLike) -> NDArray[np.float64]:
+def _checked_bounds(bounds: ArrayLike, prefix: str) -> NDArray[np.float64]:
     box = np.asarray(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.isfinite(box).all():
-        raise ValueError(f"bounds of shape {box.shape}; expected (2, 3), all finite")
-    if (box[0] > box[1]).any() or not (box[0] < box[1]).any():
-        raise ValueError(f"bounds from {box[0].tolist()} to {box[1].tolist()}; expected a box with a size")
+        raise ValueError(f"{prefix}bounds of shape {box.shape}; expected (2, 3), all finite")
+    size = box[1] - box[0]
+    if not size.min() >= 0 or not 0 < size.max() < LARGEST_BOX:
+        raise ValueError(
+            f"{prefix}bounds from {in_digits(box[0])} to {in_digits(box[1])}; expected a box with a size, below "
+            f"{LARGEST_BOX:g}"
+        )
     return box
 
 

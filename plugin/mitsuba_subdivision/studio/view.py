@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.errors import in_digits
+
 # Azimuth and elevation in degrees. Azimuth 0 is the model's front, 90 its own left, which is +x.
 VIEWS = {
     "front": (0.0, 0.0),
@@ -43,7 +45,7 @@ def angles_of(view: View) -> tuple[float, float]:
         raise ValueError(f"view {view!r}; expected one of {', '.join(VIEWS)}, or azimuth and elevation in degrees")
     azimuth, elevation = map(float, view)
     if not -90 <= elevation <= 90:
-        raise ValueError(f"elevation {elevation:g}; expected -90 to 90 degrees")
+        raise ValueError(f"elevation {in_digits(elevation)}; expected -90 to 90 degrees")
     return azimuth, elevation
 
 

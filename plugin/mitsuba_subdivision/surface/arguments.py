@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from ..cage.errors import in_digits
 from ..evaluation.equations import EVALUATORS, Evaluator
 from ..schemes.domain import FloatArray
 
@@ -76,5 +77,5 @@ def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str)
     if wrong.any():
         first = int(np.argmax(wrong))
         raise ValueError(
-            f"{name} of sample {first} is {values[first]}; expected {expected} ({wrong.sum()} such samples)"
+            f"{name} of sample {first} is {in_digits(values[first])}; expected {expected} ({wrong.sum()} such samples)"
         )

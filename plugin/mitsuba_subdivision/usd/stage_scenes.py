@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.equality import same
-from ..cage.errors import CageError
+from ..cage.errors import CageError, in_digits
 from ..progress import timed
 from ..regression.scene import LoadedScene
 from ..studio.animation import load_quietly, set_parameters
@@ -132,7 +132,9 @@ class StageScenes:
             return [0.0]
         opens, closes = first.camera.shutter if first.camera else (0.0, 0.0)
         if opens >= closes:
-            found = f"shutter:open is {opens:g}, and shutter:close {closes:g}" if first.camera else "there is no camera"
+            found = "there is no camera"
+            if first.camera:
+                found = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
             raise CageError(f"{self.name}: {found}; expected a camera whose shutter opens before it closes")
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
@@ -170,7 +172,7 @@ class StageScenes:
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
-            rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes)
+            rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes, self.name)
         if rest is not None and (turns or follows_sensor):
             needed = texels_for_pictures(
                 contents, [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
@@ -258,7 +260,7 @@ class StageScenes:
 
     def _rest(self, first: SceneContents, points: NDArray[np.float64]) -> SceneNode:
         """What of a studio the first frame lacks; its camera has notes in `_sensor`."""
-        return with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings())
+        return with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings(), self.name)
 
     def _sensor(
         self, contents: SceneContents, first: SceneContents, rest: SceneNode, notes: StageWarnings

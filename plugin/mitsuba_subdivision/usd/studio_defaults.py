@@ -43,7 +43,12 @@ def angles_for(contents: SceneContents, look: Look) -> View:
 
 
 def with_studio_defaults(
-    contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: StageWarnings
+    contents: SceneContents,
+    points: NDArray[np.float64],
+    is_lit: bool,
+    look: Look,
+    notes: StageWarnings,
+    name: str | None = None,
 ) -> SceneNode:
     """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene.
 
@@ -56,12 +61,15 @@ def with_studio_defaults(
         Whether the stage has lights.
     look : Look
     notes : StageWarnings
+    name : str, optional
+        Of the stage, with which messages begin.
     """
     camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     if (bounds[0] == bounds[1]).all():
         bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())
-    entries = studio(bounds, up=contents.up, view=angles_for(contents, look), size=size, spp=look.spp, points=points)
+    view = angles_for(contents, look)
+    entries = studio(bounds, up=contents.up, view=view, size=size, spp=look.spp, points=points, name=name)
     found = {"integrator": integrator(contents.materials, entries["integrator"])}
     found["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
     if is_lit:

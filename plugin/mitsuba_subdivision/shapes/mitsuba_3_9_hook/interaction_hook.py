@@ -276,8 +276,11 @@ class InteractionHook:
             with self._collection():
                 value = answers.attribute(ctypes.string_at(text, length).decode(), given, self._mask_at(active))
             size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
-            if size == 3 and variant.is_monochromatic and result_type is variant.UnpolarizedSpectrum:
-                value, size = variant.luminance(variant.Color3f(value)), 1
+            if size == 3 and result_type is variant.UnpolarizedSpectrum:
+                if variant.is_monochromatic:
+                    value, size = variant.luminance(variant.Color3f(value)), 1
+                elif variant.is_spectral:
+                    value, size = variant.srgb_model_eval(value, given.wavelengths), dr.size_v(result_type)
             if value is not None and size in sizes:
                 own = self._object_at(result_type, result)
                 # In instances, points are in another space than the shape.

@@ -1,0 +1,122 @@
+"""Colours in spectral variants: coefficients of smooth spectra, which Mitsuba's meshes store in place of colours.
+
+Mitsuba looks them up in a table when an attribute is added to a mesh [Jakob and Hanika 2019]. Here colours may change
+and have derivatives, so that kernels look them up.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..device_arrays import upload
+from ..kernels.types import Float, FloatBuffer, Index, Mask, Value
+from ..mesh.shared import Shared
+from ..variants import Variant
+
+TABLE = "data/srgb.coeff"
+# Bytes of the file's mark and of its resolution.
+_MARK, _WORD = 4, 4
+# The last coefficient of black and white.
+_BLACK, _WHITE = -8192.0, 8192.0
+# Colours below are black: the table is scaled by the inverse of the largest component.
+_DARKEST = 1e-6
+
+
+def holds_spectra(variant: Variant, mesh_name: str, size: int) -> bool:
+    """Whether Mitsuba stores spectra for a mesh attribute of this name and number of components.
+
+    Mitsuba looks for "color" only; USD's "displayColor" is a colour, too.
+    """
+    return bool(variant.is_spectral) and size == 3 and "color" in mesh_name.lower()
+
+
+class SpectralUpsampling:
+    """Coefficients of the spectra of colours, differentiable in JIT variants.
+
+    Parameters
+    ----------
+    variant : module
+        A spectral one.
+    """
+
+    @classmethod
+    def shared(cls, variant: Variant) -> SpectralUpsampling:
+        """The same object for all shapes of a variant, while it is referenced."""
+        return _UPSAMPLING.get(variant, lambda: cls(variant))
+
+    def __init__(self, variant: Variant) -> None:
+        self._variant = variant
+        if not dr.is_jit_v(variant.Float):
+            return
+        # Mitsuba's stub says of this function only that it is an object.
+        file_resolver: Any = mi.file_resolver
+        content = Path(str(file_resolver().resolve(TABLE))).read_bytes()
+        self._resolution = size = int(np.frombuffer(content, "<u4", 1, _MARK)[0])
+        values = np.frombuffer(content, "<f4", size + 9 * size**3, _MARK + _WORD)
+        self._levels, self._table = (upload(variant.Float, each) for each in (values[:size], values[size:]))
+
+    def stored(self, colors: FloatBuffer) -> FloatBuffer:
+        """Coefficients of a mesh's buffer of colours, both flat."""
+        variant = self._variant
+        if dr.is_jit_v(variant.Float):
+            return dr.ravel(variant.Color3f(self(dr.unravel(variant.Color3f, colors))))
+        mesh = variant.Mesh("", len(colors) // 3, 0)
+        mesh.add_attribute("vertex_color", 3, np.asarray(colors).tolist())
+        return np.array(mesh.attribute_buffer("vertex_color"))
+
+    def __call__(self, color: Value) -> Value:
+        """Coefficients of colours on a device."""
+        variant, last = self._variant, self._resolution - 1
+        r, g, b = (dr.clip(each, 0, 1) for each in color)
+        # The table has a part for each component that is the largest; of equal ones, the last counts.
+        is_blue = b >= dr.maximum(r, g)
+        is_green = ~is_blue & (g >= r)
+        largest = dr.maximum(dr.select(is_blue, b, dr.select(is_green, g, r)), _DARKEST)
+        first = dr.select(is_blue, r, dr.select(is_green, b, g)) * (last / largest)
+        second = dr.select(is_blue, g, dr.select(is_green, r, b)) * (last / largest)
+
+        index = variant.UInt32
+        x = dr.minimum(index(dr.detach(first)), last - 1)
+        y = dr.minimum(index(dr.detach(second)), last - 1)
+        z = self._interval(dr.detach(largest))
+        level = dr.gather(variant.Float, self._levels, z)
+        height = (largest - level) / (dr.gather(variant.Float, self._levels, z + 1) - level)
+        part = dr.select(is_blue, index(2), dr.select(is_green, index(1), index(0)))
+
+        def along_x(y: Index, z: Index) -> Value:
+            row = ((part * (last + 1) + z) * (last + 1) + y) * (last + 1) + x
+            begin, end = (dr.gather(variant.Color3f, self._table, row + i) for i in range(2))
+            return dr.lerp(begin, end, first - x)
+
+        def along_y(z: Index) -> Value:
+            return dr.lerp(along_x(y, z), along_x(y + 1, z), second - y)
+
+        found = dr.lerp(along_y(z), along_y(z + 1), height)
+        # Greys have constant spectra, in closed form.
+        is_grey = (r == g) & (g == b)
+        grey = dr.replace_grad(self._grey(dr.detach(b)), found)  # type: ignore[func-returns-value]  # The stub is wrong.
+        return dr.select(is_grey, grey, found)
+
+    def _interval(self, largest: Float) -> Index:
+        """Level at or below each number."""
+        last = self._resolution - 1
+
+        def is_above(level: Index) -> Mask:
+            return dr.gather(self._variant.Float, self._levels, level) <= largest
+
+        return dr.binary_search(1, last, is_above) - 1
+
+    def _grey(self, value: Float) -> Value:
+        inside = (value > 0) & (value < 1)
+        within = dr.select(inside, value, 0.5)
+        constant = dr.select(inside, (within - 0.5) / dr.sqrt(within * (1 - within)), 0)
+        constant = dr.select(value <= 0, _BLACK, dr.select(value >= 1, _WHITE, constant))
+        return self._variant.Color3f(0, 0, constant)
+
+
+_UPSAMPLING: Shared[SpectralUpsampling] = Shared()

@@ -1,0 +1,332 @@
+"""Every public method of a mesh, called on the shape with both kinds of shading."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import Attribute
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+
+exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+
+# Single precision, and where a ray meets the surface in it.
+SINGLE, HIT = 2e-6, 1e-4
+# Texture coordinates of a point that is found by them, at four segments for each edge.
+TEXTURE = 5e-4
+RATE = 4
+CENTRE = [0.0, 0.0, 5.0]
+EDGES = int(mi.DiscontinuityFlags.PerimeterType) | int(mi.DiscontinuityFlags.DirectionSphere)
+
+
+class Place:
+    """A shape whose attributes follow from positions, and a hit on it.
+
+    Texture coordinates are x and y, the colour is half the position plus one half, the weight is x.
+    """
+
+    def __init__(self, shading, has_gradients=False):
+        positions = cube().positions
+        cage = ControlCage(
+            positions,
+            cube().face_vertices.reshape(-1, 4),
+            texcoords=Attribute(positions[:, :2]),
+            attributes={"color": positions / 2 + 0.5, "weight": positions[:, :1]},
+        )
+        self.surface, self.is_exact = LimitSurface(cage), shading == "exact"
+        parameters = {"tessellation_rate": RATE, "shading": shading, "bsdf": {"type": "diffuse"}}
+        self.shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), **parameters})
+        self.ray = mi.Ray3f([0.1, 0.2, 5], [0.01, 0, -1])
+        # Kept, as Mitsuba's own `eval_parameterization` refers to the scene of a shape.
+        self.scene = mi.load_dict({"type": "scene", "shape": self.shape})
+        self.preliminary = self.scene.ray_intersect_preliminary(self.ray)
+        self.si = self.preliminary.compute_surface_interaction(self.ray)
+        self.interaction = dr.zeros(mi.Interaction3f)
+        self.interaction.p = mi.Point3f(CENTRE)
+        if has_gradients:
+            scene_parameters = mi.traverse(self.shape)
+            dr.enable_grad(scene_parameters["control_points"])
+            scene_parameters.update()
+
+
+def numbers(value):
+    return np.array(dr.detach(value)).ravel()
+
+
+def close(found, expected, atol=SINGLE):
+    np.testing.assert_allclose(numbers(found), expected, atol=atol)
+
+
+def holds(value, *expected):
+    assert [bool(np.all(numbers(each))) if dr.is_array_v(each) else each for each in value] == list(expected)
+
+
+def refused(call, message):
+    with pytest.raises(RuntimeError, match=message):
+        call()
+
+
+def add_attribute(at):
+    at.shape.add_attribute("vertex_half", 1, [0.5] * at.shape.vertex_count())
+    close(at.shape.eval_attribute_1("vertex_half", at.si), 0.5)
+
+
+def remove_attribute(at):
+    add_attribute(at)
+    at.shape.remove_attribute("vertex_half")
+    holds([at.shape.has_attribute("vertex_half")], False)
+
+
+def texture_attribute(at):
+    texture = mi.load_dict({"type": "bitmap", "data": upload(mi.TensorXf, np.full((2, 2, 1), 0.25))})
+    at.shape.add_texture_attribute("vertex_t", texture)
+    close(at.shape.eval_attribute_1("vertex_t", at.si), 0.25)
+    assert at.shape.texture_attribute("vertex_t") == texture
+
+
+def attribute_buffer(at):
+    close(at.shape.attribute_buffer("vertex_color"), numbers(at.shape.vertex_positions_buffer()) / 2 + 0.5)
+
+
+def bbox(at):
+    box, first = at.shape.bbox(), at.shape.bbox(0)
+    assert box.contains(first)
+    points = numbers(at.shape.vertex_positions_buffer()).reshape(-1, 3)
+    close(box.min, points.min(axis=0))
+    at.shape.recompute_bbox()
+    assert at.shape.bbox() == box
+
+
+def edges(at):
+    """Each half of an edge is the other of its other; the cage is closed."""
+    at.shape.build_directed_edges()
+    edge = dr.arange(mi.UInt32, 3 * at.shape.face_count())
+    other = at.shape.opposite_dedge(edge)
+    np.testing.assert_array_equal(np.array(at.shape.opposite_dedge(other)), np.array(edge))
+    faces = np.array(at.shape.faces_buffer()).reshape(-1, 3)
+    close(at.shape.edge_indices(5, 1), faces[5, 1:])
+    close(at.shape.face_indices(5), faces[5])
+
+
+def interaction(at):
+    si = at.shape.compute_surface_interaction(at.ray, at.preliminary)
+    close(si.p, numbers(at.si.p))
+    close(at.shape.differential_motion(at.si), numbers(at.si.p))
+    close(at.shape.ray_intersect_triangle(at.preliminary.prim_index, at.ray).t, numbers(at.preliminary.t))
+
+
+def attributes(at):
+    p = numbers(at.si.p)
+    close(at.shape.eval_attribute("vertex_color", at.si), p / 2 + 0.5, HIT)
+    close(at.shape.eval_attribute_3("vertex_color", at.si), p / 2 + 0.5, HIT)
+    close(at.shape.eval_attribute_1("vertex_weight", at.si), p[0], HIT)
+    holds([at.shape.has_attribute("vertex_color"), at.shape.has_mesh_attributes()], True, True)
+
+
+def eval_parameterization(at):
+    for uv in ([0.3, 0.2], [-0.5, 0.4], [0, 0]):
+        si = at.shape.eval_parameterization(mi.Point2f(uv))
+        close(si.uv, uv, TEXTURE)
+        close(numbers(si.p)[:2], numbers(si.uv), HIT)
+        nearest = at.surface.closest_point(numbers(si.p)[None])
+        if at.is_exact:
+            close(si.sh_frame.n, nearest.n[0], 1e-3)
+        assert nearest.distance[0] <= (HIT if at.is_exact else 0.1)
+    holds([at.shape.eval_parameterization(mi.Point2f(2, 2)).is_valid()], False)
+    texcoords = mi.traverse(at.shape)
+    if at.is_exact:
+        # Those of Mitsuba's own method stay.
+        texcoords["cage_texcoords"] = texcoords["cage_texcoords"] + 10
+        texcoords.update()
+        close(numbers(at.shape.eval_parameterization(mi.Point2f(10.3, 10.2)).p)[:2], [0.3, 0.2], TEXTURE)
+
+
+def normals_at_vertices(at):
+    if at.is_exact:
+        refused(lambda: at.shape.vertex_normal(0), "vertex_normal: the mesh has no normals .* exact shading")
+        refused(at.shape.recompute_vertex_normals, "recompute_vertex_normals: the mesh has no normals .* exact shading")
+        assert len(at.shape.vertex_normals_buffer()) == 0
+    else:
+        expected = at.surface.tessellate(RATE).normals
+        close(at.shape.vertex_normals_buffer(), expected.ravel(), 50 * SINGLE)
+        close(at.shape.vertex_normal(3), expected[3], 50 * SINGLE)
+        at.shape.recompute_vertex_normals()
+        close(dr.norm(at.shape.vertex_normal(3)), 1)
+    holds([at.shape.has_vertex_normals(), at.shape.has_face_normals()], not at.is_exact, False)
+
+
+def texcoords_at_vertices(at):
+    if at.is_exact:
+        refused(lambda: at.shape.vertex_texcoord(0), "the mesh has no texture coordinates .* exact shading")
+        assert len(at.shape.vertex_texcoords_buffer()) == 0
+    else:
+        close(at.shape.vertex_texcoord(3), numbers(at.shape.vertex_position(3))[:2])
+        assert len(at.shape.vertex_texcoords_buffer()) == 2 * at.shape.vertex_count()
+    holds([at.shape.has_vertex_texcoords()], not at.is_exact)
+
+
+def samples(at):
+    u, area = mi.Point2f(0.3, 0.6), numbers(at.shape.surface_area())
+    found = at.shape.sample_position(0, u)
+    close(found.pdf, 1 / area)
+    close(at.shape.pdf_position(found), 1 / area)
+    # On a triangle, not further from the surface than its middle.
+    assert at.surface.closest_point(numbers(found.p)[None]).distance[0] < 0.1
+    direction = at.shape.sample_direction(at.interaction, u)
+    close(direction.p, numbers(found.p))
+    close(at.shape.pdf_direction(at.interaction, direction), numbers(direction.pdf), 1e-4)
+
+
+def surface_area(at):
+    assert numbers(at.shape.surface_area())[0] == pytest.approx(at.surface.area(), rel=0.05)
+
+
+def silhouettes(at):
+    with_gradients = Place("exact" if at.is_exact else "vertex", has_gradients=True).shape
+    given = np.random.default_rng(0).random((3, 1000))
+    sample = with_gradients.sample_silhouette(upload(mi.Point3f, given.T), EDGES)
+    # Edges are silhouettes from few directions each.
+    is_valid = np.array(sample.is_valid())
+    assert is_valid.sum() > 50
+    again = np.array(with_gradients.invert_silhouette_sample(sample))
+    np.testing.assert_allclose(again[:, is_valid], given[:, is_valid], atol=1e-3)
+    indices, weights = with_gradients.precompute_silhouette(mi.ScalarPoint3f(CENTRE))
+    assert len(indices) == len(weights) > 0
+    first = with_gradients.sample_precomputed_silhouette(mi.Point3f(CENTRE), int(np.array(indices)[0]), 0.5)
+    assert with_gradients.bbox().contains(numbers(first.p).tolist())
+    kind = int(mi.DiscontinuityFlags.PerimeterType)
+    projected = with_gradients.primitive_silhouette_projection(mi.Point3f(CENTRE), at.si, kind, 0.5)
+    assert with_gradients.bbox().contains(numbers(projected.p).tolist())
+    assert with_gradients.silhouette_discontinuity_types() == int(mi.DiscontinuityFlags.PerimeterType)
+    assert with_gradients.silhouette_sampling_weight() == 1
+    assert with_gradients.parameters_grad_enabled()
+
+
+def write_ply(at):
+    def load(path):
+        at.shape.write_ply(str(path))
+        return mi.load_dict({"type": "ply", "filename": str(path)})
+
+    found = load(at.folder / "mesh.ply")
+    close(found.vertex_positions_buffer(), numbers(at.shape.vertex_positions_buffer()))
+    close(found.attribute_buffer("vertex_color"), numbers(at.shape.attribute_buffer("vertex_color")))
+
+
+def merge(at):
+    refused(lambda: at.shape.merge(at.shape), "merge: the shape's vertices follow its control points; expected")
+
+
+def not_of_meshes(at):
+    """Mitsuba's own meshes have none of these either."""
+    for method in (at.shape.ray_intersect, at.shape.ray_intersect_preliminary, at.shape.ray_test):
+        refused(lambda method=method: method(at.ray), "not implemented")
+    # A name that no mesh has, of attributes of any size.
+    assert np.count_nonzero(numbers(at.shape.eval_attribute_x("vertex_color", at.si))) == 0
+
+
+def counts(at):
+    faces = 6 * RATE**2 * 2
+    assert {at.shape.face_count(), at.shape.primitive_count(), at.shape.effective_primitive_count()} == {faces}
+    assert len(at.shape.vertex_positions_buffer()) == 3 * at.shape.vertex_count()
+    close(at.shape.vertex_position(3), numbers(at.shape.vertex_positions_buffer())[9:12])
+    corners = [numbers(at.shape.vertex_position(int(each))) for each in numbers(at.shape.face_indices(0))]
+    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    close(at.shape.face_normal(0), n / np.linalg.norm(n), 10 * SINGLE)
+
+
+def properties(at):
+    shape = at.shape
+    holds(
+        [
+            shape.is_mesh(),
+            shape.is_ellipsoids(),
+            shape.is_emitter(),
+            shape.is_sensor(),
+            shape.is_medium_transition(),
+            shape.has_flipped_normals(),
+        ],
+        True,
+        *[False] * 5,
+    )
+    assert (shape.emitter(), shape.sensor(), shape.interior_medium(), shape.exterior_medium()) == (None,) * 4
+    shape.set_id("name")
+    assert shape.id() == "name"
+    other = mi.load_dict({"type": "conductor"})
+    shape.set_bsdf(other)
+    assert shape.bsdf() == other
+    assert shape.shape_type() == mi.ShapeType.Mesh.value
+    assert shape.expand() == []
+    assert shape.class_name() == "Mesh"
+    assert shape.variant_name() == mi.variant()
+    assert shape.ptr
+    shape.initialize()
+
+
+def parameters(at):
+    found = mi.traverse(at.shape)
+    found["control_points"] = found["control_points"] * 2
+    found.update()
+    at.shape.parameters_changed([])
+    close(at.shape.bbox().max, 2 * numbers(at.surface.tessellate(RATE).positions).max() * np.ones(3), 1e-5)
+
+
+METHODS = {
+    add_attribute: "add_attribute",
+    remove_attribute: "remove_attribute has_attribute",
+    texture_attribute: "add_texture_attribute texture_attribute",
+    attribute_buffer: "attribute_buffer",
+    bbox: "bbox recompute_bbox",
+    edges: "build_directed_edges opposite_dedge edge_indices face_indices faces_buffer",
+    interaction: "compute_surface_interaction differential_motion ray_intersect_triangle",
+    attributes: "eval_attribute eval_attribute_1 eval_attribute_3 has_mesh_attributes",
+    eval_parameterization: "eval_parameterization",
+    normals_at_vertices: "vertex_normal vertex_normals_buffer recompute_vertex_normals has_vertex_normals "
+    "has_face_normals",
+    texcoords_at_vertices: "vertex_texcoord vertex_texcoords_buffer has_vertex_texcoords",
+    samples: "sample_position pdf_position sample_direction pdf_direction",
+    surface_area: "surface_area",
+    silhouettes: "sample_silhouette invert_silhouette_sample precompute_silhouette sample_precomputed_silhouette "
+    "primitive_silhouette_projection silhouette_discontinuity_types silhouette_sampling_weight parameters_grad_enabled",
+    write_ply: "write_ply",
+    merge: "merge",
+    not_of_meshes: "ray_intersect ray_intersect_preliminary ray_test eval_attribute_x",
+    counts: "face_count primitive_count effective_primitive_count vertex_count vertex_position "
+    "vertex_positions_buffer face_normal",
+    properties: "is_mesh is_ellipsoids is_emitter is_sensor is_medium_transition has_flipped_normals emitter sensor "
+    "interior_medium exterior_medium id set_id bsdf set_bsdf shape_type expand class_name variant_name ptr initialize",
+    parameters: "traverse parameters_changed",
+}
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_these_are_all_methods():
+    called = {name for names in METHODS.values() for name in names.split()}
+    assert called == {name for name in dir(mi.Mesh) if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+@pytest.mark.parametrize("check", METHODS, ids=lambda check: check.__name__)
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
+def test_methods(check, shading, tmp_path):
+    at = Place(shading)
+    at.folder = tmp_path
+    check(at)
+
+
+@exact
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_points_are_found_by_texture_coordinates_in_scalar_variants():
+    eval_parameterization(Place("exact"))
+
+
+@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+@pytest.mark.usefixtures("variants_all_rgb")
+def test_a_cage_without_texture_coordinates_has_none_to_find(shading):
+    shape = mi.load_dict({"type": "subdivision", **cube().as_properties(mi), "shading": shading})
+    message = ": the mesh has no texture coordinates at its vertices, as the cage has none"
+    refused(lambda: shape.eval_parameterization(mi.Point2f(0.5)), f"eval_parameterization{message}")
+    refused(lambda: shape.vertex_texcoord(0), f"vertex_texcoord{message}")
+    flat = mi.load_dict({"type": "subdivision", **cube().as_properties(mi), "face_normals": True})
+    refused(lambda: flat.vertex_normal(0), "vertex_normal: the mesh has no normals at its vertices, as it has face")
