@@ -43,9 +43,12 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
     if dr.is_tensor_v(kind):
         (values,) = parts
         return kind(upload(dr.array_t(kind), values), np.shape(values))
+    if not dr.is_array_v(kind):
+        (value,) = parts
+        return kind(np.asarray(value).item())
     array: NDArray = np.concatenate(parts, axis=None, dtype=dr.type_v(kind).name.lower(), casting="unsafe")
     if not dr.is_jit_v(kind):
-        return kind(array if dr.is_array_v(kind) else array.item())
+        return kind(array)
     if dr.depth_v(kind) > 1:
         return dr.unravel(kind, upload(dr.array_t(dr.value_t(kind)), array))
     # A copy by Dr.Jit: it reads no more than the array has, and is complete before NumPy's memory is freed.

@@ -1,0 +1,102 @@
+"""NumPy's values become arrays of Dr.Jit in one place, which copies them."""
+
+import ast
+import re
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import mitsuba_subdivision
+import numpy as np
+import pytest
+from mitsuba_subdivision import upload
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.device_arrays import take_over
+
+ROOT = Path(mitsuba_subdivision.__file__).parent
+# Classes of arrays of Dr.Jit and Mitsuba by the last part of their names, and what variables that hold one are called.
+ARRAY = re.compile(
+    r"(Float|UInt|Int)(32|64)?|Bool|Mask|Tensor\w+|(Point|Vector|Normal|Color)\df|Array\w+|(Scalar)?Matrix\df"
+    r"|\w*float_type|\w*kernel_type|_float"
+)
+# What an expression of NumPy's looks like.
+NUMPY = re.compile(r"\bnp\.|\.(ravel|astype|reshape|copy)\(|\.(T|positions|values|array|data|weights)\b")
+
+
+@pytest.mark.core
+@pytest.mark.usefixtures("variants_all")
+@pytest.mark.parametrize("shape", [(), (1,), (7,), (5, 3), (2, 3, 4)], ids=str)
+def test_tensors_have_the_values_and_the_shape(shape, np_rng):
+    for name in ("TensorXf", "TensorXu"):
+        values = np_rng.integers(0, 100, shape)
+        found = upload(getattr(mi, name), values)
+        assert type(found) is getattr(mi, name)
+        np.testing.assert_array_equal(np.array(found), values)
+
+
+@pytest.mark.core
+def test_arrays_are_parts_flattened_and_joined(variants_all_ad_rgb, np_rng):  # noqa: ARG001
+    one, other = np_rng.random((4, 3)), np_rng.random(5)
+    flat = upload(mi.Float, one, other)
+    np.testing.assert_array_equal(np.array(flat), np.array(mi.Float([*one.ravel(), *other])))
+    np.testing.assert_array_equal(np.array(upload(mi.Point3f, one.T.copy().T)).T, np.array(flat)[:12].reshape(4, 3))
+    assert np.array(upload(mi.Bool, [True, False])).tolist() == [True, False]
+    assert len(upload(mi.UInt32, [])) == 0
+
+
+def test_single_numbers_and_vectors_of_scalar_variants(variant_scalar_rgb):  # noqa: ARG001
+    assert upload(mi.Float, np.array([0.5])) == 0.5
+    assert upload(mi.Point3f, np.arange(3)) == mi.Point3f(0, 1, 2)
+
+
+def address(array):
+    return array.numpy().ctypes.data
+
+
+def test_memory_is_not_that_of_numpy(variant_llvm_ad_rgb):  # noqa: ARG001
+    values = np.arange(20, dtype=np.float32)
+    found = upload(mi.Float, values)
+    assert address(found) != values.ctypes.data
+    # In packets of any size.
+    assert address(found) % 64 == 0
+    values[:] = 7
+    np.testing.assert_array_equal(np.array(found), np.arange(20))
+
+
+def test_a_user_s_array_is_taken_over_in_place_unless_it_has_derivatives(variant_llvm_ad_rgb):  # noqa: ARG001
+    values = np.arange(20, dtype=np.float32)
+    mapped = mi.Float(values)
+    assert address(mapped) == values.ctypes.data
+    same = mapped
+    take_over(mapped)
+    assert mapped is same
+    assert address(mapped) != values.ctypes.data
+    np.testing.assert_array_equal(np.array(mapped), values)
+    dr.enable_grad(mapped)
+    before = mapped.index_ad
+    take_over(mapped)
+    assert mapped.index_ad == before
+
+
+@pytest.mark.parametrize("shading", ["vertex", "exact"])
+def test_parameters_that_a_user_assigns_are_taken_over(shading, variant_llvm_ad_rgb):  # noqa: ARG001
+    cube = named_cages.cube()
+    shape = mi.load_dict({"type": "subdivision", **cube.as_properties(mi), "shading": shading})
+    parameters, points = mi.traverse(shape), cube.positions.ravel().astype(np.float32)
+    parameters["control_points"] = points
+    parameters.update()
+    assert address(shape.control_points) != points.ctypes.data
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("module", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_other_module_converts(module):
+    """Numbers, and arrays of Dr.Jit, may be converted anywhere."""
+    if module.name == "device_arrays.py":
+        return
+    for call in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+        if isinstance(call, ast.Call) and call.args:
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+            given = " ".join(map(ast.unparse, call.args))
+            is_host = "scalar" in ast.unparse(call.func) or ".tolist()" in given
+            assert is_host or not (ARRAY.fullmatch(name) and NUMPY.search(given)), ast.unparse(call)
