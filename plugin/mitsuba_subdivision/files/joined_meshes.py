@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, number_of_such, shortened, warn
 from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..cage.validation import require_range
@@ -53,6 +54,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
         rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in RULES if rule in meshes[0].rules
     }
     scheme = _common("scheme", meshes, [mesh.scheme for mesh in meshes])
+    meshes = [replace(mesh, creases=_own_rows(mesh, "creases"), corners=_own_rows(mesh, "corners")) for mesh in meshes]
     for mesh in meshes:
         _require_own_indices(mesh)
     starts = {
@@ -99,6 +101,20 @@ def _starts(counts: Sequence[int]) -> IntArray:
     return ragged.starts(np.array(counts))
 
 
+def _own_rows(mesh: CageContents, kind: str) -> NDArray[np.float64]:
+    """Rows of the "creases" or "corners" of a mesh that name its own vertices, with a warning of others."""
+    rows: NDArray[np.float64] = getattr(mesh, kind)
+    is_own = ((rows[:, :-1] >= 0) & (rows[:, :-1] < len(mesh.positions))).all(axis=1)
+    for row in np.flatnonzero(~is_own)[:1]:
+        vertices = ", ".join(f"{vertex:.0f}" for vertex in rows[row, :-1])
+        such = number_of_such(int((~is_own).sum()), kind[:-1])
+        warn(
+            f"{mesh.source.at_tag(kind, row)}: {kind[:-1]} at ({vertices}), where the mesh has no vertex, is ignored; "
+            f"expected 0 to {len(mesh.positions) - 1} ({such})"
+        )
+    return rows[is_own]
+
+
 def _require_own_indices(mesh: CageContents) -> None:
     """Raise an error if an index is out of the mesh's range or data has the wrong length.
 
@@ -109,8 +125,6 @@ def _require_own_indices(mesh: CageContents) -> None:
     corner_count = len(mesh.face_vertices)
     for what, indices, count in (
         ("face corners", mesh.face_vertices, vertex_count),
-        ("creases", mesh.creases[:, :2].reshape(-1), vertex_count),
-        ("corners", mesh.corners[:, 0], vertex_count),
         ("holes", mesh.holes, face_count),
     ):
         require_range(indices, count, f"{source}: {what} have")
