@@ -167,7 +167,7 @@ def test_what_is_not_to_be_smoothed_is_left_out_with_a_warning(read):
         (
             "cornerSharpnesses = [3]",
             "cornerSharpnesses = [-1]",
-            "prim /sheet: corner at vertex 5 of /sheet has sharpness",
+            "prim /sheet: value 0 of cornerSharpnesses has sharpness -1; expected 0 for smooth",
         ),
         ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),
         ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 of /sheet more than once"),
@@ -186,7 +186,7 @@ def test_errors_tell_the_mesh_and_its_own_numbers(read, old, new, message):
         (
             "creaseIndices = [1, 4]",
             "creaseIndices = [1, 7]",
-            r"prim /sheet: crease at \(1, 7\), where the mesh has no vertex, is ignored; expected 0 to 5 \(1 such",
+            r"prim /sheet: crease at \(1, 7\) is ignored; expected vertices from 0 to 5 \(1 such crease\)",
         ),
         (
             "creaseIndices = [1, 4]",
@@ -196,7 +196,7 @@ def test_errors_tell_the_mesh_and_its_own_numbers(read, old, new, message):
         (
             "cornerIndices = [5]",
             "cornerIndices = [6]",
-            r"prim /sheet: corner at \(6\), where the mesh has no vertex, is ignored; expected 0 to 5",
+            r"prim /sheet: corner at \(6\) is ignored; expected vertices from 0 to 5 \(1 such corner\)",
         ),
     ],
 )

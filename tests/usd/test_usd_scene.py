@@ -251,6 +251,12 @@ VERTEX_DATA = """normal3f[] normals = [(0,0,1), (0,1,0), (1,0,0), (0,0,1), (0,1,
     texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1), (0,0), (1,0), (1,1), (0,1)] ( interpolation = "vertex" )
     uniform token subdivisionScheme = "none"\n"""
 FLAT = CUBE.replace("-1", "-2") + VERTEX_DATA
+SUBSET_OF_TWO = """def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {
+    uniform token elementType = "face"
+    uniform token familyName = "materialBind"
+    int[] indices = [0, 5]
+    rel material:binding = </paint>
+}"""
 UV_AND_NORMAL = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "direct"}}
 
 
@@ -258,15 +264,9 @@ UV_AND_NORMAL = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "di
 def test_subsets_share_the_surface_of_the_whole_mesh(stage, monkeypatch, most_faces, rounding):
     """Bit by bit, or up to rounding where each part has the other faces as holes."""
     monkeypatch.setattr(stage_meshes, "MOST_SHARED_FACES", most_faces)
-    subset = """def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {
-        uniform token elementType = "face"
-        uniform token familyName = "materialBind"
-        int[] indices = [0, 5]
-        rel material:binding = </paint>
-    }"""
     tags = "int[] creaseIndices = [0, 1, 3]\nint[] creaseLengths = [3]\nfloat[] creaseSharpnesses = [2.5]"
     paint = material("color3f inputs:diffuseColor = (1, 0, 0)")
-    path = stage(paint + mesh("cube", f"{CUBE}{tags}\n{subset}"))
+    path = stage(paint + mesh("cube", f"{CUBE}{tags}\n{SUBSET_OF_TWO}"))
     parts = {shape.id(): shape for shape in mi.load_dict(msub.usd_scene(path, mi, tessellation_rate=3)).shapes()}
     parts = [parts["cube"], parts["cube_2"]]
     whole = mi.load_dict(
@@ -330,12 +330,26 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
     with pytest.raises(CageError, match="nothing is visible; expected visible meshes"):
         msub.usd_scene(stage('def Xform "empty" {}'), mi)
-    quadrilaterals = mesh("bad", CUBE + 'uniform token subdivisionScheme = "loop"')
     with (
-        pytest.warns(CageWarning, match="prim /bad: face 0 has 4 corners"),
+        pytest.warns(CageWarning, match="prim /bad: face 0 has 2 vertices; .*; the prim is left out"),
         pytest.raises(CageError, match="none of the meshes can be used; expected one"),
     ):
-        msub.usd_scene(stage(quadrilaterals), mi)
+        msub.usd_scene(stage(mesh("bad", CUBE.replace("[4, 4,", "[2, 6,"))), mi)
+
+
+@pytest.mark.parametrize("subset", ["", SUBSET_OF_TWO])
+def test_a_mesh_that_its_scheme_cannot_subdivide_is_shown_as_polygons(stage, subset):
+    loop = CUBE + 'uniform token subdivisionScheme = "loop"\n' + subset
+    paint = material("color3f inputs:diffuseColor = (1, 0, 0)")
+    with pytest.warns(
+        CageWarning, match="prim /quads: face 0 has 4 corners.*; the mesh is shown as polygons"
+    ) as record:
+        scene = msub.usd_scene(stage(CAMERA + paint + mesh("quads", loop)), mi)
+    assert len(record) == 1
+    shapes = [each for name, each in scene.items() if name.startswith("quads")]
+    assert [each.face_count() for each in shapes] == ([8, 4] if subset else [12])
+    corners = np.unique(np.concatenate([positions(each) for each in shapes]), axis=0)
+    np.testing.assert_array_equal(np.sort(corners.ravel()), [-1] * 12 + [1] * 12)
 
 
 def test_a_cage_is_warned_of_once_by_its_prim(stage):

@@ -51,8 +51,8 @@ def validated_tags(
     def at_vertex(row: int) -> str:
         return f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
 
-    _require_sharpness(edges[:, 2], at_edge)
-    _require_sharpness(vertices[:, 1], at_vertex)
+    require_sharpness(edges[:, 2], at_edge)
+    require_sharpness(vertices[:, 1], at_vertex)
     is_edge, is_vertex = half_edge >= 0, (vertex >= 0) & (vertex < topology.vertex_count)
     _warn_of_ignored(is_edge, at_edge, "is no edge of a face", "crease", source)
     _warn_of_ignored(is_vertex, at_vertex, f"is none of {topology.vertex_count} vertices", "corner", source)
@@ -191,7 +191,8 @@ def _warn_of_ignored(
         warn(f"{where(missing[0])}, which {problem}, is ignored ({such}; numbers count from {source.index_base})")
 
 
-def _require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
+def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
+    """Raise an error if a sharpness is negative or not a number; ``where`` is the beginning of its message by row."""
     for row in np.flatnonzero(~(values >= 0))[:1]:
         raise CageError(
             f"{where(row)} has sharpness {values[row]:g}; expected 0 for smooth, up to {INFINITE:g} for "

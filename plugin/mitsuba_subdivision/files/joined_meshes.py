@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, number_of_such, shortened, warn
+from ..cage.errors import CageError, shortened, warn
 from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..cage.validation import require_range
@@ -29,7 +28,8 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     Parameters
     ----------
     meshes : sequence of CageContents
-        All with the same rules by name; one or more. A single mesh is returned as it is.
+        One or more, with the same rules by name. Creases and corners name vertices of their mesh. A single mesh is
+        returned as it is.
     name : str
         Name of the file in messages.
 
@@ -54,7 +54,6 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
         rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in RULES if rule in meshes[0].rules
     }
     scheme = _common("scheme", meshes, [mesh.scheme for mesh in meshes])
-    meshes = [replace(mesh, creases=_own_rows(mesh, "creases"), corners=_own_rows(mesh, "corners")) for mesh in meshes]
     for mesh in meshes:
         _require_own_indices(mesh)
     starts = {
@@ -99,20 +98,6 @@ def _common(rule: str, meshes: Sequence[CageContents], values: Sequence[Value]) 
 def _starts(counts: Sequence[int]) -> IntArray:
     """Number of the first one of each mesh, in the cage."""
     return ragged.starts(np.array(counts))
-
-
-def _own_rows(mesh: CageContents, kind: str) -> NDArray[np.float64]:
-    """Rows of the "creases" or "corners" of a mesh that name its own vertices, with a warning of others."""
-    rows: NDArray[np.float64] = getattr(mesh, kind)
-    is_own = ((rows[:, :-1] >= 0) & (rows[:, :-1] < len(mesh.positions))).all(axis=1)
-    for row in np.flatnonzero(~is_own)[:1]:
-        vertices = ", ".join(f"{vertex:.0f}" for vertex in rows[row, :-1])
-        such = number_of_such(int((~is_own).sum()), kind[:-1])
-        warn(
-            f"{mesh.source.at_tag(kind, row)}: {kind[:-1]} at ({vertices}), where the mesh has no vertex, is ignored; "
-            f"expected 0 to {len(mesh.positions) - 1} ({such})"
-        )
-    return rows[is_own]
 
 
 def _require_own_indices(mesh: CageContents) -> None:

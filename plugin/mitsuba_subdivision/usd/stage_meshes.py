@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened
+from ..cage.validation import require_range
 from ..files.usd_primvars import PrimvarChoice
 from ..files.usd_reader import MeshReader
 from ..files.usd_skinning import Skinning
 from ..files.usd_stage import usd_errors_at
+from ..files.usd_values import value_at
 from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
 from .polygons import GPRIMS, read_gprim, read_normals
@@ -29,6 +32,7 @@ if TYPE_CHECKING:
 COLORS = ("displayColor", "displayOpacity")
 # Faces times parts of a mesh, up to which each part evaluates the whole surface.
 MOST_SHARED_FACES = 1_000_000
+_NO_FACES: IntArray = np.zeros(0, np.int64)
 
 
 class ShapeReader:
@@ -88,7 +92,7 @@ class ShapeReader:
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
-        reader = MeshReader(mesh, location, self._time, self._skinning)
+        reader = MeshReader(mesh, location, self._time, self._skinning, report=self._notes.add_message)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
         materials, owner = self._materials_of_faces(mesh, reader)
@@ -107,7 +111,7 @@ class ShapeReader:
                     f'texture coordinates "{choice.texcoords[0]}" are missing; the first others of the mesh are used',
                     prim.GetPath(),
                 )
-            normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
+            normals = read_normals(reader, cage) if cage.scheme is None else None
             shown = None
             if len(materials) > 1:
                 if cage.scheme is not None and len(materials) * len(owner) <= MOST_SHARED_FACES:
@@ -124,17 +128,14 @@ class ShapeReader:
 
         prim = mesh.GetPrim()
         materials = [self._materials.bound(prim)]
-        owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64)), dtype=np.int64)
+        owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)), dtype=np.int64)
         for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
             if subset.GetElementTypeAttr().Get() != "face":
                 self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
-            faces = np.array(reader.value(subset.GetIndicesAttr()) or [], dtype=np.int64)
-            if len(faces) and not 0 <= faces.min() <= faces.max() < len(owner):
-                raise CageError(
-                    f"{reader.location}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
-                    f"{faces.max()}; expected 0 to {len(owner) - 1}"
-                )
+            read = partial(_faces_of, reader, subset, len(owner))
+            left_out = f"the subset {subset.GetPrim().GetName()} is left out"
+            faces = reader.fitting(subset.GetIndicesAttr(), left_out, read, _NO_FACES)
             material = self._materials.bound(subset.GetPrim())
             if material not in materials:
                 materials.append(material)
@@ -166,23 +167,46 @@ class ShapeReader:
 
         contents = None if material is None else self._materials.materials[material]
         if contents and contents.texcoords() and cage.texcoords is None:
-            self._notes.add(
-                "prims without texture coordinates have the colour of their texture at (0, 0)", prim.GetPath()
-            )
+            # Of those that are there and do not fit, there is a message already.
+            if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(contents.texcoords()[0]):
+                self._notes.add(
+                    "prims without texture coordinates have the colour of their texture at (0, 0)", prim.GetPath()
+                )
             cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
         names = COLORS if contents is None else contents.primvars()
-        constants = {}
-        for name in names:
-            primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-            values = np.asarray(primvar.Get(self._code) if primvar and primvar.HasValue() else [])
-            if name not in cage.attributes and values.dtype.kind == "f" and values.size in (1, 3):
-                constants[name] = values.astype(np.float64).ravel().tolist()
+        constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
+        constants = {name: values for name, values in constants.items() if values}
         radiance = None
         if prim.HasAPI(UsdLux.MeshLightAPI):
             if UsdLux.LightAPI(prim).GetNormalizeAttr().Get(self._code):
                 self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
             radiance = read_emission(prim, self._code).tolist()
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
+
+    def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
+        """A primvar of a prim, or of those above, that has one value of one or three numbers; else nothing."""
+        from pxr import UsdGeom
+
+        primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+        if not primvar or not primvar.HasValue() or primvar.GetInterpolation() != UsdGeom.Tokens.constant:
+            return []
+        values = np.asarray(value_at(primvar.GetAttr(), self._code))
+        if primvar.IsIndexed() and values.ndim:
+            indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._code))
+            values = values[indices] if ((indices >= 0) & (indices < len(values))).all() else np.zeros(0)
+        if values.dtype.kind == "f" and values.size in (1, 3) and np.isfinite(values).all():
+            return list(values.astype(np.float64).ravel().tolist())
+        self._notes.add(
+            "constant primvars are ignored unless they have one value of one or three finite numbers",
+            primvar.GetAttr().GetPath(),
+        )
+        return []
+
+
+def _faces_of(reader: MeshReader, subset: UsdGeom.Subset, face_count: int) -> IntArray:
+    faces = reader.array(subset.GetIndicesAttr(), np.int64)
+    require_range(faces, face_count, f"{reader.location}: subset {subset.GetPrim().GetName()} has")
+    return faces
 
 
 def is_invertible(matrix: NDArray[np.float64]) -> bool:

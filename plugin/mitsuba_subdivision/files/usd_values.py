@@ -1,0 +1,59 @@
+"""Values of USD attributes and transforms of prims at a time.
+
+Without a time, which the time code `EarliestTime` stands for, a value is the default, which does not depend on time, or
+else the first sample. USD itself takes the sample first, and takes the schema's fallback before it at the default time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pxr import Gf, Usd
+
+
+def time_of(attribute: Usd.Attribute, time: Usd.TimeCode) -> Usd.TimeCode:
+    """Time code at which an attribute is read."""
+    from pxr import Usd
+
+    default = Usd.TimeCode.Default()
+    if not time.IsEarliestTime():
+        return time
+    return default if attribute.GetResolveInfo(default).GetSource() == Usd.ResolveInfoSourceDefault else time
+
+
+def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
+    """Value of an attribute."""
+    return attribute.Get(time_of(attribute, time))
+
+
+def local_to_world(
+    prim: Usd.Prim, time_of: Callable[[Usd.Attribute], Usd.TimeCode], known: dict[str, Gf.Matrix4d] | None = None
+) -> Gf.Matrix4d:
+    """Transform of a prim to world space, for row vectors.
+
+    Parameters
+    ----------
+    prim : Usd.Prim
+    time_of : callable
+        Time code at which an attribute is read. Operations may have different ones.
+    known : dict, optional
+        Transforms by path, to which those of the prim and the prims above are added.
+    """
+    from pxr import Gf, UsdGeom
+
+    path = str(prim.GetPath())
+    if known is not None and path in known:
+        return known[path]
+    matrix, resets = Gf.Matrix4d(1), prim.IsPseudoRoot()
+    here = UsdGeom.Xformable(prim)
+    if here:
+        for operation in reversed(here.GetOrderedXformOps()):
+            matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
+        resets = here.GetResetXformStack()
+    if not resets:
+        matrix *= local_to_world(prim.GetParent(), time_of, known)
+    if known is not None:
+        known[path] = matrix
+    return matrix
