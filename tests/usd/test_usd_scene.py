@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
+from mitsuba_subdivision.cage.equality import same
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd import materialx_layers, stage_meshes
 from mitsuba_subdivision.usd.stage_walk import read_stage
@@ -179,6 +180,62 @@ def test_instances_look_like_copies(stage, interpolation):
     for other in pictures[1:]:
         # Rays meet instances in their own space, which rounds otherwise.
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
+
+
+def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
+    """Of transforms, cameras, lights, materials, shapes without a mesh, subsets and visibility."""
+    values = {
+        "double3 xformOp:translate": ("(0, 0, 10)", "(0, 0, 20)"),
+        "float focalLength": ("70", "50"),
+        "token projection": ('"orthographic"', '"perspective"'),
+        "float inputs:intensity": ("3", "1"),
+        "float inputs:radius": ("2", "0.5"),
+        "color3f inputs:diffuseColor": ("(1, 0, 0)", "(0, 1, 0)"),
+        "double size": ("1", "2"),
+        "int[] indices": ("[0, 1]", "[2]"),
+        "token visibility": ('"invisible"', '"inherited"'),
+        "color3f[] primvars:displayColor": ("[(1, 0, 0)]", "[(0, 0, 1)]"),
+        "uniform int2 resolution": ("(20, 10)", "(10, 20)"),
+        "float inputs:roughness": ("0.3", "0.6"),
+    }
+
+    def prims(line):
+        subset = f"""def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {{
+            uniform token elementType = "face"
+            uniform token familyName = "materialBind"
+            {line("int[] indices")}
+            rel material:binding = </paint>
+        }}"""
+        inputs = line("color3f inputs:diffuseColor") + line("float inputs:roughness")
+        return (
+            f"""def Camera "camera" {{
+                {line("double3 xformOp:translate")}
+                uniform token[] xformOpOrder = ["xformOp:translate"]
+                {line("float focalLength")}{line("token projection")}
+            }}
+            def SphereLight "lamp" {{ {line("float inputs:intensity")}{line("float inputs:radius")} }}
+            def Cube "cube" {{ {line("double size")}{line("color3f[] primvars:displayColor")} }}
+            def Cube "unseen" {{ {line("token visibility")} }}
+            def RenderSettings "settings" {{ {line("uniform int2 resolution")} }}
+            """
+            + material(inputs)
+            + mesh("parts", CUBE + subset)
+        )
+
+    def lines_of(kind):
+        def line(name):
+            value, other = values[name]
+            default = "" if kind == "samples" else f"{name} = {value}\n"
+            first = value if kind == "samples" else other
+            return default + (f"{name}.timeSamples = {{ 1: {first}, 2: {other} }}\n" if kind != "default" else "")
+
+        return line
+
+    head = 'renderSettingsPrimPath = "/settings"'
+    plain, *others = (read_stage(stage(prims(lines_of(kind)), head=head)) for kind in ("default", "samples", "both"))
+    assert {shape.name for shape in plain.shapes} == {"/cube", "/parts"}
+    assert (plain.camera.focal_length, plain.lights[0].size, plain.resolution) == (70, [2], [20, 10])
+    assert all(same(plain, each) for each in others)
 
 
 def test_instances_that_cannot_be_seen_leave_the_others_there(stage):

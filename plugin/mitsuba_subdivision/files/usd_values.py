@@ -41,7 +41,7 @@ def local_to_world(
     known : dict, optional
         Transforms by path, to which those of the prim and the prims above are added.
     """
-    from pxr import Gf, UsdGeom
+    from pxr import Gf, Usd, UsdGeom
 
     path = str(prim.GetPath())
     if known is not None and path in known:
@@ -49,8 +49,11 @@ def local_to_world(
     matrix, resets = Gf.Matrix4d(1), prim.IsPseudoRoot()
     here = UsdGeom.Xformable(prim)
     if here:
-        for operation in reversed(here.GetOrderedXformOps()):
-            matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
+        if here.GetTimeSamples():
+            for operation in reversed(here.GetOrderedXformOps()):
+                matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
+        else:
+            matrix = here.GetLocalTransformation(Usd.TimeCode.Default())
         resets = here.GetResetXformStack()
     if not resets:
         matrix *= local_to_world(prim.GetParent(), time_of, known)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files.usd_values import value_at
 from .contents import CameraContents
 from .stage_warnings import StageWarnings
 
@@ -41,17 +42,17 @@ def read_camera(
     rigid[:3, :3], rigid[:3, 3] = np.stack([right, up, -forward], axis=1), to_world[:3, 3]
 
     def number(attribute: Usd.Attribute) -> float:
-        return float(attribute.Get(time))
+        return float(value_at(attribute, time))
 
-    is_perspective = camera.GetProjectionAttr().Get(time) == "perspective"
+    is_perspective = value_at(camera.GetProjectionAttr(), time) == "perspective"
     unit = 1.0 if is_perspective else TENTHS
     aperture = [number(camera.GetHorizontalApertureAttr()), number(camera.GetVerticalApertureAttr())]
     offset = [number(camera.GetHorizontalApertureOffsetAttr()), number(camera.GetVerticalApertureOffsetAttr())]
-    near, far = camera.GetClippingRangeAttr().Get(time)
+    near, far = value_at(camera.GetClippingRangeAttr(), time)
     focal_length, f_stop = number(camera.GetFocalLengthAttr()), number(camera.GetFStopAttr())
     focus = number(camera.GetFocusDistanceAttr())
     has_lens = is_perspective and f_stop > 0 and focus > 0
-    if camera.GetClippingPlanesAttr().Get(time):
+    if value_at(camera.GetClippingPlanesAttr(), time):
         notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
     return CameraContents(
         str(camera.GetPath()),

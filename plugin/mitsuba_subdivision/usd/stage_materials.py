@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.equality import same
+from ..files.usd_values import value_at
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
@@ -145,7 +146,7 @@ class MaterialReader:
         attribute = found[0]
         if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
             return UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName()
-        return None, attribute.Get(self._time)
+        return None, value_at(attribute, self._time)
 
     def _value(self, shader: UsdShade.Shader, name: str, usual: Any) -> Any:
         """Value of an input that cannot be connected to a shader."""

@@ -130,7 +130,7 @@ class ShapeReader:
         materials = [self._materials.bound(prim)]
         owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)), dtype=np.int64)
         for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
-            if subset.GetElementTypeAttr().Get() != "face":
+            if value_at(subset.GetElementTypeAttr(), self._code) != "face":
                 self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
             read = partial(_faces_of, reader, subset, len(owner))
@@ -178,7 +178,7 @@ class ShapeReader:
         constants = {name: values for name, values in constants.items() if values}
         radiance = None
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            if UsdLux.LightAPI(prim).GetNormalizeAttr().Get(self._code):
+            if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._code):
                 self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
             radiance = read_emission(prim, self._code).tolist()
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)

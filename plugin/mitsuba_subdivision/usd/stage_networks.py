@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files.usd_values import value_at
 from ..srgb import decoded
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_library import library, numbers
@@ -67,7 +68,7 @@ class NetworkReader:
         attribute = attributes[0]
         if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
             return self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
-        value = attribute.Get(self._time)
+        value = value_at(attribute, self._time)
         if value is None:
             return self._usual(declared)
         if declared.getType() == "filename":

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError, shortened
 from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
+from ..files.usd_values import local_to_world, time_of, value_at
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
@@ -29,7 +30,7 @@ from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
 from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
-    from pxr import Usd, UsdGeom
+    from pxr import Gf, Usd, UsdGeom
 
 # Draw modes by which a viewer shows a model as it is.
 _FULL_MODES = (None, "default", "inherited")
@@ -156,14 +157,14 @@ class _StageWalk:
     def __init__(
         self, stage: Usd.Stage, name: str, time: float | None, notes: StageWarnings, at: Callable[[str], None]
     ) -> None:
-        from pxr import Usd, UsdGeom
+        from pxr import Usd
 
         self._stage = stage
         self._name = name
         self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         self._notes = notes
         self._at, self._count = at, 0
-        self._transforms = UsdGeom.XformCache(self._code)
+        self._transforms: dict[str, Gf.Matrix4d] = {}
         self._materials = MaterialReader(self._code, notes)
         self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
         # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
@@ -219,7 +220,7 @@ class _StageWalk:
             self._count += 1
             self._at(f"prim {self._count}")
             draw_mode = prim.GetAttribute("model:drawMode")
-            if draw_mode and draw_mode.Get(self._code) not in _FULL_MODES:
+            if draw_mode and value_at(draw_mode, self._code) not in _FULL_MODES:
                 self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
             if prim != root and prim.IsInstance():
                 self._add_instance(prim, name, to_root, found)
@@ -260,7 +261,7 @@ class _StageWalk:
         prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
         for prim in prims:
             imageable = UsdGeom.Imageable(prim)
-            if imageable and imageable.GetVisibilityAttr().Get(self._code) == UsdGeom.Tokens.invisible:
+            if imageable and value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible:
                 prims.PruneChildren()
                 continue
             if prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
@@ -397,7 +398,7 @@ class _StageWalk:
         settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
         chosen = path
         if settings:
-            resolution = [int(each) for each in settings.GetResolutionAttr().Get()]
+            resolution = [int(each) for each in value_at(settings.GetResolutionAttr(), self._code)]
             targets = settings.GetCameraRel().GetForwardedTargets()
             chosen = path or (str(targets[0]) if targets else None)
         if chosen is not None:
@@ -412,7 +413,7 @@ class _StageWalk:
         return next(iter(cameras.values()), None), resolution
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
-        return np.array(self._transforms.GetLocalToWorldTransform(prim)).T
+        return np.array(local_to_world(prim, lambda attribute: time_of(attribute, self._code), self._transforms)).T
 
 
 def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
