@@ -262,6 +262,36 @@ def test_instances_that_cannot_be_seen_leave_the_others_there(stage):
     assert not {"a_cube", "points_0"} & set(entries)
 
 
+@pytest.mark.parametrize(
+    ("above", "root"),
+    [
+        ("def Scope", "def Xform"),
+        ("class", "def Xform"),
+        ("over", "def Xform"),
+        ("over", "over"),
+        ("class", "class Xform"),
+    ],
+)
+def test_prototypes_may_lie_below_a_class_or_an_over(stage, above, root):
+    """As the schema of point instancers recommends; what is a class or an over in a prototype is not shown."""
+    hidden = f'class "hidden" {{ {mesh("hidden", CUBE)} }}\nover "more" {{ {mesh("more", CUBE)} }}\n'
+    points = f"""def PointInstancer "points" {{
+        rel prototypes = [</points/all/proto>, </points/none>]
+        int[] protoIndices = [0, 0, 0, 1]
+        point3f[] positions = [(-3, 0, 0), (0, 0, 0), (3, 0, 0), (9, 9, 9)]
+        {above} "all" {{ {root} "proto" {{ {mesh("cube", CUBE)}{hidden} }} }}
+    }}"""
+    with pytest.warns(CageWarning, match=r"prototypes of .* that are not there are ignored \(/points/none\)"):
+        entries = msub.usd_scene(stage(points), mi)
+    names = {name for name in entries if name.startswith("points")}
+    assert names == {"points_0", "points_1", "points_2"}
+    scene = mi.load_dict({name: entry for name, entry in entries.items() if name not in ("ground", "key_light")})
+    for x in (-3, 0, 3):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0, 9), mi.Vector3f(0, 0, -1)))
+        # The limit of a cube in the middle of a face.
+        np.testing.assert_allclose(np.array(si.p).ravel(), [x, 0, 68 / 81], atol=1e-6)
+
+
 @pytest.mark.parametrize(("time", "expected"), [(None, 1), (2, 1), (3, 3)])
 def test_instances_have_velocities(stage, time, expected):
     """Without a time, they are where they are at their first time."""

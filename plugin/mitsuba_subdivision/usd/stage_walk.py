@@ -256,10 +256,14 @@ class _StageWalk:
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
         """Visible prims of a subtree, without the descendants of other instances and instancers."""
-        from pxr import Usd, UsdGeom
+        from pxr import Sdf, Usd, UsdGeom
 
-        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
+        # Prototypes of instancers may lie below a class or an over, as their schema recommends.
+        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)))
         for prim in prims:
+            if prim != root and prim.GetSpecifier() != Sdf.SpecifierDef:
+                prims.PruneChildren()
+                continue
             imageable = UsdGeom.Imageable(prim)
             if imageable and value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible:
                 prims.PruneChildren()
@@ -328,7 +332,10 @@ class _StageWalk:
             self._notes.add(_SINGULAR, f"{path}/{row}")
         for number, target in enumerate(targets):
             prototype = self._stage.GetPrimAtPath(target)
-            if not prototype or number not in kinds:
+            if number not in kinds:
+                continue
+            if not prototype:
+                self._notes.add("prototypes of point instancers that are not there are ignored", target)
                 continue
             group = self._prototype(f"{path} {target}", prototype)
             for row in np.flatnonzero((kinds == number) & is_shown & is_usable):
