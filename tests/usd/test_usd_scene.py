@@ -182,6 +182,97 @@ def test_instances_look_like_copies(stage, interpolation):
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
 
 
+DIFFERENCES = {
+    # What the first and the second instance have, and what the prim above them.
+    "binding": ("rel material:binding = </red>", "rel material:binding = </blue>", ""),
+    "full": ("rel material:binding:full = </red>", "rel material:binding:full = </blue>", ""),
+    "preview": ("rel material:binding:preview = </red>", "rel material:binding:preview = </blue>", ""),
+    "full and all": ("rel material:binding:full = </red>", "rel material:binding = </red>", ""),
+    "strength": (
+        'rel material:binding = </red> (\nbindMaterialAs = "strongerThanDescendants")',
+        "rel material:binding = </red>",
+        "",
+    ),
+    "collection of parts": (
+        "rel collection:some:includes = </all/one/cube>\n"
+        "rel material:binding:collection:some = [</all/one.collection:some>, </red>]",
+        "rel material:binding = </red>",
+        "",
+    ),
+    "collection above": (
+        "",
+        "",
+        "rel collection:some:includes = </all/two>\n"
+        "rel material:binding:collection:full:some = [</all.collection:some>, </blue>]",
+    ),
+    "display colour": (
+        "color3f[] primvars:displayColor = [(1, 0, 0)]",
+        "color3f[] primvars:displayColor = [(0, 0, 1)]",
+        "",
+    ),
+    "indices": (
+        "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]\nint[] primvars:displayColor:indices = [0]",
+        "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]\nint[] primvars:displayColor:indices = [1]",
+        "",
+    ),
+    "primvar of a material": (
+        "color3f primvars:tint = (1, 0, 0)",
+        "color3f primvars:tint = (0, 0, 1)",
+        "rel material:binding = </tinted>",
+    ),
+    "visibility": ("", 'token visibility = "invisible"', ""),
+    "purpose": ('uniform token purpose = "render"', 'uniform token purpose = "guide"', ""),
+    "places": ("", "rel material:binding = </red>", ""),
+}
+
+
+@pytest.mark.parametrize("difference", DIFFERENCES)
+def test_instances_that_differ_look_like_prims_that_do(stage, difference, request):
+    request.getfixturevalue("variant_scalar_rgb")
+    one, two, above = DIFFERENCES[difference]
+    diffuse = "color3f inputs:diffuseColor = {}"
+    paints = {"red": (1, 0, 0), "blue": (0, 0, 1), "green": (0, 1, 0)}
+    text = "".join(material(diffuse.format(color)).replace("paint", name) for name, color in paints.items())
+    tint = """def Shader "tint" {
+        uniform token info:id = "UsdPrimvarReader_float3"
+        string inputs:varname = "tint"
+        float3 outputs:result
+    }"""
+    reads = "color3f inputs:diffuseColor.connect = </paint/tint.outputs:result>"
+    text += material(reads, tint).replace("paint", "tinted")
+    # Where the difference is the place, one part does not move with the instance.
+    reset = '"!resetXformStack!", ' if difference == "places" else ""
+    lower = f"""double3 xformOp:translate = (0, {-0.3 - 0.3 * bool(reset)}, 0)
+        float3 xformOp:scale = (0.2, 0.2, 0.2)
+        uniform token[] xformOpOrder = [{reset}"xformOp:translate", "xformOp:scale"]\n"""
+    upper = lower.replace("-0.", "0.").replace(reset, "")
+    own = "rel material:binding = </green>\n" if difference in ("strength", "full and all") else ""
+    text += f'class Xform "kind" {{ {mesh("cube", CUBE + upper)} {mesh("other", CUBE + lower + own)} }}\n'
+
+    def placed(name, x, body, instanceable):
+        head = f"""(prepend apiSchemas = ["MaterialBindingAPI", "CollectionAPI:some"]
+            instanceable = {instanceable}
+            references = </kind>)"""
+        return f"""def Xform "{name}" {head} {{
+            double3 xformOp:translate = ({x}, 0, 0)
+            uniform token[] xformOpOrder = ["xformOp:translate"]
+            {body}
+        }}\n"""
+
+    sky = 'def DomeLight "sky" {}\n'
+    pictures = []
+    for instanceable in ("false", "true"):
+        head = '(prepend apiSchemas = ["MaterialBindingAPI", "CollectionAPI:some"])'
+        both = placed("one", -0.5, one, instanceable) + placed("two", 0.5, two, instanceable)
+        path = stage(CAMERA + sky + text + f'def Xform "all" {head} {{ {above}\n {both} }}')
+        entries = {**msub.usd_scene(path, mi, size=(32, 32)), "integrator": {"type": "direct"}}
+        pictures.append(rendered(entries, spp=256))
+    plain, instanced = pictures
+    assert np.abs(plain[:, :16] - plain[:, 16:]).max() > 0.2
+    # Noise of 256 samples of the sky.
+    assert np.abs(plain - instanced).max() < 0.1
+
+
 def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
     """Of transforms, cameras, lights, materials, shapes without a mesh, subsets and visibility."""
     values = {

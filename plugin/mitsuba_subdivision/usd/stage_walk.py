@@ -169,6 +169,9 @@ class _StageWalk:
         self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
         # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
         self._numbers: dict[object, int] = {}
+        # Names of primvars that the shapes of instances read, and whether some of these have places of their own, by
+        # prototype and bindings.
+        self._inherited: dict[tuple[object, ...], tuple[list[str], bool]] = {}
         self._prototypes: list[_Subtree] = []
 
     def contents(self, camera: str | None) -> SceneContents:
@@ -274,27 +277,52 @@ class _StageWalk:
 
     def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
         """Add an instance; instances that differ in appearance belong to different prototypes."""
-        from pxr import UsdGeom, UsdShade, UsdSkel
-
         matrix = to_root @ self._to_world(prim)
-        if not self._is_invertible(matrix, prim.GetPath()):
-            return
-        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-        primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in COLORS)
+        if self._is_invertible(matrix, prim.GetPath()):
+            found.instances.append(InstanceContents(name, self._prototype(self._appearance(prim), prim), matrix))
+
+    def _appearance(self, prim: Usd.Prim) -> tuple[object, ...]:
+        """What an instance inherits that may make it look different from others of its prototype, and the prototype."""
+        from pxr import UsdGeom, UsdSkel
+
         binding = UsdSkel.BindingAPI(prim)
         skeleton, animation = binding.GetInheritedSkeleton(), binding.GetInheritedAnimationSource()
         # A skeleton outside moves the points of each instance otherwise.
         is_posed = skeleton and not skeleton.GetPath().HasPrefix(prim.GetPath())
         is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES
-        key = (
-            str(prim.GetPrototype().GetPath()),
-            str(material.GetPath()) if material else "",
-            *(str(each.Get(self._code)) if each else "" for each in primvars),
-            bool(is_hidden),
-            str(prim.GetPath()) if is_posed else "",
+        key = str(prim.GetPrototype().GetPath()), self._bindings(prim), bool(is_hidden)
+        if key not in self._inherited:
+            parts = _parts(prim)
+            materials = {self._materials.bound(part) for part in parts if _is_shape(part)}
+            names: set[str] = set()
+            for number in materials:
+                names.update(COLORS if number is None else self._materials.materials[number].primvars())
+            is_placed = any(UsdGeom.Xformable(part) and UsdGeom.Xformable(part).GetResetXformStack() for part in parts)
+            self._inherited[key] = sorted(names), is_placed
+        names_read, is_placed = self._inherited[key]
+        primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in names_read)
+        return (
+            *key,
+            *(_texts(primvar, self._code) for primvar in primvars),
+            str(prim.GetPath()) if is_posed or is_placed else "",
             str(animation.GetPath()) if animation else "",
         )
-        found.instances.append(InstanceContents(name, self._prototype(key, prim), matrix))
+
+    def _bindings(self, prim: Usd.Prim) -> tuple[object, ...]:
+        """Bindings of materials that an instance inherits or has; of collections, the materials of its parts."""
+        from pxr import UsdShade
+
+        above = prim
+        while not above.IsPseudoRoot():
+            if above.GetPropertiesInNamespace("material:binding:collection"):
+                return tuple(self._materials.bound(part) for part in _parts(prim) if _is_shape(part))
+            above = above.GetParent()
+        found = []
+        for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview):
+            material, binding = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
+            strength = UsdShade.MaterialBindingAPI.GetMaterialBindingStrength(binding) if binding else ""
+            found.append((str(material.GetPath()), binding.GetName() if binding else "", strength))
+        return tuple(found)
 
     def _add_point_instances(
         self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64], found: _Subtree
@@ -421,6 +449,28 @@ class _StageWalk:
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
         return np.array(local_to_world(prim, lambda attribute: time_of(attribute, self._code), self._transforms)).T
+
+
+def _parts(instance: Usd.Prim) -> list[Usd.Prim]:
+    """Prims of an instance."""
+    from pxr import Usd
+
+    return list(Usd.PrimRange(instance, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)))
+
+
+def _is_shape(prim: Usd.Prim) -> bool:
+    """Whether a material may be bound to what a prim shows."""
+    from pxr import UsdGeom
+
+    return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.Subset))
+
+
+def _texts(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> tuple[str, str]:
+    """Values and indices of a primvar, to be compared."""
+    if not primvar:
+        return "", ""
+    indices = primvar.GetIndicesAttr()
+    return str(value_at(primvar.GetAttr(), time)), str(value_at(indices, time)) if indices else ""
 
 
 def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
