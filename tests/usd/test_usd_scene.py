@@ -196,7 +196,8 @@ DIFFERENCES = {
     "collection of parts": (
         "rel collection:some:includes = </all/one/cube>\n"
         "rel material:binding:collection:some = [</all/one.collection:some>, </red>]",
-        "rel material:binding = </red>",
+        "rel collection:some:includes = </all/two/other>\n"
+        "rel material:binding:collection:some = [</all/two.collection:some>, </red>]",
         "",
     ),
     "collection above": (
@@ -222,7 +223,7 @@ DIFFERENCES = {
     ),
     "visibility": ("", 'token visibility = "invisible"', ""),
     "purpose": ('uniform token purpose = "render"', 'uniform token purpose = "guide"', ""),
-    "places": ("", "rel material:binding = </red>", ""),
+    "places": ("", "", ""),
 }
 
 
@@ -242,10 +243,10 @@ def test_instances_that_differ_look_like_prims_that_do(stage, difference, reques
     text += material(reads, tint).replace("paint", "tinted")
     # Where the difference is the place, one part does not move with the instance.
     reset = '"!resetXformStack!", ' if difference == "places" else ""
-    lower = f"""double3 xformOp:translate = (0, {-0.3 - 0.3 * bool(reset)}, 0)
+    lower = f"""double3 xformOp:translate = ({-0.2 * bool(reset)}, -0.3, 0)
         float3 xformOp:scale = (0.2, 0.2, 0.2)
         uniform token[] xformOpOrder = [{reset}"xformOp:translate", "xformOp:scale"]\n"""
-    upper = lower.replace("-0.", "0.").replace(reset, "")
+    upper = lower.replace("-0.2, -0.3", "0, 0.3").replace("-0.3", "0.3").replace(reset, "")
     own = "rel material:binding = </green>\n" if difference in ("strength", "full and all") else ""
     text += f'class Xform "kind" {{ {mesh("cube", CUBE + upper)} {mesh("other", CUBE + lower + own)} }}\n'
 
