@@ -1013,6 +1013,97 @@ def test_depth_of_field_and_the_resolution_of_render_settings(stage):
         msub.usd_scene(stage(lens + mesh("cube", CUBE)), mi, camera="/none")
 
 
+SETTINGS = """def RenderSettings "settings" {{
+    uniform int2 resolution = (40, 20)
+    {}
+}}
+"""
+NAMED = 'renderSettingsPrimPath = "/settings"'
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize(
+    ("policy", "wide", "high"),
+    [
+        # Of an aperture of 3 by 3 in a picture twice as wide as high.
+        ("expandAperture", 6, 3),
+        ("cropAperture", 3, 1.5),
+        ("adjustApertureWidth", 6, 3),
+        ("adjustApertureHeight", 3, 1.5),
+        ("adjustPixelAspectRatio", 6, 3),
+    ],
+)
+def test_the_aperture_fits_the_picture_as_render_settings_say(stage, projection, policy, wide, high):
+    settings = SETTINGS.format(f'uniform token aspectRatioConformPolicy = "{policy}"')
+    text = settings + CAMERA.replace("Aperture = 10", "Aperture = 3") + mesh("cube", CUBE)
+    text = text.replace("focalLength = 50", f'focalLength = 50\ntoken projection = "{projection}"')
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        sensor = mi.load_dict(msub.usd_scene(stage(text, head=NAMED), mi)["sensor"])
+    assert ('aspectRatioConformPolicy "adjustPixelAspectRatio" is ignored' in told(record)) == ("Pixel" in policy)
+    assert tuple(sensor.film().size()) == (40, 20)
+    # Where the corners of the picture are at a distance of the focal length, or in tenths of the world's unit.
+    ray = sensor.sample_ray(0, 0, mi.Point2f([0, 1], [0, 1]), mi.Point2f(0.5))[0]
+    ends = np.array(ray.d * 50 / -ray.d.z if projection == "perspective" else ray.o * 10)[:2]
+    np.testing.assert_allclose(np.abs(np.ptp(ends, axis=1)), [wide, high], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["disableMotionBlur", "instantaneousShutter", "disableDepthOfField"])
+def test_render_settings_turn_off_blur(stage, name):
+    lens = "float fStop = 2\nfloat focusDistance = 7\n"
+    shutter = "double shutter:open = -0.5\ndouble shutter:close = 0.5\n"
+    camera = CAMERA.replace("focalLength = 50", f"focalLength = 50\n{lens}{shutter}")
+    for value in (False, True):
+        text = SETTINGS.format(f"uniform bool {name} = {str(value).lower()}") + camera + mesh("cube", CUBE)
+        found = read_stage(stage(text, head=NAMED)).camera
+        is_off = [found.shutter == [0, 0], found.lens_radius == 0]
+        assert is_off == (
+            [False, False] if not value else [name != "disableDepthOfField", name == "disableDepthOfField"]
+        )
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("uniform float pixelAspectRatio = 2", "pixelAspectRatio of render settings is ignored"),
+        ("uniform float4 dataWindowNDC = (0, 0, 0.5, 1)", "dataWindowNDC of render settings is ignored"),
+        ('uniform token[] includedPurposes = ["default", "proxy"]', "includedPurposes of render settings is ignored"),
+        ('uniform token[] materialBindingPurposes = ["preview"]', "materialBindingPurposes of render settings is ign"),
+        ('uniform token renderingColorSpace = "acescg"', "renderingColorSpace of render settings is ignored"),
+        ("rel products = </product>", "render products are ignored; the picture is that of the render settings"),
+        ('uniform token aspectRatioConformPolicy = "other"', 'aspectRatioConformPolicy "other" is ignored; expand'),
+        ("uniform int2 resolution = (0, 20)", "a resolution of render settings that is not two numbers above 0"),
+        ('uniform token resolution = "large"', "a resolution of render settings that is not two numbers above 0"),
+        # Those of cameras.
+        ("float exposure = 1", "exposure of cameras is ignored; pictures have the radiance of the scene"),
+        ("float exposure:iso = 200", "exposure:iso of cameras is ignored"),
+        ("float exposure:time = 0.5", "exposure:time of cameras is ignored"),
+        ("float exposure:fStop = 2", "exposure:fStop of cameras is ignored"),
+        ("float exposure:responsivity = 2", "exposure:responsivity of cameras is ignored"),
+        ("float4[] clippingPlanes = [(0, 0, 1, 0)]", "clippingPlanes of cameras are ignored"),
+        ('token projection = "fisheye"', 'the projection "fisheye" of cameras is ignored, and perspective is used'),
+        ("float fStop = 2", "fStop of cameras without a focusDistance above 0 is ignored"),
+    ],
+)
+def test_what_the_frame_does_not_follow_is_told_once(stage, line, message):
+    is_camera = any(word in line for word in ("exposure", "clipping", "projection", "fStop"))
+    settings = SETTINGS.replace("uniform int2 resolution = (40, 20)", "") if "resolution" in line else SETTINGS
+    camera = CAMERA.replace("focalLength = 50", f"focalLength = 50\n{line}") if is_camera else CAMERA
+    text = settings.format("" if is_camera else line) + 'def RenderProduct "product" {}\n' + camera + mesh("cube", CUBE)
+    with pytest.warns(CageWarning) as record:
+        msub.usd_scene(stage(text, head=NAMED), mi)
+    (found,) = (str(each.message) for each in record)
+    assert message in found
+    assert found.endswith("(/camera)" if is_camera else "(/settings)")
+
+
+def test_render_settings_that_the_stage_does_not_name_are_told(stage):
+    text = SETTINGS.format("") + CAMERA + mesh("cube", CUBE)
+    for head, named in (("", "/settings"), ('renderSettingsPrimPath = "/none"', "/settings")):
+        with pytest.warns(CageWarning, match=rf"render settings are those that .* all others are ignored \({named}\)"):
+            assert read_stage(stage(text, head=head)).resolution is None
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_of_several_cameras_the_first_is_used_and_told(stage, count):
     cameras = "".join(CAMERA.replace('"camera"', f'"camera_{number}"') for number in range(count))

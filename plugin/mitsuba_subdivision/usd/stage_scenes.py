@@ -133,7 +133,10 @@ class StageScenes:
         opens, closes = first.camera.shutter if first.camera else (0.0, 0.0)
         if opens >= closes:
             found = f"shutter:open is {opens:g}, and shutter:close {closes:g}" if first.camera else "there is no camera"
-            raise CageError(f"{self.name}: {found}; expected a camera whose shutter opens before it closes")
+            raise CageError(
+                f"{self.name}: {found}; expected a camera whose shutter opens before it closes, and render settings "
+                "without disableMotionBlur"
+            )
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, View, tuple[int, int]]:

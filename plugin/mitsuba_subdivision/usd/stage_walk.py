@@ -23,7 +23,7 @@ from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
 from .polygons import GPRIMS
-from .stage_camera import read_camera
+from .stage_camera import FrameSettings, read_camera, read_settings
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
@@ -209,8 +209,9 @@ class _StageWalk:
 
     def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:
         """The camera, and the resolution of the stage's render settings; each None if there is none."""
-        chosen, resolution = self._camera(path)
-        return None if chosen is None else self._camera_contents(chosen), resolution
+        settings = read_settings(self._stage, self._code, self._notes)
+        chosen = self._camera(path or settings.camera)
+        return None if chosen is None else self._camera_contents(chosen, settings), settings.resolution
 
     def _below(self, root: Usd.Prim) -> _Subtree:
         """Visible contents of a prim and its descendants."""
@@ -398,7 +399,7 @@ class _StageWalk:
             self._prototypes.append(flat)
         return self._numbers[key]
 
-    def _camera_contents(self, camera: UsdGeom.Camera) -> CameraContents:
+    def _camera_contents(self, camera: UsdGeom.Camera, settings: FrameSettings) -> CameraContents:
         """Parameters of a camera.
 
         Raises
@@ -407,7 +408,7 @@ class _StageWalk:
             If it cannot be used.
         """
         try:
-            contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, self._notes)
+            contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, settings, self._notes)
         except (TypeError, ValueError):
             contents = None
         if contents is None or not contents.is_usable:
@@ -417,35 +418,26 @@ class _StageWalk:
             )
         return contents
 
-    def _camera(self, path: str | None) -> tuple[UsdGeom.Camera | None, list[int] | None]:
-        """The camera, and the resolution of the stage's render settings; each None if there is none.
+    def _camera(self, path: str | None) -> UsdGeom.Camera | None:
+        """The camera of a path, or by default the first one; None if there is none.
 
         Raises
         ------
         CageError
             If there is no camera of the path.
         """
-        from pxr import Usd, UsdGeom, UsdRender
+        from pxr import Usd, UsdGeom
 
-        resolution = None
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
         cameras = {str(prim.GetPath()): UsdGeom.Camera(prim) for prim in prims if prim.IsA(UsdGeom.Camera)}
-        settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
-        chosen = path
-        if settings:
-            resolution = [int(each) for each in value_at(settings.GetResolutionAttr(), self._code)]
-            targets = settings.GetCameraRel().GetForwardedTargets()
-            chosen = path or (str(targets[0]) if targets else None)
-        if chosen is not None:
-            if chosen not in cameras:
+        if path is not None:
+            if path not in cameras:
                 there = ", ".join(cameras) or "none"
-                raise CageError(
-                    f'{self._name}: there is no camera "{chosen}"; expected one of those there are: {there}'
-                )
-            return cameras[chosen], resolution
+                raise CageError(f'{self._name}: there is no camera "{path}"; expected one of those there are: {there}')
+            return cameras[path]
         if len(cameras) > 1:
             self._notes.add("there are several cameras, and the first is used", ", ".join(cameras))
-        return next(iter(cameras.values()), None), resolution
+        return next(iter(cameras.values()), None)
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
         return np.array(local_to_world(prim, lambda attribute: time_of(attribute, self._code), self._transforms)).T
