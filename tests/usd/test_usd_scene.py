@@ -780,6 +780,91 @@ def test_nodes_of_texture_coordinates_that_are_not_known_are_told_and_left_out(s
         assert told(record).count('shaders "OddTransform" of texture coordinates are ignored (/paint/odd)') == expected
 
 
+PLACE = """def Shader "place" {{
+    uniform token info:id = "UsdTransform2d"
+    {}
+    float2 outputs:result
+}}"""
+READER = "float2 inputs:in.connect = </paint/reader.outputs:result>\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('wrapS = "repeat"', 'wrapS = "other"', 'wrapS "other" of textures is ignored; expected repeat, mirror, clamp'),
+        ('wrapS = "repeat"', 'wrapS = "clamp"', "wrapT of textures is ignored; wrapS applies to both coordinates"),
+        ('"repeat"', '"black"', 'textures with the wrap mode "black" use "clamp"'),
+        ('"sRGB"', '"acescg"', 'sourceColorSpace "acescg" of textures is ignored; expected auto, raw, sRGB'),
+        (
+            "float3 outputs:rgb",
+            "float inputs:gain = 2\nfloat3 outputs:rgb",
+            "does not have are ignored (gain of /paint/te",
+        ),
+        (
+            "float3 outputs:rgb",
+            "float4 inputs:scale.connect = </paint/reader.outputs:result>\nfloat3 outputs:rgb",
+            "connections of scale of ",
+        ),
+        (
+            "float2 inputs:st.connect = </paint/reader.outputs:result>",
+            "",
+            "read the texture coordinates st where st is not",
+        ),
+        (
+            "string inputs:varname",
+            "float2 inputs:fallback = (1, 0)\nstring inputs:varname",
+            "fallback of texture coord",
+        ),
+        ("string inputs:varname", "int inputs:index = 1\nstring inputs:varname", "ignored (index of /paint/reader)"),
+        ("reader.outputs:result>", "place.outputs:result>", "ignored (pivot of /paint/place)"),
+        ("outputs:rgb", "outputs:rgba", 'the output "rgba" of textures is not there; rgb is used'),
+        (
+            "outputs:rgb>",
+            "outputs:none>",
+            "connections of inputs to what is not there are ignored (/paint/surface.inputs",
+        ),
+        (
+            "float3 outputs:rgb",
+            "float2 inputs:scale = (1, 1)\nfloat3 outputs:rgb",
+            "materials whose inputs have other types than their model",
+        ),
+        (
+            "asset inputs:file = @black.png@",
+            'string inputs:file = "a"',
+            "materials whose inputs have other types than the",
+        ),
+        (
+            '"UsdPreviewSurface"',
+            '"UsdPreviewSurface"\nfloat inputs:gain = 2',
+            "does not have are ignored (gain of /paint/su",
+        ),
+    ],
+)
+def test_inputs_of_textures_that_are_ignored_are_told_once_by_name(stage, tmp_path, old, new, message):
+    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    place = PLACE.format(READER + "float2 inputs:pivot = (1, 1)")
+    paint = material("color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>", texture("black.png") + place)
+    assert old in paint
+    changed = paint.replace(old, new, 2 if old in ('"repeat"', "outputs:rgb") else 1)
+    with pytest.warns(CageWarning) as record:
+        scene = msub.usd_scene(stage(changed + mesh("square", SQUARE + BOUND)), mi)
+    assert [message in str(each.message) for each in record] == [True]
+    assert "square" in scene
+
+
+def test_constant_texture_coordinates_read_one_texel(stage, tmp_path):
+    mi.Bitmap(QUADRANTS.repeat(8, axis=0).repeat(8, axis=1)).write(str(tmp_path / "quadrants.png"))
+    glow = (
+        "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>\ncolor3f inputs:diffuseColor = (0, 0, 0)"
+    )
+    nodes = texture("quadrants.png").replace(
+        "inputs:st.connect = </paint/reader.outputs:result>", "inputs:st = (0.75, 0.75)"
+    )
+    text = CAMERA + DARK + material(glow, nodes) + mesh("square", SQUARE + BOUND)
+    picture = rendered(msub.usd_scene(stage(text), mi, size=(4, 4)), spp=4)
+    np.testing.assert_allclose(picture, np.broadcast_to([0, 1, 0], picture.shape), atol=1e-6)
+
+
 def test_normal_maps_turn_the_normal(stage, tmp_path):
     """A surface that faces the light by its normal map gets all of it."""
     normal = np.array([0.6, 0.0, 0.8])

@@ -81,17 +81,17 @@ def read_settings(stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings) ->
             notes.add(f"{name} of render settings is ignored", path)
     if settings.GetProductsRel().GetForwardedTargets():
         notes.add("render products are ignored; the picture is that of the render settings", path)
-    resolution = np.asarray(value("resolution"))
-    if resolution.dtype.kind != "i" or resolution.shape != (2,) or (resolution < 1).any():
+    size = np.asarray(value("resolution"))
+    is_size = size.dtype.kind == "i" and size.shape == (2,) and bool((size > 0).all())
+    if not is_size:
         notes.add("a resolution of render settings that is not two numbers above 0 is ignored", path)
-        resolution = None
     policy = str(value("aspectRatioConformPolicy"))
     if policy not in CONFORM_POLICIES:
         notes.add(f'aspectRatioConformPolicy "{policy}" is ignored; {CONFORM_POLICIES[0]} is used', path)
         policy = CONFORM_POLICIES[0]
     targets = settings.GetCameraRel().GetForwardedTargets()
     return FrameSettings(
-        None if resolution is None else resolution.tolist(),
+        size.tolist() if is_size else None,
         str(targets[0]) if targets else None,
         policy,
         not (value("disableMotionBlur") or value("instantaneousShutter")),
