@@ -244,3 +244,77 @@ def test_a_mesh_whose_points_or_faces_cannot_be_meant_is_left_out_alone(tmp_path
     assert [name for name in entries if name.startswith("m")] == [f"m{len(unusable)}"]
     assert [len(re.findall(rf"/m{number}\b", told)) for number in range(len(unusable))] == [1] * len(unusable)
     assert {"points", "faceVertexCounts", "faceVertexIndices"} <= set(re.findall(r"\w+", told))
+
+
+INSTANCER = {
+    "prototypes": "rel prototypes = </prim/proto>",
+    "protoIndices": "int[] protoIndices = [0, 0]",
+    "positions": "point3f[] positions = [(3, 0, 0), (6, 0, 0)]",
+    "orientations": "quath[] orientations = [(1, 0, 0, 0), (1, 0, 0, 0)]",
+    "scales": "float3[] scales = [(1, 1, 1), (1, 1, 1)]",
+    "ids": "int64[] ids = [1, 2]",
+    "invisibleIds": "int64[] invisibleIds = []",
+}
+
+
+def instancer(name, line):
+    whole = "\n".join((POINTS, COUNTS, VERTICES))
+    lines = "\n".join({**INSTANCER, name: line}.values())
+    return f'def PointInstancer "prim" {{\n{lines}\ndef Mesh "proto" {{\n{whole}\n}}\n}}\n'
+
+
+def prim(kind, line):
+    return f'def {kind} "prim" ( prepend apiSchemas = ["ShapingAPI"] ) {{\n{line}\n}}\n'
+
+
+MOVED = "\n".join((POINTS, COUNTS, VERTICES, 'uniform token[] xformOpOrder = ["xformOp:translate"]\n'))
+BROKEN = [
+    instancer("prototypes", ""),
+    instancer("prototypes", "int prototypes = 3"),
+    instancer("prototypes", "rel prototypes = </none>"),
+    instancer("prototypes", "rel prototypes = </prim>"),
+    instancer("protoIndices", "int[] protoIndices = [0, 1]"),
+    instancer("protoIndices", "int[] protoIndices = [0, -1]"),
+    instancer("protoIndices", "float[] protoIndices = [0, 0.5]"),
+    instancer("protoIndices", ""),
+    instancer("positions", "point3f[] positions = [(3, 0, 0)]"),
+    instancer("positions", "float[] positions = [3, 6]"),
+    instancer("positions", "point3f[] positions = [(nan, 0, 0), (6, 0, 0)]"),
+    instancer("positions", ""),
+    instancer("orientations", "quath[] orientations = [(1, 0, 0, 0)]"),
+    instancer("orientations", "quatf[] orientations = [(1, 0, 0, 0), (1, 0, 0, 0)]"),
+    instancer("scales", "float3[] scales = [(1, 1, 1)]"),
+    instancer("scales", "float[] scales = [1, 1]"),
+    instancer("ids", 'string[] ids = ["a", "b"]'),
+    instancer("invisibleIds", "int[] invisibleIds = [1]"),
+    *(prim("Mesh", MOVED + f"{kind} xformOp:translate = {value}") for kind, value in (
+        ("string", '"a"'), ("double4", "(1, 2, 3, 4)"), ("double3[]", "[(1, 2, 3)]"), ("double3", "(nan, 0, 0)"),
+    )),
+    *(prim("RectLight", f"{line}") for line in ('string inputs:texture:file = "a"', 'string inputs:width = "a"')),
+    *(prim("DomeLight", f"{line}") for line in ('string inputs:texture:file = "a"', "int inputs:texture:format = 3")),
+    *(prim("SphereLight", f'string {name} = "a"') for name in (
+        "inputs:intensity", "inputs:color", "inputs:exposure", "inputs:normalize", "inputs:radius", "treatAsPoint",
+        "inputs:shaping:cone:angle",
+    )),
+    prim("SphereLight", "float inputs:color = 1"),
+    prim("DistantLight", 'string inputs:angle = "a"'),
+    prim("Cube", 'string size = "a"'),
+    prim("Cube", "double size = nan"),
+    prim("Sphere", "double radius = -1"),
+    prim("Cylinder", 'uniform token axis = "Q"'),
+    prim("Plane", "int[] width = [1]"),
+    prim("Camera", "float2 clippingRange = (5, 1)"),
+    prim("Camera", 'token projection = "fisheye"'),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", BROKEN)
+def test_a_prim_that_cannot_be_used_is_told_and_the_stage_stays(tmp_path, text):
+    path = write(tmp_path, mesh_of(0, "") + text)
+    with pytest.warns(CageWarning) as record:
+        entries = msub.usd_scene(path, mi, tessellation_rate=1, shading="vertex", size=(4, 4))
+    mi.load_dict(entries)
+    assert "m0" in entries
+    assert any(re.search(r"/prim\b|/none", str(each.message)) for each in record)
+    # USD may report the same in a line of its own.
+    assert len(record) <= 2

@@ -28,6 +28,21 @@ def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
     return attribute.Get(time_of(attribute, time))
 
 
+def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
+    """Check that values of the attributes of a prim have the types that its schema says; USD reads others as none.
+
+    Raises
+    ------
+    TypeError
+    """
+    for attribute in prim.GetAuthoredAttributes():
+        value, declared = value_at(attribute, time), attribute.GetTypeName().defaultValue
+        are_numbers = isinstance(value, (int, float)) and isinstance(declared, (int, float))
+        if value is not None and declared is not None and not are_numbers and not isinstance(value, type(declared)):
+            found, expected = type(value).__name__, type(declared).__name__
+            raise TypeError(f"{attribute.GetName()} is of the type {found}; expected {expected}")
+
+
 def local_to_world(
     prim: Usd.Prim, time_of: Callable[[Usd.Attribute], Usd.TimeCode], known: dict[str, Gf.Matrix4d] | None = None
 ) -> Gf.Matrix4d:

@@ -83,7 +83,10 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
     def number(name: str, usual: float) -> float:
         attribute = prim.GetAttribute(name)
         value = value_at(attribute, time) if attribute else None
-        return usual if value is None else float(value)
+        size = usual if value is None else float(value)
+        if not 0 <= size < np.inf:
+            raise ValueError(f"{name} is {size}; expected a finite number, 0 or more")
+        return size
 
     axis = str(value_at(prim.GetAttribute("axis"), time)) if prim.HasAttribute("axis") else "Z"
     if axis not in _TURNS:

@@ -30,6 +30,8 @@ _NEUTRAL_EXPOSURE = {
     "exposure:fStop": 1.0,
     "exposure:responsivity": 1.0,
 }
+# The schema's fallback of clippingRange.
+_CLIPPING_RANGE = (1.0, 1e6)
 # Of aspectRatioConformPolicy, as `sensors.film_window` has them.
 CONFORM_POLICIES = ("expandAperture", "cropAperture", "adjustApertureWidth", "adjustApertureHeight")
 # Apertures and focal lengths are in tenths of the world's unit.
@@ -138,6 +140,9 @@ def read_camera(
     aperture = [number(camera.GetHorizontalApertureAttr()), number(camera.GetVerticalApertureAttr())]
     offset = [number(camera.GetHorizontalApertureOffsetAttr()), number(camera.GetVerticalApertureOffsetAttr())]
     near, far = value_at(camera.GetClippingRangeAttr(), time)
+    if not near <= far:
+        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", camera.GetPath())
+        near, far = _CLIPPING_RANGE
     focal_length, f_stop = number(camera.GetFocalLengthAttr()), number(camera.GetFStopAttr())
     focus = number(camera.GetFocusDistanceAttr())
     has_lens = is_perspective and f_stop > 0 and focus > 0 and settings.has_depth_of_field

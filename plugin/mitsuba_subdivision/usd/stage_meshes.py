@@ -16,8 +16,7 @@ from ..cage.validation import require_range
 from ..files.usd_primvars import PrimvarChoice
 from ..files.usd_reader import MeshReader
 from ..files.usd_skinning import Skinning
-from ..files.usd_stage import usd_errors_at
-from ..files.usd_values import value_at
+from ..files.usd_values import require_types, value_at
 from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
 from .polygons import GPRIMS, read_gprim, read_normals
@@ -60,7 +59,7 @@ class ShapeReader:
         self._skinning = Skinning(time, notes.add)
 
     def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
-        """Shapes of a prim: one for each material, none if it cannot be used.
+        """Shapes of a prim: one for each material.
 
         Parameters
         ----------
@@ -68,25 +67,20 @@ class ShapeReader:
         to_world : (4, 4) float64
             From the prim's space, for column vectors.
 
-        Warns
-        -----
-        CageWarning
+        Raises
+        ------
+        CageError, TypeError, ValueError
             If it cannot be used.
         """
         location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
-        try:
-            if not is_invertible(to_world):
-                raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
-            with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-                if str(prim.GetTypeName()) in GPRIMS:
-                    cage, normals = read_gprim(prim, self._code)
-                    return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
+        if not is_invertible(to_world):
+            raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
+        with np.errstate(over="ignore", invalid="ignore"):
+            if str(prim.GetTypeName()) not in GPRIMS:
                 return self._parts(prim, to_world, location)
-        except (CageError, TypeError, ValueError) as error:
-            # Values of another type than the schema's.
-            message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
-            self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
-            return []
+            require_types(prim, self._code)
+            cage, normals = read_gprim(prim, self._code)
+            return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         from pxr import UsdGeom
@@ -181,6 +175,9 @@ class ShapeReader:
             if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._code):
                 self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
             radiance = read_emission(prim, self._code).tolist()
+            if not np.isfinite(radiance).all():
+                self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
+                radiance = None
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
 
     def _constant(self, prim: Usd.Prim, name: str) -> list[float]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError, shortened
 from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
-from ..files.usd_values import local_to_world, time_of, value_at
+from ..files.usd_values import local_to_world, require_types, time_of, value_at
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
@@ -30,7 +31,7 @@ from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
 from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
-    from pxr import Gf, Usd, UsdGeom
+    from pxr import Gf, Sdf, Usd, UsdGeom
 
 # Draw modes by which a viewer shows a model as it is.
 _FULL_MODES = (None, "default", "inherited")
@@ -173,6 +174,8 @@ class _StageWalk:
         # prototype and bindings.
         self._inherited: dict[tuple[object, ...], tuple[list[str], bool]] = {}
         self._prototypes: list[_Subtree] = []
+        # Paths of instancers whose prototypes are being read.
+        self._open: list[Sdf.Path] = []
 
     def contents(self, camera: str | None) -> SceneContents:
         from pxr import UsdGeom
@@ -215,40 +218,53 @@ class _StageWalk:
 
     def _below(self, root: Usd.Prim) -> _Subtree:
         """Visible contents of a prim and its descendants."""
-        from pxr import UsdGeom, UsdLux
-
         found, to_root = _Subtree(), _inverse(self._to_world(root))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
             name = str(prim.GetPath()).removeprefix(above)
             self._count += 1
             self._at(f"prim {self._count}")
-            draw_mode = prim.GetAttribute("model:drawMode")
-            if draw_mode and value_at(draw_mode, self._code) not in _FULL_MODES:
-                self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
-            if prim != root and prim.IsInstance():
-                self._add_instance(prim, name, to_root, found)
-            elif prim.IsA(UsdGeom.PointInstancer):
-                try:
-                    self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
-                except (CageError, TypeError, ValueError) as error:
-                    location = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
-                    message = str(error) if isinstance(error, CageError) else f"{location}{error}"
-                    self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
-            elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
-                kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
-                if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
-                    found.shapes += [replace(shape, name=name) for shape in self._shapes.read(prim, placed)]
-                elif prim.HasAPI(UsdLux.LightAPI):
-                    light = self._light(prim, placed)
-                    found.lights += [] if light is None else [replace(light, name=name)]
-                elif kind not in _SILENT:
-                    self._notes.add(f"prims of type {kind} are ignored", path)
+            with self._left_out_if_unusable(prim):
+                self._add(prim, name, root, to_root, found)
         return found
+
+    def _add(self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], found: _Subtree) -> None:
+        """Add what a prim shows."""
+        from pxr import UsdGeom, UsdLux
+
+        draw_mode = prim.GetAttribute("model:drawMode")
+        if draw_mode and value_at(draw_mode, self._code) not in _FULL_MODES:
+            self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
+        if prim != root and prim.IsInstance():
+            self._add_instance(prim, name, to_root, found)
+        elif prim.IsA(UsdGeom.PointInstancer):
+            self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
+        elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
+            kind, path = str(prim.GetTypeName()), prim.GetPath()
+            if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
+                shapes = self._shapes.read(prim, to_root @ self._to_world(prim))
+                found.shapes += [replace(shape, name=name) for shape in shapes]
+            elif prim.HasAPI(UsdLux.LightAPI):
+                light = self._light(prim, to_root @ self._to_world(prim))
+                found.lights += [] if light is None else [replace(light, name=name)]
+            elif kind not in _SILENT:
+                self._notes.add(f"prims of type {kind} are ignored", path)
+
+    @contextmanager
+    def _left_out_if_unusable(self, prim: Usd.Prim) -> Iterator[None]:
+        """Leave out a prim that raises an error in a ``with`` block, with a note, in place of the whole stage."""
+        location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
+        try:
+            with usd_errors_at(location):
+                yield
+        except (CageError, AttributeError, TypeError, ValueError) as error:
+            message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
+            self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
 
     def _light(self, prim: Usd.Prim, placed: NDArray[np.float64]) -> LightContents | None:
         """A light; None, with a note, if it cannot be used."""
         try:
+            require_types(prim, self._code)
             light = read_light(prim, placed, self._code, self._notes)
         except (TypeError, ValueError):
             self._notes.add("lights with attributes of other types than UsdLux has are ignored", prim.GetPath())
@@ -334,6 +350,10 @@ class _StageWalk:
         path = prim.GetPath()
         if UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES:
             return
+        if path in self._open:
+            self._notes.add("point instancers in their own prototypes are ignored", path)
+            return
+        require_types(prim, self._code)
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         kinds = np.array(instancer.GetProtoIndicesAttr().Get(self._code) or [], dtype=np.int64)
         if len(kinds) and not 0 <= kinds.min() <= kinds.max() < len(targets):
@@ -342,6 +362,8 @@ class _StageWalk:
                 f"{self._name}, prim {shortened(str(path))}: protoIndices are from {kinds.min()} to {kinds.max()}; "
                 f"expected {expected}"
             )
+        if not len(kinds) and instancer.GetPositionsAttr().Get(self._code):
+            self._notes.add("point instancers without protoIndices show nothing", path)
         if any(each.GetInterpolation() != "constant" for each in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()):
             self._notes.add("primvars of point instancers are ignored", path)
         mask = instancer.ComputeMaskAtTime(self._code)
@@ -366,7 +388,11 @@ class _StageWalk:
             if not prototype:
                 self._notes.add("prototypes of point instancers that are not there are ignored", target)
                 continue
-            group = self._prototype(f"{path} {target}", prototype)
+            self._open.append(path)
+            try:
+                group = self._prototype(f"{path} {target}", prototype)
+            finally:
+                self._open.pop()
             for row in np.flatnonzero((kinds == number) & is_shown & is_usable):
                 found.instances.append(InstanceContents(f"{name}/{row}", group, matrices[row]))
 
