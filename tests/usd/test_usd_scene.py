@@ -330,6 +330,16 @@ def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
     assert all(same(plain, each) for each in others)
 
 
+def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
+    """USD looks for the times of its samples for ever."""
+    moving = "double3 xformOp:translate.timeSamples = { 1: (0, 0, 3), 2: (0, 0, 4) }\n"
+    body = CUBE + moving + 'uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+    layer = f'#usda 1.0\n( timeCodesPerSecond = 24 )\ndef Mesh "cube" {{\n{body}\n}}\n'
+    (tmp_path / "layer.usda").write_text(layer)
+    (shape,) = read_stage(stage("", head="subLayers = [@layer.usda@]\n    timeCodesPerSecond = 0")).shapes
+    np.testing.assert_array_equal(shape.to_world[:3, 3], [0, 0, 3])
+
+
 def test_instances_that_cannot_be_seen_leave_the_others_there(stage):
     """The first one, of size 0, is not what the prototype is read from."""
     prototype = f'class Xform "class_of" {{ {mesh("cube", CUBE)} }}'

@@ -56,7 +56,7 @@ def local_to_world(
     known : dict, optional
         Transforms by path, to which those of the prim and the prims above are added.
     """
-    from pxr import Gf, Usd, UsdGeom
+    from pxr import Gf, UsdGeom
 
     path = str(prim.GetPath())
     if known is not None and path in known:
@@ -64,11 +64,9 @@ def local_to_world(
     matrix, resets = Gf.Matrix4d(1), prim.IsPseudoRoot()
     here = UsdGeom.Xformable(prim)
     if here:
-        if here.GetTimeSamples():
-            for operation in reversed(here.GetOrderedXformOps()):
-                matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
-        else:
-            matrix = here.GetLocalTransformation(Usd.TimeCode.Default())
+        # Times of samples are not asked for: with timeCodesPerSecond = 0, USD looks for them for ever.
+        for operation in reversed(here.GetOrderedXformOps()):
+            matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
         resets = here.GetResetXformStack()
     if not resets:
         matrix *= local_to_world(prim.GetParent(), time_of, known)
