@@ -50,8 +50,11 @@ def note_unknown_inputs(shader: UsdShade.Shader, known: Collection[str], notes: 
 def source_of(given: UsdShade.Input, notes: StageWarnings) -> Usd.Attribute | None:
     """The attribute that has the value of an input, or the output that computes it; None if there is none."""
     found = given.GetValueProducingAttributes() if given else []
-    if not found and given and given.GetAttr().HasAuthoredConnections():
-        notes.add("connections of inputs to what is not there are ignored", given.GetAttr().GetPath())
+    attribute = given.GetAttr() if given else None
+    if not found and attribute:
+        stage = attribute.GetStage()
+        if not all(stage.GetPropertyAtPath(path) for path in attribute.GetConnections()):
+            notes.add("connections of inputs to what is not there are ignored", attribute.GetPath())
     return found[0] if found else None
 
 
