@@ -340,6 +340,18 @@ def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
     np.testing.assert_array_equal(shape.to_world[:3, 3], [0, 0, 3])
 
 
+@pytest.mark.parametrize("time", [None, 1, 1.5, 2, 3])
+def test_velocities_of_meshes_are_told_between_samples(stage, time):
+    points = CUBE.split("= ", 1)[1].split("]", maxsplit=1)[0] + "]"
+    body = CUBE.replace(f"points = {points}", f"points.timeSamples = {{ 1: {points}, 2: {points} }}")
+    velocities = f"vector3f[] velocities.timeSamples = {{ 1: {points}, 2: {points} }}"
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        read_stage(stage(mesh("cube", f"{body}{velocities}")), time)
+    is_between = time in (1.5, 3)
+    assert ("velocities of meshes are ignored; their points are interpolated" in told(record)) == is_between
+
+
 def test_instances_that_cannot_be_seen_leave_the_others_there(stage):
     """The first one, of size 0, is not what the prototype is read from."""
     prototype = f'class Xform "class_of" {{ {mesh("cube", CUBE)} }}'

@@ -89,6 +89,7 @@ class ShapeReader:
         reader = MeshReader(mesh, location, self._time, self._skinning, report=self._notes.add_message)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
+        self._note_velocities(mesh)
         materials, owner = self._materials_of_faces(mesh, reader)
         shapes = []
         # Parts whose materials need the same primvars share their arrays.
@@ -115,6 +116,16 @@ class ShapeReader:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             shapes.append(replace(self._shape(prim, to_world, cage, normals, material), shown_faces=shown))
         return shapes
+
+    def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
+        """Note velocities where points are not those of a sample."""
+        if self._code.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
+            return
+        time = self._code.GetValue()
+        if time not in mesh.GetPointsAttr().GetBracketingTimeSamples(time):
+            self._notes.add(
+                "velocities of meshes are ignored; their points are interpolated between samples", mesh.GetPath()
+            )
 
     def _materials_of_faces(self, mesh: UsdGeom.Mesh, reader: MeshReader) -> tuple[list[int | None], IntArray]:
         """Materials of a mesh, and for each face the index of its own among them."""

@@ -83,7 +83,7 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
     ----------
     path : str or Path
     time : float, optional
-        Time code; by default, the first one of each value.
+        Time code; by default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional
         Path of the camera; by default, that of the stage's render settings, or its first one.
 
