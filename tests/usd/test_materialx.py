@@ -474,6 +474,27 @@ def test_inputs_of_images_and_coordinates_that_are_ignored_are_told_once_by_name
     assert [each.file for each in found.materials[0].textures()] == [str(tmp_path / "black.png")]
 
 
+@pytest.mark.parametrize("place", ["texcoord", "place2d"])
+def test_slopes_along_other_coordinates_are_told(tmp_path, place):
+    bump = f"""<image name="i" type="float"><input name="file" type="filename" value="black.png" /></image>
+        <texcoord name="texcoord" type="vector2" />
+        <place2d name="place2d" type="vector2"><input name="texcoord" type="vector2" nodename="texcoord" />
+            <input name="rotate" type="float" value="30" /></place2d>
+        <heighttonormal name="h" type="vector3"><input name="in" type="float" nodename="i" />
+            <input name="texcoord" type="vector2" nodename="{place}" /></heighttonormal>
+        <normalmap name="n" type="vector3"><input name="in" type="vector3" nodename="h" /></normalmap>"""
+    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    normal = '<input name="normal" type="vector3" nodename="n" />'
+    path = stage(tmp_path, LOOKS % "" + bound(), red=surface(normal, graph=bump))
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        StageReader(path).at()
+    told = [str(each.message) for each in record]
+    assert ["texcoord of heighttonormal is ignored; slopes are along" in each for each in told] == [True] * (
+        place != "texcoord"
+    )
+
+
 BOX = """int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
     int[] faceVertexIndices = [0, 3, 2, 1, 4, 5, 6, 7, 0, 1, 5, 4, 1, 2, 6, 5, 2, 3, 7, 6, 3, 0, 4, 7]
     point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0), (-1,-1,2), (1,-1,2), (1,1,2), (-1,1,2)]

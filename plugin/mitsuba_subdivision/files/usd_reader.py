@@ -331,6 +331,8 @@ class MeshReader:
         indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
         lengths = self.array(mesh.GetCreaseLengthsAttr(), np.int64)
         sharpness = self.array(mesh.GetCreaseSharpnessesAttr(), np.float64)
+        if not len(indices) and not len(lengths) and not len(sharpness):
+            return np.zeros((0, 3))
         if (lengths < 2).any():
             first = int(np.argmax(lengths < 2))
             raise self.error(f"creaseLengths has the value {lengths[first]} at {first}", "2 or more vertices")
@@ -357,6 +359,8 @@ class MeshReader:
         """Rows (vertex, sharpness)."""
         indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
         sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
+        if not len(indices) and not len(sharpness):
+            return np.zeros((0, 2))
         if len(indices) != len(sharpness):
             raise self.error(
                 f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}", "as many"

@@ -17,9 +17,11 @@ def time_of(attribute: Usd.Attribute, time: Usd.TimeCode) -> Usd.TimeCode:
     """Time code at which an attribute is read."""
     from pxr import Usd
 
-    default = Usd.TimeCode.Default()
     if not time.IsEarliestTime():
         return time
+    default = Usd.TimeCode.Default()
+    if not attribute.HasAuthoredValue():
+        return default
     return default if attribute.GetResolveInfo(default).GetSource() == Usd.ResolveInfoSourceDefault else time
 
 

@@ -184,6 +184,9 @@ class NetworkReader:
             return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, prim)
         # Slopes are those along texture coordinates.
         unused = {"texcoord"} if category == "heighttonormal" else set()
+        for where in (input_of(each) for each in declared if each.getName() in unused):
+            if not isinstance(where, NodeContents) or where.category != "texcoord":
+                self._notes.add(f"texcoord of {category} is ignored; slopes are along those of the mesh", prim)
         given = {each.getName(): input_of(each) for each in declared if each.getName() not in unused}
         if category in _SPECIAL:
             return _SPECIAL[category](self, kind, given, prim)
