@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import CageError, ControlCage
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, torus
 
 
@@ -48,6 +48,28 @@ def test_what_is_equal_everywhere_takes_no_memory():
     cage = torus(8, 6)
     for values in (cage.tags.edges, cage.tags.vertices, cage.face_sizes):
         assert values.strides == (0,)
+
+
+@pytest.mark.parametrize(
+    ("tags", "message"),
+    [
+        ({"creases": [(0, 7, 10), (0, 1, 3)]}, r"crease along edge \(0, 7\), which is no edge of a face, is ignored"),
+        (
+            {"creases": [(0, 1, 3), (-1, 99, 1)]},
+            r"crease along edge \(-1, 99\), .* \(1 such crease; numbers count from 0",
+        ),
+        (
+            {"creases": [(0, 1, 3)], "corners": [(8, 1), (-1, 1)]},
+            r"corner at vertex 8, which is .* \(2 such corners; num",
+        ),
+    ],
+)
+def test_what_no_face_has_is_ignored_and_told(tags, message):
+    with pytest.warns(CageWarning, match=message) as record:
+        cage = cube_with(**tags)
+    assert len(record) == 1
+    np.testing.assert_array_equal(cage.tags.creases(cage.topology)[:, 2], [3])
+    assert not cage.tags.vertices.any()
 
 
 @pytest.mark.parametrize("vertex", [10**400, 1e300, -1e300, 2**60, float("inf")])

@@ -144,16 +144,6 @@ def test_what_is_not_to_be_smoothed_is_left_out_with_a_warning(read):
         # Numbers that are another mesh's.
         ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at position 6; expected 0 to 5"),
         (
-            "creaseIndices = [1, 4]",
-            "creaseIndices = [1, 7]",
-            "prim /sheet: creases have the index 7 at position 1; expected 0 to",
-        ),
-        (
-            "cornerIndices = [5]",
-            "cornerIndices = [6]",
-            "prim /sheet: corners have the index 6 at position 0; expected 0 to 5",
-        ),
-        (
             "holeIndices = [1]",
             "holeIndices = [2]",
             "prim /sheet: holes have the index 2 at position 0; expected 0 to 1",
@@ -175,14 +165,9 @@ def test_what_is_not_to_be_smoothed_is_left_out_with_a_warning(read):
         ),
         # Mistakes that only the whole cage shows.
         (
-            "creaseIndices = [1, 4]",
-            "creaseIndices = [0, 4]",
-            r"prim /sheet: crease along edge \(0, 4\) of /sheet, which is no edge",
-        ),
-        (
             "cornerSharpnesses = [3]",
             "cornerSharpnesses = [-1]",
-            "prim /sheet: corner at vertex 5 of /sheet has sharpness",
+            "prim /sheet: value 0 of cornerSharpnesses has sharpness -1; expected 0 for smooth",
         ),
         ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),
         ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 of /sheet more than once"),
@@ -193,6 +178,37 @@ def test_errors_tell_the_mesh_and_its_own_numbers(read, old, new, message):
     assert old in SHEET
     with pytest.raises(CageError, match=message):
         read(HOUSE, SHEET.replace(old, new, 1), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "creaseIndices = [1, 4]",
+            "creaseIndices = [1, 7]",
+            r"prim /sheet: crease at \(1, 7\) is ignored; expected vertices from 0 to 5 \(1 such crease\)",
+        ),
+        (
+            "creaseIndices = [1, 4]",
+            "creaseIndices = [0, 4]",
+            r"prim /sheet: crease along edge \(0, 4\) of /sheet, which is no edge of a face, is ignored",
+        ),
+        (
+            "cornerIndices = [5]",
+            "cornerIndices = [6]",
+            r"prim /sheet: corner at \(6\) is ignored; expected vertices from 0 to 5 \(1 such corner\)",
+        ),
+    ],
+)
+def test_tags_of_what_their_own_mesh_lacks_are_ignored_and_told(read, old, new, message):
+    """A number that is a vertex of another mesh, too."""
+    whole = read(SHEET, HOUSE).tags
+    with pytest.warns(CageWarning, match=message):
+        tags = read(SHEET.replace(old, new, 1), HOUSE).tags
+    kept, cut = (tags.vertices, tags.edges) if "crease" in old else (tags.edges, tags.vertices)
+    expected = (whole.vertices, whole.edges) if "crease" in old else (whole.edges, whole.vertices)
+    np.testing.assert_array_equal(kept, expected[0])
+    assert np.count_nonzero(cut) < np.count_nonzero(expected[1])
 
 
 def test_faces_of_several_meshes_are_named(read):

@@ -411,6 +411,90 @@ def test_what_cannot_be_had_is_told_once(tmp_path, text, message):
     assert sum(message in str(each.message) for each in record) == 1
 
 
+ADDRESSES = 'string inputs:uaddressmode = "{0}"\nstring inputs:vaddressmode = "{0}"'
+COORDINATES = "ND_geompropvalue_vector2", 'string inputs:geomprop = "st"\nfloat2 inputs:default = (0.5, 0)'
+
+
+@pytest.mark.parametrize("node", ["ND_image_color3", "ND_tiledimage_color3"])
+@pytest.mark.parametrize(
+    ("image", "where", "message"),
+    [
+        ('string inputs:layer = "some"', (), "layer of images is ignored (/Red/image)"),
+        ('string inputs:filtertype = "closest"', (), "filtertype of images is ignored (/Red/image)"),
+        ('string inputs:framerange = "1-10"', (), "framerange of images is ignored (/Red/image)"),
+        ("int inputs:frameoffset = 3", (), "frameoffset of images is ignored (/Red/image)"),
+        ('string inputs:frameendaction = "periodic"', (), "frameendaction of images is ignored (/Red/image)"),
+        (ADDRESSES.format("constant"), (), 'textures with the address mode "constant" are clamped (/Red/image)'),
+        (ADDRESSES.format("other"), (), "address modes other than periodic, mirror"),
+        ('string inputs:uaddressmode = "clamp"', (), "vaddressmode of textures is ignored; uaddressmode is used for"),
+        ("float inputs:gain = 2", (), "does not have are ignored (gain of /Red/image)"),
+        ("color3f inputs:default.connect = </Red/tone.outputs:out>", (), "default of images is ignored unless it is"),
+        (
+            "",
+            ("ND_texcoord_vector2", "int inputs:index = 1"),
+            "index of texcoord is ignored; the first set of the mesh",
+        ),
+        ("", COORDINATES, "default of texture coordinates is ignored, and (0, 0) is used (/Red/where)"),
+    ],
+)
+def test_inputs_of_images_and_coordinates_that_are_ignored_are_told_once_by_name(tmp_path, node, image, where, message):
+    if "tiled" in node and ("address" in image or "layer" in image):
+        # It has none of these.
+        message = "inputs that ND_tiledimage_color3 does not have are ignored"
+    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    kind, inputs = where or ("ND_texcoord_vector2", "")
+    text = f"""def Material "Red" {{
+        token outputs:mtlx:surface.connect = </Red/surface.outputs:out>
+        def Shader "surface" {{
+            uniform token info:id = "ND_standard_surface_surfaceshader"
+            color3f inputs:base_color.connect = </Red/image.outputs:out>
+            token outputs:out
+        }}
+        def Shader "image" {{
+            uniform token info:id = "{node}"
+            asset inputs:file = @black.png@
+            float2 inputs:texcoord.connect = </Red/where.outputs:out>
+            {image}
+            color3f outputs:out
+        }}
+        def Shader "where" {{
+            uniform token info:id = "{kind}"
+            {inputs}
+            float2 outputs:out
+        }}
+        def Shader "tone" {{
+            uniform token info:id = "ND_geompropvalue_color3"
+            string inputs:geomprop = "tone"
+            color3f outputs:out
+        }}
+    }}\n"""
+    with pytest.warns(CageWarning) as record:
+        found = StageReader(stage(tmp_path, text + bound(target="</Red>"))).at()
+    assert [message in str(each.message) for each in record] == [True]
+    assert [each.file for each in found.materials[0].textures()] == [str(tmp_path / "black.png")]
+
+
+@pytest.mark.parametrize("place", ["texcoord", "place2d"])
+def test_slopes_along_other_coordinates_are_told(tmp_path, place):
+    bump = f"""<image name="i" type="float"><input name="file" type="filename" value="black.png" /></image>
+        <texcoord name="texcoord" type="vector2" />
+        <place2d name="place2d" type="vector2"><input name="texcoord" type="vector2" nodename="texcoord" />
+            <input name="rotate" type="float" value="30" /></place2d>
+        <heighttonormal name="h" type="vector3"><input name="in" type="float" nodename="i" />
+            <input name="texcoord" type="vector2" nodename="{place}" /></heighttonormal>
+        <normalmap name="n" type="vector3"><input name="in" type="vector3" nodename="h" /></normalmap>"""
+    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    normal = '<input name="normal" type="vector3" nodename="n" />'
+    path = stage(tmp_path, LOOKS % "" + bound(), red=surface(normal, graph=bump))
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        StageReader(path).at()
+    told = [str(each.message) for each in record]
+    assert ["texcoord of heighttonormal is ignored; slopes are along" in each for each in told] == [True] * (
+        place != "texcoord"
+    )
+
+
 BOX = """int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
     int[] faceVertexIndices = [0, 3, 2, 1, 4, 5, 6, 7, 0, 1, 5, 4, 1, 2, 6, 5, 2, 3, 7, 6, 3, 0, 4, 7]
     point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0), (-1,-1,2), (1,-1,2), (1,1,2), (-1,1,2)]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
+from mitsuba_subdivision.cage.equality import same
 from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd import materialx_layers, stage_meshes
 from mitsuba_subdivision.usd.stage_walk import read_stage
@@ -181,6 +182,176 @@ def test_instances_look_like_copies(stage, interpolation):
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
 
 
+DIFFERENCES = {
+    # What the first and the second instance have, and what the prim above them.
+    "binding": ("rel material:binding = </red>", "rel material:binding = </blue>", ""),
+    "full": ("rel material:binding:full = </red>", "rel material:binding:full = </blue>", ""),
+    "preview": ("rel material:binding:preview = </red>", "rel material:binding:preview = </blue>", ""),
+    "full and all": ("rel material:binding:full = </red>", "rel material:binding = </red>", ""),
+    "strength": (
+        'rel material:binding = </red> (\nbindMaterialAs = "strongerThanDescendants")',
+        "rel material:binding = </red>",
+        "",
+    ),
+    "collection of parts": (
+        "rel collection:some:includes = </all/one/cube>\n"
+        "rel material:binding:collection:some = [</all/one.collection:some>, </red>]",
+        "rel collection:some:includes = </all/two/other>\n"
+        "rel material:binding:collection:some = [</all/two.collection:some>, </red>]",
+        "",
+    ),
+    "collection above": (
+        "",
+        "",
+        "rel collection:some:includes = </all/two>\n"
+        "rel material:binding:collection:full:some = [</all.collection:some>, </blue>]",
+    ),
+    "display colour": (
+        "color3f[] primvars:displayColor = [(1, 0, 0)]",
+        "color3f[] primvars:displayColor = [(0, 0, 1)]",
+        "",
+    ),
+    "indices": (
+        "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]\nint[] primvars:displayColor:indices = [0]",
+        "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]\nint[] primvars:displayColor:indices = [1]",
+        "",
+    ),
+    "primvar of a material": (
+        "color3f primvars:tint = (1, 0, 0)",
+        "color3f primvars:tint = (0, 0, 1)",
+        "rel material:binding = </tinted>",
+    ),
+    "visibility": ("", 'token visibility = "invisible"', ""),
+    "purpose": ('uniform token purpose = "render"', 'uniform token purpose = "guide"', ""),
+    "places": ("", "", ""),
+}
+
+
+@pytest.mark.parametrize("difference", DIFFERENCES)
+def test_instances_that_differ_look_like_prims_that_do(stage, difference, request):
+    request.getfixturevalue("variant_scalar_rgb")
+    one, two, above = DIFFERENCES[difference]
+    diffuse = "color3f inputs:diffuseColor = {}"
+    paints = {"red": (1, 0, 0), "blue": (0, 0, 1), "green": (0, 1, 0)}
+    text = "".join(material(diffuse.format(color)).replace("paint", name) for name, color in paints.items())
+    tint = """def Shader "tint" {
+        uniform token info:id = "UsdPrimvarReader_float3"
+        string inputs:varname = "tint"
+        float3 outputs:result
+    }"""
+    reads = "color3f inputs:diffuseColor.connect = </paint/tint.outputs:result>"
+    text += material(reads, tint).replace("paint", "tinted")
+    # Where the difference is the place, one part does not move with the instance.
+    reset = '"!resetXformStack!", ' if difference == "places" else ""
+    lower = f"""double3 xformOp:translate = ({-0.2 * bool(reset)}, -0.3, 0)
+        float3 xformOp:scale = (0.2, 0.2, 0.2)
+        uniform token[] xformOpOrder = [{reset}"xformOp:translate", "xformOp:scale"]\n"""
+    upper = lower.replace("-0.2, -0.3", "0, 0.3").replace("-0.3", "0.3").replace(reset, "")
+    own = "rel material:binding = </green>\n" if difference in ("strength", "full and all") else ""
+    text += f'class Xform "kind" {{ {mesh("cube", CUBE + upper)} {mesh("other", CUBE + lower + own)} }}\n'
+
+    def placed(name, x, body, instanceable):
+        head = f"""(prepend apiSchemas = ["MaterialBindingAPI", "CollectionAPI:some"]
+            instanceable = {instanceable}
+            references = </kind>)"""
+        return f"""def Xform "{name}" {head} {{
+            double3 xformOp:translate = ({x}, 0, 0)
+            uniform token[] xformOpOrder = ["xformOp:translate"]
+            {body}
+        }}\n"""
+
+    sky = 'def DomeLight "sky" {}\n'
+    pictures = []
+    for instanceable in ("false", "true"):
+        head = '(prepend apiSchemas = ["MaterialBindingAPI", "CollectionAPI:some"])'
+        both = placed("one", -0.5, one, instanceable) + placed("two", 0.5, two, instanceable)
+        path = stage(CAMERA + sky + text + f'def Xform "all" {head} {{ {above}\n {both} }}')
+        entries = {**msub.usd_scene(path, mi, size=(32, 32)), "integrator": {"type": "direct"}}
+        pictures.append(rendered(entries, spp=256))
+    plain, instanced = pictures
+    assert np.abs(plain[:, :16] - plain[:, 16:]).max() > 0.2
+    # Noise of 256 samples of the sky.
+    assert np.abs(plain - instanced).max() < 0.1
+
+
+def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
+    """Of transforms, cameras, lights, materials, shapes without a mesh, subsets and visibility."""
+    values = {
+        "double3 xformOp:translate": ("(0, 0, 10)", "(0, 0, 20)"),
+        "float focalLength": ("70", "50"),
+        "token projection": ('"orthographic"', '"perspective"'),
+        "float inputs:intensity": ("3", "1"),
+        "float inputs:radius": ("2", "0.5"),
+        "color3f inputs:diffuseColor": ("(1, 0, 0)", "(0, 1, 0)"),
+        "double size": ("1", "2"),
+        "int[] indices": ("[0, 1]", "[2]"),
+        "token visibility": ('"invisible"', '"inherited"'),
+        "color3f[] primvars:displayColor": ("[(1, 0, 0)]", "[(0, 0, 1)]"),
+        "uniform int2 resolution": ("(20, 10)", "(10, 20)"),
+        "float inputs:roughness": ("0.3", "0.6"),
+    }
+
+    def prims(line):
+        subset = f"""def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {{
+            uniform token elementType = "face"
+            uniform token familyName = "materialBind"
+            {line("int[] indices")}
+            rel material:binding = </paint>
+        }}"""
+        inputs = line("color3f inputs:diffuseColor") + line("float inputs:roughness")
+        return (
+            f"""def Camera "camera" {{
+                {line("double3 xformOp:translate")}
+                uniform token[] xformOpOrder = ["xformOp:translate"]
+                {line("float focalLength")}{line("token projection")}
+            }}
+            def SphereLight "lamp" {{ {line("float inputs:intensity")}{line("float inputs:radius")} }}
+            def Cube "cube" {{ {line("double size")}{line("color3f[] primvars:displayColor")} }}
+            def Cube "unseen" {{ {line("token visibility")} }}
+            def RenderSettings "settings" {{ {line("uniform int2 resolution")} }}
+            """
+            + material(inputs)
+            + mesh("parts", CUBE + subset)
+        )
+
+    def lines_of(kind):
+        def line(name):
+            value, other = values[name]
+            default = "" if kind == "samples" else f"{name} = {value}\n"
+            first = value if kind == "samples" else other
+            return default + (f"{name}.timeSamples = {{ 1: {first}, 2: {other} }}\n" if kind != "default" else "")
+
+        return line
+
+    head = 'renderSettingsPrimPath = "/settings"'
+    plain, *others = (read_stage(stage(prims(lines_of(kind)), head=head)) for kind in ("default", "samples", "both"))
+    assert {shape.name for shape in plain.shapes} == {"/cube", "/parts"}
+    assert (plain.camera.focal_length, plain.lights[0].size, plain.resolution) == (70, [2], [20, 10])
+    assert all(same(plain, each) for each in others)
+
+
+def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
+    """USD looks for the times of its samples for ever."""
+    moving = "double3 xformOp:translate.timeSamples = { 1: (0, 0, 3), 2: (0, 0, 4) }\n"
+    body = CUBE + moving + 'uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+    layer = f'#usda 1.0\n( timeCodesPerSecond = 24 )\ndef Mesh "cube" {{\n{body}\n}}\n'
+    (tmp_path / "layer.usda").write_text(layer)
+    (shape,) = read_stage(stage("", head="subLayers = [@layer.usda@]\n    timeCodesPerSecond = 0")).shapes
+    np.testing.assert_array_equal(shape.to_world[:3, 3], [0, 0, 3])
+
+
+@pytest.mark.parametrize("time", [None, 1, 1.5, 2, 3])
+def test_velocities_of_meshes_are_told_between_samples(stage, time):
+    points = CUBE.split("= ", 1)[1].split("]", maxsplit=1)[0] + "]"
+    body = CUBE.replace(f"points = {points}", f"points.timeSamples = {{ 1: {points}, 2: {points} }}")
+    velocities = f"vector3f[] velocities.timeSamples = {{ 1: {points}, 2: {points} }}"
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        read_stage(stage(mesh("cube", f"{body}{velocities}")), time)
+    is_between = time in (1.5, 3)
+    assert ("velocities of meshes are ignored; their points are interpolated" in told(record)) == is_between
+
+
 def test_instances_that_cannot_be_seen_leave_the_others_there(stage):
     """The first one, of size 0, is not what the prototype is read from."""
     prototype = f'class Xform "class_of" {{ {mesh("cube", CUBE)} }}'
@@ -203,6 +374,36 @@ def test_instances_that_cannot_be_seen_leave_the_others_there(stage):
         entries = msub.usd_scene(path, mi)
     assert {"b_cube", "points_1", "points_2"} <= set(entries)
     assert not {"a_cube", "points_0"} & set(entries)
+
+
+@pytest.mark.parametrize(
+    ("above", "root"),
+    [
+        ("def Scope", "def Xform"),
+        ("class", "def Xform"),
+        ("over", "def Xform"),
+        ("over", "over"),
+        ("class", "class Xform"),
+    ],
+)
+def test_prototypes_may_lie_below_a_class_or_an_over(stage, above, root):
+    """As the schema of point instancers recommends; what is a class or an over in a prototype is not shown."""
+    hidden = f'class "hidden" {{ {mesh("hidden", CUBE)} }}\nover "more" {{ {mesh("more", CUBE)} }}\n'
+    points = f"""def PointInstancer "points" {{
+        rel prototypes = [</points/all/proto>, </points/none>]
+        int[] protoIndices = [0, 0, 0, 1]
+        point3f[] positions = [(-3, 0, 0), (0, 0, 0), (3, 0, 0), (9, 9, 9)]
+        {above} "all" {{ {root} "proto" {{ {mesh("cube", CUBE)}{hidden} }} }}
+    }}"""
+    with pytest.warns(CageWarning, match=r"prototypes of .* that are not there are ignored \(/points/none\)"):
+        entries = msub.usd_scene(stage(points), mi)
+    names = {name for name in entries if name.startswith("points")}
+    assert names == {"points_0", "points_1", "points_2"}
+    scene = mi.load_dict({name: entry for name, entry in entries.items() if name not in ("ground", "key_light")})
+    for x in (-3, 0, 3):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0, 9), mi.Vector3f(0, 0, -1)))
+        # The limit of a cube in the middle of a face.
+        np.testing.assert_allclose(np.array(si.p).ravel(), [x, 0, 68 / 81], atol=1e-6)
 
 
 @pytest.mark.parametrize(("time", "expected"), [(None, 1), (2, 1), (3, 3)])
@@ -251,6 +452,12 @@ VERTEX_DATA = """normal3f[] normals = [(0,0,1), (0,1,0), (1,0,0), (0,0,1), (0,1,
     texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1), (0,0), (1,0), (1,1), (0,1)] ( interpolation = "vertex" )
     uniform token subdivisionScheme = "none"\n"""
 FLAT = CUBE.replace("-1", "-2") + VERTEX_DATA
+SUBSET_OF_TWO = """def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {
+    uniform token elementType = "face"
+    uniform token familyName = "materialBind"
+    int[] indices = [0, 5]
+    rel material:binding = </paint>
+}"""
 UV_AND_NORMAL = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "direct"}}
 
 
@@ -258,15 +465,9 @@ UV_AND_NORMAL = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "di
 def test_subsets_share_the_surface_of_the_whole_mesh(stage, monkeypatch, most_faces, rounding):
     """Bit by bit, or up to rounding where each part has the other faces as holes."""
     monkeypatch.setattr(stage_meshes, "MOST_SHARED_FACES", most_faces)
-    subset = """def GeomSubset "part" ( prepend apiSchemas = ["MaterialBindingAPI"] ) {
-        uniform token elementType = "face"
-        uniform token familyName = "materialBind"
-        int[] indices = [0, 5]
-        rel material:binding = </paint>
-    }"""
     tags = "int[] creaseIndices = [0, 1, 3]\nint[] creaseLengths = [3]\nfloat[] creaseSharpnesses = [2.5]"
     paint = material("color3f inputs:diffuseColor = (1, 0, 0)")
-    path = stage(paint + mesh("cube", f"{CUBE}{tags}\n{subset}"))
+    path = stage(paint + mesh("cube", f"{CUBE}{tags}\n{SUBSET_OF_TWO}"))
     parts = {shape.id(): shape for shape in mi.load_dict(msub.usd_scene(path, mi, tessellation_rate=3)).shapes()}
     parts = [parts["cube"], parts["cube_2"]]
     whole = mi.load_dict(
@@ -330,12 +531,26 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     assert any("prim /broken" in message and message.endswith("; the prim is left out") for message in messages)
     with pytest.raises(CageError, match="nothing is visible; expected visible meshes"):
         msub.usd_scene(stage('def Xform "empty" {}'), mi)
-    quadrilaterals = mesh("bad", CUBE + 'uniform token subdivisionScheme = "loop"')
     with (
-        pytest.warns(CageWarning, match="prim /bad: face 0 has 4 corners"),
+        pytest.warns(CageWarning, match="prim /bad: face 0 has 2 vertices; .*; the prim is left out"),
         pytest.raises(CageError, match="none of the meshes can be used; expected one"),
     ):
-        msub.usd_scene(stage(quadrilaterals), mi)
+        msub.usd_scene(stage(mesh("bad", CUBE.replace("[4, 4,", "[2, 6,"))), mi)
+
+
+@pytest.mark.parametrize("subset", ["", SUBSET_OF_TWO])
+def test_a_mesh_that_its_scheme_cannot_subdivide_is_shown_as_polygons(stage, subset):
+    loop = CUBE + 'uniform token subdivisionScheme = "loop"\n' + subset
+    paint = material("color3f inputs:diffuseColor = (1, 0, 0)")
+    with pytest.warns(
+        CageWarning, match="prim /quads: face 0 has 4 corners.*; the mesh is shown as polygons"
+    ) as record:
+        scene = msub.usd_scene(stage(CAMERA + paint + mesh("quads", loop)), mi)
+    assert len(record) == 1
+    shapes = [each for name, each in scene.items() if name.startswith("quads")]
+    assert [each.face_count() for each in shapes] == ([8, 4] if subset else [12])
+    corners = np.unique(np.concatenate([positions(each) for each in shapes]), axis=0)
+    np.testing.assert_array_equal(np.sort(corners.ravel()), [-1] * 12 + [1] * 12)
 
 
 def test_a_cage_is_warned_of_once_by_its_prim(stage):
@@ -587,6 +802,91 @@ def test_nodes_of_texture_coordinates_that_are_not_known_are_told_and_left_out(s
         assert told(record).count('shaders "OddTransform" of texture coordinates are ignored (/paint/odd)') == expected
 
 
+PLACE = """def Shader "place" {{
+    uniform token info:id = "UsdTransform2d"
+    {}
+    float2 outputs:result
+}}"""
+READER = "float2 inputs:in.connect = </paint/reader.outputs:result>\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('wrapS = "repeat"', 'wrapS = "other"', 'wrapS "other" of textures is ignored; expected repeat, mirror, clamp'),
+        ('wrapS = "repeat"', 'wrapS = "clamp"', "wrapT of textures is ignored; wrapS applies to both coordinates"),
+        ('"repeat"', '"black"', 'textures with the wrap mode "black" use "clamp"'),
+        ('"sRGB"', '"acescg"', 'sourceColorSpace "acescg" of textures is ignored; expected auto, raw, sRGB'),
+        (
+            "float3 outputs:rgb",
+            "float inputs:gain = 2\nfloat3 outputs:rgb",
+            "does not have are ignored (gain of /paint/te",
+        ),
+        (
+            "float3 outputs:rgb",
+            "float4 inputs:scale.connect = </paint/reader.outputs:result>\nfloat3 outputs:rgb",
+            "connections of scale of ",
+        ),
+        (
+            "float2 inputs:st.connect = </paint/reader.outputs:result>",
+            "",
+            "read the texture coordinates st where st is not",
+        ),
+        (
+            "string inputs:varname",
+            "float2 inputs:fallback = (1, 0)\nstring inputs:varname",
+            "fallback of texture coord",
+        ),
+        ("string inputs:varname", "int inputs:index = 1\nstring inputs:varname", "ignored (index of /paint/reader)"),
+        ("reader.outputs:result>", "place.outputs:result>", "ignored (pivot of /paint/place)"),
+        ("outputs:rgb", "outputs:rgba", 'the output "rgba" of textures is not there; rgb is used'),
+        (
+            "outputs:rgb>",
+            "outputs:none>",
+            "connections of inputs to what is not there are ignored (/paint/surface.inputs",
+        ),
+        (
+            "float3 outputs:rgb",
+            "float2 inputs:scale = (1, 1)\nfloat3 outputs:rgb",
+            "materials whose inputs have other types than their model",
+        ),
+        (
+            "asset inputs:file = @black.png@",
+            'string inputs:file = "a"',
+            "materials whose inputs have other types than the",
+        ),
+        (
+            '"UsdPreviewSurface"',
+            '"UsdPreviewSurface"\nfloat inputs:gain = 2',
+            "does not have are ignored (gain of /paint/su",
+        ),
+    ],
+)
+def test_inputs_of_textures_that_are_ignored_are_told_once_by_name(stage, tmp_path, old, new, message):
+    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    place = PLACE.format(READER + "float2 inputs:pivot = (1, 1)")
+    paint = material("color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>", texture("black.png") + place)
+    assert old in paint
+    changed = paint.replace(old, new, 2 if old in ('"repeat"', "outputs:rgb") else 1)
+    with pytest.warns(CageWarning) as record:
+        scene = msub.usd_scene(stage(changed + mesh("square", SQUARE + BOUND)), mi)
+    assert [message in str(each.message) for each in record] == [True]
+    assert "square" in scene
+
+
+def test_constant_texture_coordinates_read_one_texel(stage, tmp_path):
+    mi.Bitmap(QUADRANTS.repeat(8, axis=0).repeat(8, axis=1)).write(str(tmp_path / "quadrants.png"))
+    glow = (
+        "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>\ncolor3f inputs:diffuseColor = (0, 0, 0)"
+    )
+    nodes = texture("quadrants.png").replace(
+        "inputs:st.connect = </paint/reader.outputs:result>", "inputs:st = (0.75, 0.75)"
+    )
+    text = CAMERA + DARK + material(glow, nodes) + mesh("square", SQUARE + BOUND)
+    picture = rendered(msub.usd_scene(stage(text), mi, size=(4, 4)), spp=4)
+    np.testing.assert_allclose(picture, np.broadcast_to([0, 1, 0], picture.shape), atol=1e-6)
+
+
 def test_normal_maps_turn_the_normal(stage, tmp_path):
     """A surface that faces the light by its normal map gets all of it."""
     normal = np.array([0.6, 0.0, 0.8])
@@ -818,6 +1118,97 @@ def test_depth_of_field_and_the_resolution_of_render_settings(stage):
     assert (sensor["film"]["width"], sensor["film"]["height"]) == (60, 40)
     with pytest.raises(CageError, match='there is no camera "/none"; expected one of those there are: /camera'):
         msub.usd_scene(stage(lens + mesh("cube", CUBE)), mi, camera="/none")
+
+
+SETTINGS = """def RenderSettings "settings" {{
+    uniform int2 resolution = (40, 20)
+    {}
+}}
+"""
+NAMED = 'renderSettingsPrimPath = "/settings"'
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize(
+    ("policy", "wide", "high"),
+    [
+        # Of an aperture of 3 by 3 in a picture twice as wide as high.
+        ("expandAperture", 6, 3),
+        ("cropAperture", 3, 1.5),
+        ("adjustApertureWidth", 6, 3),
+        ("adjustApertureHeight", 3, 1.5),
+        ("adjustPixelAspectRatio", 6, 3),
+    ],
+)
+def test_the_aperture_fits_the_picture_as_render_settings_say(stage, projection, policy, wide, high):
+    settings = SETTINGS.format(f'uniform token aspectRatioConformPolicy = "{policy}"')
+    text = settings + CAMERA.replace("Aperture = 10", "Aperture = 3") + mesh("cube", CUBE)
+    text = text.replace("focalLength = 50", f'focalLength = 50\ntoken projection = "{projection}"')
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        sensor = mi.load_dict(msub.usd_scene(stage(text, head=NAMED), mi)["sensor"])
+    assert ('aspectRatioConformPolicy "adjustPixelAspectRatio" is ignored' in told(record)) == ("Pixel" in policy)
+    assert tuple(sensor.film().size()) == (40, 20)
+    # Where the corners of the picture are at a distance of the focal length, or in tenths of the world's unit.
+    ray = sensor.sample_ray(0, 0, mi.Point2f([0, 1], [0, 1]), mi.Point2f(0.5))[0]
+    ends = np.array(ray.d * 50 / -ray.d.z if projection == "perspective" else ray.o * 10)[:2]
+    np.testing.assert_allclose(np.abs(np.ptp(ends, axis=1)), [wide, high], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["disableMotionBlur", "instantaneousShutter", "disableDepthOfField"])
+def test_render_settings_turn_off_blur(stage, name):
+    lens = "float fStop = 2\nfloat focusDistance = 7\n"
+    shutter = "double shutter:open = -0.5\ndouble shutter:close = 0.5\n"
+    camera = CAMERA.replace("focalLength = 50", f"focalLength = 50\n{lens}{shutter}")
+    for value in (False, True):
+        text = SETTINGS.format(f"uniform bool {name} = {str(value).lower()}") + camera + mesh("cube", CUBE)
+        found = read_stage(stage(text, head=NAMED)).camera
+        is_off = [found.shutter == [0, 0], found.lens_radius == 0]
+        assert is_off == (
+            [False, False] if not value else [name != "disableDepthOfField", name == "disableDepthOfField"]
+        )
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("uniform float pixelAspectRatio = 2", "pixelAspectRatio of render settings is ignored"),
+        ("uniform float4 dataWindowNDC = (0, 0, 0.5, 1)", "dataWindowNDC of render settings is ignored"),
+        ('uniform token[] includedPurposes = ["default", "proxy"]', "includedPurposes of render settings is ignored"),
+        ('uniform token[] materialBindingPurposes = ["preview"]', "materialBindingPurposes of render settings is ign"),
+        ('uniform token renderingColorSpace = "acescg"', "renderingColorSpace of render settings is ignored"),
+        ("rel products = </product>", "render products are ignored; the picture is that of the render settings"),
+        ('uniform token aspectRatioConformPolicy = "other"', 'aspectRatioConformPolicy "other" is ignored; expand'),
+        ("uniform int2 resolution = (0, 20)", "a resolution of render settings that is not two numbers above 0"),
+        ('uniform token resolution = "large"', "a resolution of render settings that is not two numbers above 0"),
+        # Those of cameras.
+        ("float exposure = 1", "exposure of cameras is ignored; pictures have the radiance of the scene"),
+        ("float exposure:iso = 200", "exposure:iso of cameras is ignored"),
+        ("float exposure:time = 0.5", "exposure:time of cameras is ignored"),
+        ("float exposure:fStop = 2", "exposure:fStop of cameras is ignored"),
+        ("float exposure:responsivity = 2", "exposure:responsivity of cameras is ignored"),
+        ("float4[] clippingPlanes = [(0, 0, 1, 0)]", "clippingPlanes of cameras are ignored"),
+        ('token projection = "fisheye"', 'the projection "fisheye" of cameras is ignored, and perspective is used'),
+        ("float fStop = 2", "fStop of cameras without a focusDistance above 0 is ignored"),
+    ],
+)
+def test_what_the_frame_does_not_follow_is_told_once(stage, line, message):
+    is_camera = any(word in line for word in ("exposure", "clipping", "projection", "fStop"))
+    settings = SETTINGS.replace("uniform int2 resolution = (40, 20)", "") if "resolution" in line else SETTINGS
+    camera = CAMERA.replace("focalLength = 50", f"focalLength = 50\n{line}") if is_camera else CAMERA
+    text = settings.format("" if is_camera else line) + 'def RenderProduct "product" {}\n' + camera + mesh("cube", CUBE)
+    with pytest.warns(CageWarning) as record:
+        msub.usd_scene(stage(text, head=NAMED), mi)
+    (found,) = (str(each.message) for each in record)
+    assert message in found
+    assert found.endswith("(/camera)" if is_camera else "(/settings)")
+
+
+def test_render_settings_that_the_stage_does_not_name_are_told(stage):
+    text = SETTINGS.format("") + CAMERA + mesh("cube", CUBE)
+    for head, named in (("", "/settings"), ('renderSettingsPrimPath = "/none"', "/settings")):
+        with pytest.warns(CageWarning, match=rf"render settings are those that .* all others are ignored \({named}\)"):
+            assert read_stage(stage(text, head=head)).resolution is None
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -90,6 +90,11 @@ class Attribute:
         self, name: str, value_count: int, topology: Topology, source: CageSource, order: IntArray | None
     ) -> IntArray:
         corner_count = topology.half_edge_count
+        if self.indices is None and value_count != corner_count:
+            raise CageError(
+                f'{source.name}: attribute "{shortened(name)}" has {value_count} values and no indices; expected '
+                f"{corner_count} values, one per face corner"
+            )
         # Not copied before the length is checked, as a damaged file may promise any number of indices.
         indices = np.arange(corner_count) if self.indices is None else self.indices
         if indices.shape != (corner_count,) or not np.issubdtype(indices.dtype, np.integer):

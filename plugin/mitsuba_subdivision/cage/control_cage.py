@@ -118,7 +118,8 @@ class ControlCage:
     Warns
     -----
     CageWarning
-        If vertices belong to no face, faces are turned over, or the faces are not a manifold.
+        If vertices belong to no face, faces are turned over, or the faces are not a manifold; if creases are along no
+        edge of a face, or corners at no vertex, which are ignored.
     """
 
     positions: NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import INFINITE, Sharpness
-from .errors import CageError, in_digits
+from .errors import CageError, in_digits, number_of_such, warn
 from .source import CageSource
 from .validation import read_only
 
@@ -25,11 +25,17 @@ def validated_tags(
 ) -> Sharpness:
     """Check creases and corners. If an edge or vertex is given more than once, its last sharpness counts.
 
+    As in OpenSubdiv, those that name an edge or a vertex that the mesh does not have are ignored.
+
     Raises
     ------
     CageError
-        If a crease is not along an edge of the mesh, a corner is not at a vertex, or a sharpness is negative or not a
-        number.
+        If rows are no numbers of vertices, or a sharpness is negative or not a number.
+
+    Warns
+    -----
+    CageWarning
+        If creases or corners are ignored.
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
@@ -37,32 +43,27 @@ def validated_tags(
         return Sharpness(_zeros(topology.half_edge_count), _zeros(topology.vertex_count))
     starts, ends = edges[:, :2].astype(np.int64).T
     half_edge = _half_edges_between(topology, starts, ends)
-    for row in np.flatnonzero(half_edge < 0)[:1]:
-        raise CageError(
-            f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}, which is no edge of "
-            f"a face (numbers count from {source.index_base})"
-        )
-    _require_sharpness(
-        edges[:, 2],
-        lambda row: f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}",
-    )
-
     vertex = vertices[:, 0].astype(np.int64)
-    for row in np.flatnonzero((vertex < 0) | (vertex >= topology.vertex_count))[:1]:
-        raise CageError(
-            f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}; expected one of "
-            f"{topology.vertex_count} vertices (numbers count from {source.index_base})"
-        )
-    _require_sharpness(
-        vertices[:, 1], lambda row: f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
-    )
 
-    twin, sharpness = topology.twin[half_edge], edges[:, 2]
+    def at_edge(row: int) -> str:
+        return f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}"
+
+    def at_vertex(row: int) -> str:
+        return f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
+
+    require_sharpness(edges[:, 2], at_edge)
+    require_sharpness(vertices[:, 1], at_vertex)
+    is_edge, is_vertex = half_edge >= 0, (vertex >= 0) & (vertex < topology.vertex_count)
+    _warn_of_ignored(is_edge, at_edge, "is no edge of a face", "crease", source)
+    _warn_of_ignored(is_vertex, at_vertex, f"is none of {topology.vertex_count} vertices", "corner", source)
+
+    half_edge, sharpness = half_edge[is_edge], edges[is_edge, 2]
+    twin = topology.twin[half_edge]
     has_twin = twin >= 0
     both_sides = np.concatenate([half_edge, twin[has_twin]])
     return Sharpness(
         _sharpness(topology.half_edge_count, both_sides, np.concatenate([sharpness, sharpness[has_twin]])),
-        _sharpness(topology.vertex_count, vertex, vertices[:, 1]),
+        _sharpness(topology.vertex_count, vertex[is_vertex], vertices[is_vertex, 1]),
     )
 
 
@@ -181,7 +182,17 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
     return np.where(inside & (keys[found] == wanted), half_edges[found], -1)
 
 
-def _require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
+def _warn_of_ignored(
+    is_there: NDArray[np.bool_], where: Callable[[int], str], problem: str, noun: str, source: CageSource
+) -> None:
+    missing = np.flatnonzero(~is_there)
+    if len(missing):
+        such = number_of_such(len(missing), noun)
+        warn(f"{where(missing[0])}, which {problem}, is ignored ({such}; numbers count from {source.index_base})")
+
+
+def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
+    """Raise an error if a sharpness is negative or not a number; ``where`` is the beginning of its message by row."""
     for row in np.flatnonzero(~(values >= 0))[:1]:
         raise CageError(
             f"{where(row)} has sharpness {in_digits(values[row])}; expected 0 for smooth, up to {INFINITE:g} for "

@@ -28,7 +28,8 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     Parameters
     ----------
     meshes : sequence of CageContents
-        All with the same rules by name; one or more. A single mesh is returned as it is.
+        One or more, with the same rules by name. Creases and corners name vertices of their mesh. A single mesh is
+        returned as it is.
     name : str
         Name of the file in messages.
 
@@ -109,8 +110,6 @@ def _require_own_indices(mesh: CageContents) -> None:
     corner_count = len(mesh.face_vertices)
     for what, indices, count in (
         ("face corners", mesh.face_vertices, vertex_count),
-        ("creases", mesh.creases[:, :2].reshape(-1), vertex_count),
-        ("corners", mesh.corners[:, 0], vertex_count),
         ("holes", mesh.holes, face_count),
     ):
         require_range(indices, count, f"{source}: {what} have")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute, Interpolation
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, shortened
+from ..cage.source import CageSource
 from ..cage.validation import require_range
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, Topology
 from .usd_names import INTERPOLATIONS, TEXCOORDS
 
 if TYPE_CHECKING:
@@ -40,12 +42,24 @@ class PrimvarChoice:
         return {*self.texcoords, *TEXCOORDS, *self.attributes}
 
 
+class AttributeReader(Protocol):
+    """What primvars are read with; see `usd_reader.MeshReader`."""
+
+    location: str
+
+    def value(self, attribute: Usd.Attribute, /) -> Any: ...
+    def array(self, attribute: Usd.Attribute, kind: type, /) -> NDArray: ...
+    def fitting(
+        self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Any], otherwise: Any, /
+    ) -> Any: ...
+    def tell(self, message: str, path: object, /) -> None: ...
+
+
 def read_primvars(
+    reader: AttributeReader,
     mesh: UsdGeom.Mesh,
-    value: Callable[[Usd.Attribute], Any],
-    array: Callable[[Usd.Attribute, type], NDArray],
-    location: str,
     order: IntArray | None,
+    topology: Topology | None = None,
     choice: PrimvarChoice | None = None,
 ) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Read the texture coordinates and attributes of a mesh.
@@ -56,15 +70,12 @@ def read_primvars(
 
     Parameters
     ----------
+    reader : AttributeReader
     mesh : UsdGeom.Mesh
-    value : function
-        From a USD attribute to its value at the time that is read.
-    array : function
-        From a USD attribute and a type of numbers to such a value as an array.
-    location : str
-        Beginning of messages.
     order : (n_h,) int64, optional
         If the orientation of faces is reversed: which face corner of the file becomes each face corner.
+    topology : Topology, optional
+        What values are checked against. By default, the cage does so later.
     choice : PrimvarChoice, optional
         By default, all primvars are read.
 
@@ -87,28 +98,30 @@ def read_primvars(
 
     found: dict[str, Attribute] = {}
     types: dict[str, str] = {}
-    left_out = []
+    left_out: dict[str, str] = {}
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
         name, kind, interpolation = primvar.GetPrimvarName(), str(primvar.GetTypeName()), primvar.GetInterpolation()
         if interpolation == UsdGeom.Tokens.constant or name == "normals" or name.startswith("skel:"):
             continue
         if choice and not (name in choice.names or kind.startswith("texCoord2")):
             continue
-        table = _table(value(primvar.GetAttr()), primvar.GetElementSize())
-        if choice and table is not None and interpolation == UsdGeom.Tokens.uniform:
-            sizes = array(mesh.GetFaceVertexCountsAttr(), np.int64)
-            found[name] = _of_faces(primvar, table, array, sizes, f'{location}: primvar "{shortened(name)}"')
+        attribute, where = primvar.GetAttr(), f'{reader.location}: primvar "{shortened(name)}"'
+        table = _table(reader.value(attribute), primvar.GetElementSize())
+        known = (*INTERPOLATIONS, "uniform") if choice else INTERPOLATIONS
+        if table is None or interpolation not in known:
+            left_out[str(attribute.GetPath())] = f'"{name}" ({kind}, {interpolation})'
             continue
-        if table is None or interpolation not in INTERPOLATIONS:
-            left_out.append(f'"{name}" ({kind}, {interpolation})')
-            continue
-        where = f'{location}: primvar "{shortened(name)}"'
-        indices = array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
-        found[name] = _attribute(table, INTERPOLATIONS[interpolation], indices, order, where)
-        types[name] = kind
+        width = 2 if choice and name in choice.texcoords else None
+        read = partial(_read, reader, mesh, primvar, table, order, topology, width, where)
+        made = reader.fitting(attribute, "the primvar is left out", read, None)
+        if made is not None:
+            found[name], types[name] = made, kind
     if left_out:
-        shown = shortened(", ".join(left_out), 200)
-        warn(f"{location}: primvars {shown} left out; expected floats, at vertices or face corners")
+        shown = shortened(", ".join(left_out.values()), 200)
+        reader.tell(
+            f"{reader.location}: primvars {shown} left out; expected floats, at vertices or face corners",
+            ", ".join(left_out),
+        )
     by_type = [name for name, kind in types.items() if kind.startswith("texCoord2")]
     preferred = choice.texcoords if choice else ()
     pairs = (name for name in (*preferred, *TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2)
@@ -132,18 +145,30 @@ def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
     return array.astype(np.float64).reshape(-1, width) if array.size % width == 0 else None
 
 
-def _of_faces(
+def _read(
+    reader: AttributeReader,
+    mesh: UsdGeom.Mesh,
     primvar: UsdGeom.Primvar,
     values: NDArray[np.float64],
-    array: Callable[[Usd.Attribute, type], NDArray],
-    sizes: IntArray,
+    order: IntArray | None,
+    topology: Topology | None,
+    width: int | None,
     where: str,
 ) -> Attribute:
-    """Values of whole faces as those of their corners, which a change of the orientation leaves as they are."""
-    faces = array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else np.arange(len(values))
-    if len(faces) != len(sizes):
-        raise CageError(f"{where} has {len(faces)} values or indices; expected {len(sizes)}, one per face")
-    return Attribute(values, "face_varying", np.repeat(faces, sizes))
+    """A primvar as an attribute, checked against a topology if there is one."""
+    indices = reader.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
+    if primvar.GetInterpolation() == "uniform":
+        # Values of whole faces become those of their corners, which a change of the orientation leaves as they are.
+        faces = np.arange(len(values)) if indices is None else indices
+        sizes = reader.array(mesh.GetFaceVertexCountsAttr(), np.int64)
+        if len(faces) != len(sizes):
+            raise CageError(f"{where} has {len(faces)} values or indices; expected {len(sizes)}, one per face")
+        attribute = Attribute(values, "face_varying", np.repeat(faces, sizes))
+    else:
+        attribute = _attribute(values, INTERPOLATIONS[primvar.GetInterpolation()], indices, order, where)
+    if topology is None:
+        return attribute
+    return attribute.validated(primvar.GetPrimvarName(), topology, CageSource(reader.location), width)
 
 
 def _attribute(

@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, number_of_such, shortened, warn
 from ..cage.rules import RULES
 from ..cage.source import CageSource
+from ..cage.tags import require_sharpness
+from ..cage.validation import require_range, validated_face_indices
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, Topology
 from .joined_meshes import joined
 from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import PrimvarChoice, read_primvars
 from .usd_process import call_in_process, seconds_in_process
 from .usd_skinning import Skinning
 from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at, usd_messages_of
+from .usd_values import local_to_world, time_of, value_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
+
+Read = TypeVar("Read")
+
+_NO_FACES: IntArray = np.zeros(0, np.int64)
 
 
 def read_usd(
@@ -116,6 +123,9 @@ class MeshReader:
         As for `read_usd`.
     skinning : Skinning
         Of the stage, at the time.
+    report : function, optional
+        Gets messages about attributes that do not fit the mesh, which are then left out, and their paths. By default,
+        these are errors.
     """
 
     def __init__(
@@ -125,12 +135,16 @@ class MeshReader:
         time: float | None,
         skinning: Skinning,
         rules: Mapping[str, str] | None = None,
+        report: Callable[[str, object], None] | None = None,
     ) -> None:
+        from pxr import Usd
+
         self.mesh = mesh
         self.location = location
-        self.time = time
+        self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         self.skinning = skinning
         self.rules = rules or {}
+        self._report = report
 
     def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
         """The mesh as contents of a cage.
@@ -165,9 +179,24 @@ class MeshReader:
             vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
-        creases, corners, holes = self.creases(), self.corners(), self.array(mesh.GetHoleIndicesAttr(), np.int64)
+        topology = None
+        if self._report is not None:
+            # What comes of the mesh takes its indices and points as they are.
+            require_range(vertices, len(points), f"{self.location}: faceVertexIndices have")
+            if not np.isfinite(points).all():
+                raise self.error("there are points that are not finite", "finite numbers")
+            topology = Topology(len(points), sizes, vertices)
+        creases = self.fitting(
+            mesh.GetCreaseIndicesAttr(), "the creases are left out", lambda: self.creases(len(points)), np.zeros((0, 3))
+        )
+        corners = self.fitting(
+            mesh.GetCornerIndicesAttr(), "the corners are left out", lambda: self.corners(len(points)), np.zeros((0, 2))
+        )
+        holes = self.fitting(
+            mesh.GetHoleIndicesAttr(), "the holes are left out", lambda: self.holes(topology), _NO_FACES
+        )
         rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
-        texcoords, attributes = read_primvars(mesh, self.value, self.array, self.location, order, choice)
+        texcoords, attributes = read_primvars(self, mesh, order, topology, choice)
         return CageContents(
             points,
             sizes,
@@ -182,6 +211,37 @@ class MeshReader:
             source=CageSource(self.location),
         )
 
+    def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
+        """What a function reads of an attribute; something else, with a report, where that does not fit the mesh.
+
+        Parameters
+        ----------
+        attribute : Usd.Attribute
+        consequence : str
+            End of the message, such as "the creases are left out".
+        read : callable
+        otherwise : object
+
+        Raises
+        ------
+        CageError
+            As ``read``, if nothing takes reports.
+        """
+        try:
+            return read()
+        except CageError as error:
+            if self._report is None:
+                raise
+            self.tell(f"{error}; {consequence}", attribute.GetPath())
+            return otherwise
+
+    def tell(self, message: str, path: object) -> None:
+        """Report a message about a prim or an attribute; by default, as a `CageWarning`."""
+        if self._report is None:
+            warn(message)
+        else:
+            self._report(message, path)
+
     def error(self, problem: str, expected: str) -> CageError:
         return CageError(f"{self.location}: {problem}; expected {expected}")
 
@@ -193,20 +253,17 @@ class MeshReader:
         """Time code at which an attribute is read; see `read_usd`."""
         from pxr import Usd
 
-        if self.time is not None:
-            return Usd.TimeCode(float(self.time))
         if self.first_time is not None and attribute.GetNumTimeSamples():
             return Usd.TimeCode(self.first_time)
-        default = Usd.TimeCode.Default()
-        return Usd.TimeCode.EarliestTime() if attribute.Get(default) is None else default
+        return time_of(attribute, self._code)
 
     @cached_property
     def first_time(self) -> float | None:
-        """First time at which the mesh has points and faces; None if it has them at the default times."""
+        """First time at which the mesh has points and faces; None if it has them anyway, or a time is given."""
         mesh = self.mesh
         # Points come last, as they take longest to read.
         needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
-        if all(_size(each.Get()) or (each.Get() is None and _size(_first(each))) for each in needed):
+        if not self._code.IsEarliestTime() or all(_size(value_at(each, self._code)) for each in needed):
             return None
         times = sorted({time for each in needed for time in each.GetTimeSamples()})
         return next((time for time in times if all(_size(each.Get(time)) for each in needed)), None)
@@ -228,12 +285,16 @@ class MeshReader:
             raise self.error(f"{attribute.GetName()} is of the type {type(value).__name__}", f"an array of {what}")
         return array.astype(kind)
 
-    def token(self, attribute: Usd.Attribute, known: Collection[str]) -> str:
-        """Value of an attribute that must be one of the known ones."""
-        value = str(self.value(attribute))
-        if value not in known:
-            raise self.error(f'{attribute.GetName()} is "{shortened(value)}"', f"one of {', '.join(known)}")
-        return value
+    def token(self, attribute: Usd.Attribute, known: Sequence[str]) -> str:
+        """Value of an attribute that must be one of the known ones, of which the first is the schema's fallback."""
+
+        def read() -> str:
+            value = str(self.value(attribute))
+            if value not in known:
+                raise self.error(f'{attribute.GetName()} is "{shortened(value)}"', f"one of {', '.join(known)}")
+            return value
+
+        return self.fitting(attribute, f"{known[0]} is used", read, known[0])
 
     def is_left_handed(self) -> bool:
         """Whether faces are clockwise from outside."""
@@ -264,12 +325,14 @@ class MeshReader:
             warn(f'{self.location}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
         return given
 
-    def creases(self) -> NDArray[np.float64]:
+    def creases(self, vertex_count: int) -> NDArray[np.float64]:
         """Rows (vertex, vertex, sharpness)."""
         mesh = self.mesh
         indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
         lengths = self.array(mesh.GetCreaseLengthsAttr(), np.int64)
         sharpness = self.array(mesh.GetCreaseSharpnessesAttr(), np.float64)
+        if not len(indices) and not len(lengths) and not len(sharpness):
+            return np.zeros((0, 3))
         if (lengths < 2).any():
             first = int(np.argmax(lengths < 2))
             raise self.error(f"creaseLengths has the value {lengths[first]} at {first}", "2 or more vertices")
@@ -278,6 +341,7 @@ class MeshReader:
                 f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries", "as many"
             )
         edges = lengths - 1
+        require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of creaseSharpnesses")
         if len(sharpness) == len(lengths):
             sharpness = np.repeat(sharpness, edges)
         elif len(sharpness) != edges.sum():
@@ -288,32 +352,42 @@ class MeshReader:
         is_start = np.ones(len(indices), dtype=bool)
         is_start[np.cumsum(lengths) - 1] = False
         start = np.flatnonzero(is_start)
-        return np.stack([indices[start], indices[start + 1], sharpness], axis=1)
+        rows = np.stack([indices[start], indices[start + 1], sharpness], axis=1)
+        return self._own_rows(rows, vertex_count, "crease", mesh.GetCreaseIndicesAttr().GetPath())
 
-    def corners(self) -> NDArray[np.float64]:
+    def corners(self, vertex_count: int) -> NDArray[np.float64]:
         """Rows (vertex, sharpness)."""
         indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
         sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
+        if not len(indices) and not len(sharpness):
+            return np.zeros((0, 2))
         if len(indices) != len(sharpness):
             raise self.error(
                 f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}", "as many"
             )
-        return np.stack([indices, sharpness], axis=1)
+        require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
+        path = self.mesh.GetCornerIndicesAttr().GetPath()
+        return self._own_rows(np.stack([indices, sharpness], axis=1), vertex_count, "corner", path)
+
+    def _own_rows(self, rows: NDArray[np.float64], vertex_count: int, noun: str, path: object) -> NDArray[np.float64]:
+        """Rows of creases or corners that name vertices of the mesh; among other meshes, others would be theirs."""
+        vertices = rows[:, :-1]
+        is_own = ((vertices >= 0) & (vertices < vertex_count)).all(axis=1)
+        for row in np.flatnonzero(~is_own)[:1]:
+            numbers = ", ".join(f"{vertex:.0f}" for vertex in vertices[row])
+            such = number_of_such(int((~is_own).sum()), noun)
+            expected = f"expected vertices from 0 to {vertex_count - 1}"
+            self.tell(f"{self.location}: {noun} at ({numbers}) is ignored; {expected} ({such})", path)
+        return rows[is_own]
+
+    def holes(self, topology: Topology | None) -> IntArray:
+        """Faces that are holes; checked against a topology if there is one."""
+        holes = self.array(self.mesh.GetHoleIndicesAttr(), np.int64)
+        return holes if topology is None else validated_face_indices(topology, holes, "hole", CageSource(self.location))
 
     def local_to_world(self) -> NDArray[np.float64]:
         """The transform to world space, as a matrix for row vectors."""
-        from pxr import UsdGeom
-
-        matrix, prim = np.eye(4), self.mesh.GetPrim()
-        while not prim.IsPseudoRoot():
-            here = UsdGeom.Xformable(prim)
-            if here:
-                # One by one, as the operations may have different first times, or values that do not depend on time.
-                for operation in reversed(here.GetOrderedXformOps()):
-                    matrix = matrix @ np.array(operation.GetOpTransform(self.time_of(operation.GetAttr())))
-                if here.GetResetXformStack():
-                    break
-            prim = prim.GetParent()
+        matrix = np.array(local_to_world(self.mesh.GetPrim(), self.time_of))
         # The determinant says nothing about a matrix that is not finite.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
             raise self.error(
@@ -326,13 +400,6 @@ def reversed_order(sizes: IntArray) -> IntArray:
     """Order of face corners that reverses the orientation of all faces and keeps their first vertices."""
     index = ragged.index_in_row(sizes)
     return np.arange(len(index)) - index + -index % np.repeat(sizes, sizes)
-
-
-def _first(attribute: Usd.Attribute) -> Any:
-    """Value of an attribute at its first time."""
-    from pxr import Usd
-
-    return attribute.Get(Usd.TimeCode.EarliestTime())
 
 
 def _size(value: Any) -> int:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..cage.errors import CageError, shortened, warn
 from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
+from .usd_values import value_at
 from .usdc_sizes import require_plausible_sizes
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ def chosen_meshes(
     name : str
         Name of the file in messages.
     time : float or None
-        Time code at which visibility is read.
+        Time code at which visibility and schemes are read.
     scheme : str or None
         Scheme that replaces the meshes' own.
 
@@ -209,12 +210,12 @@ def chosen_meshes(
         found = stage.GetPrimAtPath(path)
         what = f'is a prim of the type "{found.GetTypeName()}" without meshes' if found else "is not in the file"
         raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
+    at = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
     if path == ALL:
-        at = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         hidden = {each for each in below if not _is_shown(meshes[each], at)}
         below = _without(below, hidden, "as they are invisible, guides or proxies; expected meshes to be seen", name)
     if scheme is None:
-        flat = {each for each in below if str(meshes[each].GetSubdivisionSchemeAttr().Get()) in FLAT_SCHEMES}
+        flat = {each for each in below if str(value_at(meshes[each].GetSubdivisionSchemeAttr(), at)) in FLAT_SCHEMES}
         given, expected = " or ".join(FLAT_SCHEMES), " or ".join(SCHEMES)
         why = f"as their subdivisionScheme is {given}; expected {expected}, or a scheme given"
         below = _without(below, flat, why, name)

@@ -242,6 +242,8 @@ class CameraContents:
         In the world's units; 0 without depth of field.
     shutter : list of 2 floats
         When it opens and closes, in time codes after the time.
+    conform_policy : str
+        How the aperture fits a picture of another aspect ratio; see `sensors.film_window`.
     """
 
     name: str
@@ -255,6 +257,7 @@ class CameraContents:
     lens_radius: float
     focus_distance: float
     shutter: list[float]
+    conform_policy: str = "expandAperture"
 
     @property
     def is_usable(self) -> bool:

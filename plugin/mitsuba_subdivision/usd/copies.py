@@ -95,7 +95,7 @@ def with_copies(
     for shape in contents.shapes:
         if len(shape.cage.face_sizes) < LARGE:
             of_cage.setdefault((id(shape.cage), id(shape.shown_faces)), []).append(shape)
-    many = [each for each in of_cage.values() if len(each) >= LEAST_INSTANCES and _is_sound(each[0].cage)]
+    many = [each for each in of_cage.values() if len(each) >= LEAST_INSTANCES]
     for alike in many:
         needed = np.concatenate([rates.get(each, _ONE) for each in alike])
         placed.append(_Copies(f"/copies{alike[0].name}", alike[0], np.stack([each.to_world for each in alike]), needed))
@@ -142,7 +142,7 @@ def _of_instances(contents: SceneContents, rates: Mapping[ShapeContents, IntArra
             matrices = np.stack(placed) @ shape.to_world
             needed = rates.get(shape, np.ones(len(placed), np.int64))
             found.append(_Copies(f"/copies_{number}{shape.name}", shape, matrices, needed))
-    return found if all(_is_sound(each.shape.cage) for each in found) else []
+    return found
 
 
 def _allowed_bytes() -> float:
@@ -159,20 +159,6 @@ def _bytes(placed: list[_Copies], most: int, shading: str) -> float:
         triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * len(each.rates)
         found += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * len(each.rates) if is_smooth else 0)
     return found
-
-
-def _is_sound(cage: CageContents) -> bool:
-    """Whether all indices of a cage are in range; otherwise they would refer to another copy."""
-    vertices = np.concatenate([cage.face_vertices, cage.creases[:, :2].ravel(), cage.corners[:, 0]])
-    counts = [(vertices, len(cage.positions)), (cage.holes, len(cage.face_sizes))]
-    for each in (*cage.attributes.values(), *([] if cage.texcoords is None else [cage.texcoords])):
-        indices, values = each.indices, each.values
-        expected = cage.face_vertices if each.interpolation == "face_varying" else cage.positions
-        if len(values if indices is None else indices) != len(expected):
-            return False
-        counts.append((np.zeros(0) if indices is None else indices, len(values)))
-    is_in_range = all(found.min(initial=0) >= 0 and found.max(initial=-1) < count for found, count in counts)
-    return is_in_range and int(cage.face_sizes.sum()) == len(cage.face_vertices)
 
 
 def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> ShapeContents:

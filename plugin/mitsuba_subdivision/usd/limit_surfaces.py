@@ -117,7 +117,10 @@ class Surfaces:
         if known is None or not same_topology(known.contents, cage):
             try:
                 known = self._of_shape[key] = self._found(cage)
-            except (CageError, SchemeError):
+            except SchemeError:
+                # Shown as polygons.
+                return points_at(cage.positions, shape.to_world)
+            except CageError:
                 # Entries are made of it later, with the error.
                 return _NO_POINTS
         is_same = np.array_equal(known.contents.positions, cage.positions)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
 from ..cage.source import CageSource
+from ..cage.validation import require_range
 from ..files.usd_reader import MeshReader, reversed_order
+from ..files.usd_values import value_at
 from ..mesh.connectivity import IntArray
-from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -24,47 +25,56 @@ AROUND, ALONG = 64, 24
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 
 
-def read_normals(reader: MeshReader, cage: CageContents, notes: StageWarnings) -> NDArray[np.float64] | None:
+def read_normals(reader: MeshReader, cage: CageContents) -> NDArray[np.float64] | None:
     """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``, after skinning; None without any.
+
+    Normals that do not fit the mesh are left out, with a message to the reader.
 
     Parameters
     ----------
     reader : MeshReader
     cage : CageContents
         Contents of the mesh, in its own space.
-    notes : StageWarnings
     """
     from pxr import UsdGeom
 
     mesh = reader.mesh
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
-    if primvar and primvar.HasAuthoredValue():
-        attribute, interpolation = primvar.GetAttr(), primvar.GetInterpolation()
-        indices = reader.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
-    else:
-        attribute, interpolation, indices = mesh.GetNormalsAttr(), mesh.GetNormalsInterpolation(), None
-    normals = reader.array(attribute, np.float64, width=3)
-    if not len(normals):
-        return None
+    is_primvar = primvar and primvar.HasAuthoredValue()
+    attribute = primvar.GetAttr() if is_primvar else mesh.GetNormalsAttr()
+    interpolation = str(primvar.GetInterpolation() if is_primvar else mesh.GetNormalsInterpolation())
     sizes, corners = cage.face_sizes, len(cage.face_vertices)
     order = reversed_order(sizes) if reader.is_left_handed() else np.arange(corners)
-    element = {
-        "vertex": cage.face_vertices,
-        "varying": cage.face_vertices,
-        "faceVarying": order,
-        "uniform": np.repeat(np.arange(len(sizes)), sizes),
-        "constant": np.zeros(corners, np.int64),
-    }.get(str(interpolation))
-    rows = len(normals) if indices is None else len(indices)
-    if element is None or element.max(initial=-1) >= rows:
-        notes.add("normals whose number does not match the mesh are ignored", mesh.GetPath())
-        return None
-    if indices is not None:
-        element = indices[element]
-        if element.min(initial=0) < 0 or element.max(initial=-1) >= len(normals):
-            notes.add("normals with indices out of range are ignored", mesh.GetPath())
+    # The element of each face corner, and how many there are.
+    elements: dict[str, tuple[IntArray, int]] = {
+        "vertex": (cage.face_vertices, len(cage.positions)),
+        "varying": (cage.face_vertices, len(cage.positions)),
+        "faceVarying": (order, corners),
+        "uniform": (np.repeat(np.arange(len(sizes)), sizes), len(sizes)),
+        "constant": (np.zeros(corners, np.int64), 1),
+    }
+
+    def read() -> NDArray[np.float64] | None:
+        normals = reader.array(attribute, np.float64, width=3)
+        if not len(normals):
             return None
-    return reader.skinning.normals(mesh, cage.positions, cage.face_vertices, normals[element])
+        if interpolation not in elements:
+            raise reader.error(f'normals have the interpolation "{interpolation}"', f"one of {', '.join(elements)}")
+        element, expected = elements[interpolation]
+        indices = np.arange(len(normals))
+        if is_primvar and primvar.IsIndexed():
+            indices = reader.array(primvar.GetIndicesAttr(), np.int64)
+        if len(indices) != expected:
+            raise reader.error(f"there are {len(indices)} {interpolation} normals or indices", str(expected))
+        require_range(indices, len(normals), f"{reader.location}: normals have")
+        if not np.isfinite(normals).all():
+            raise reader.error("there are normals that are not finite", "finite numbers")
+        return normals[indices[element]]
+
+    normals = reader.fitting(attribute, "the normals are left out", read, None)
+    if normals is None:
+        return None
+    return reader.skinning.normals(mesh, cage.positions, cage.face_vertices, normals)
 
 
 def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArray[np.float64] | None]:
@@ -72,10 +82,15 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
 
     def number(name: str, usual: float) -> float:
         attribute = prim.GetAttribute(name)
-        value = attribute.Get(time) if attribute else None
-        return usual if value is None else float(value)
+        value = value_at(attribute, time) if attribute else None
+        size = usual if value is None else float(value)
+        if not 0 <= size < np.inf:
+            raise ValueError(f"{name} is {size}; expected a finite number, 0 or more")
+        return size
 
-    axis = str(prim.GetAttribute("axis").Get(time)) if prim.HasAttribute("axis") else "Z"
+    axis = str(value_at(prim.GetAttribute("axis"), time)) if prim.HasAttribute("axis") else "Z"
+    if axis not in _TURNS:
+        raise ValueError(f'axis is "{axis}"; expected X, Y or Z')
     points, normals, sizes, vertices = GPRIMS[str(prim.GetTypeName())](number)
     turn = list(_TURNS[axis])
     if prim.GetTypeName() == "Plane" and axis != "Z":

@@ -40,7 +40,7 @@ def usd_scene(
         ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb". The scene
         is for this variant.
     time : float, optional
-        Time code. By default, the first one at which there is a value.
+        Time code. By default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional
         Path of the camera, such as "/World/camera". By default that of the stage's render settings, or its first one.
     size : (width, height), optional

@@ -15,11 +15,11 @@ from ..progress import counted
 from ..schemes import SchemeError
 from ..variants import SceneNode
 from .bsdfs import Bsdfs, interior, rgb
-from .contents import SceneContents, ShapeContents
+from .contents import MaterialContents, SceneContents, ShapeContents
 from .emitters import emitter, one_environment
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
-from .shapes import polygon_mesh, subdivision
+from .shapes import as_polygons, polygon_mesh, subdivision
 from .stage_warnings import StageWarnings
 from .studio_defaults import RESERVED
 from .textures import Textures
@@ -122,17 +122,25 @@ class SceneEntries:
             radiance = self._bsdfs.radiance(material)
         area = None if radiance is None else {"type": "area", "radiance": radiance}
         try:
-            if self._loaded is not None:
-                return self._loaded.object_of(
-                    shape, material, lambda: self._bsdf(shape, is_shared=False), area, self._notes
-                )
-            if shape.cage.scheme is None:
-                return {**polygon_mesh(shape).entry(self._bsdf(shape), area), **interior(material)}
-            parameters = {**self._parameters_of(shape), **interior(material)}
-            return subdivision(shape, self._surfaces, self._bsdf(shape), area, parameters, self._notes)
-        except (CageError, SchemeError) as error:
+            return self._made(shape, material, area)
+        except SchemeError as error:
+            self._notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
+            return self._made(as_polygons(shape), material, area)
+        except CageError as error:
             self._notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
+
+    def _made(
+        self, shape: ShapeContents, material: MaterialContents | None, area: SceneNode | None
+    ) -> SceneNode | mi.Object:
+        if self._loaded is not None:
+            return self._loaded.object_of(
+                shape, material, lambda: self._bsdf(shape, is_shared=False), area, self._notes
+            )
+        if shape.cage.scheme is None:
+            return {**polygon_mesh(shape).entry(self._bsdf(shape), area), **interior(material)}
+        parameters = {**self._parameters_of(shape), **interior(material)}
+        return subdivision(shape, self._surfaces, self._bsdf(shape), area, parameters, self._notes)
 
     def _parameters_of(self, shape: ShapeContents) -> SceneNode:
         if shape not in self._triangles:

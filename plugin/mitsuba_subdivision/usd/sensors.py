@@ -18,19 +18,18 @@ NO_BLUR = "shutters of cameras have no effect without the option --shutter of re
 
 
 def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: StageWarnings) -> SceneNode:
-    """A sensor whose film covers at least the camera's aperture.
+    """A sensor whose film is the camera's aperture, fitted to the size.
 
     Parameters
     ----------
     camera : CameraContents
     size : (width, height)
-        Of the film, in pixels. Where it is wider or higher than the aperture, more is seen.
+        Of the film, in pixels.
     spp : int
     notes : StageWarnings
     """
     width, height = size
-    wide = max(camera.aperture[0], camera.aperture[1] * width / height)
-    high = wide * height / width
+    wide, high = film_window(camera, width / height)
     matrix = camera.to_world @ np.diag([-1.0, 1, -1, 1])
     near = max(camera.near, _LEAST_NEAR)
     if camera.shutter[0] < camera.shutter[1]:
@@ -67,3 +66,18 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
         "principal_point_offset_y": -camera.offset[1] / high,
         **common,
     }
+
+
+def film_window(camera: CameraContents, aspect_ratio: float) -> tuple[float, float]:
+    """Width and height of the film of a camera, in its units, as its ``conform_policy`` fits the aperture to a picture.
+
+    By default, more is seen where the picture is wider or higher than the aperture.
+    """
+    own, of_height = camera.aperture[0], camera.aperture[1] * aspect_ratio
+    wide = {
+        "expandAperture": max(own, of_height),
+        "cropAperture": min(own, of_height),
+        "adjustApertureWidth": of_height,
+        "adjustApertureHeight": own,
+    }[camera.conform_policy]
+    return wide, wide / aspect_ratio

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mitsuba as mi
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..studio.placed_points import points_at
@@ -65,16 +65,17 @@ def subdivision(
     }
 
 
-def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
-    """Triangles of a shape that is not to be subdivided.
+def as_polygons(shape: ShapeContents) -> ShapeContents:
+    """A limit surface as its control cage."""
+    cage, shown = shape.cage, shape.shown_faces
+    if shown is not None:
+        cage = replace(cage, holes=np.union1d(cage.holes, np.setdiff1d(np.arange(len(cage.face_sizes)), shown)))
+    return replace(shape, cage=replace(cage, scheme=None), shown_faces=None)
 
-    Raises
-    ------
-    CageError
-        If indices are out of range or points are not finite.
-    """
+
+def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
+    """Triangles of a shape that is not to be subdivided."""
     cage, normals = shape.cage, shape.normals
-    _require_mesh(cage)
     corners = _triangles(cage)
     data: dict[str, Attribute] = dict(cage.attributes)
     if cage.texcoords is not None:
@@ -93,7 +94,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
         lengths = np.linalg.norm(turned, axis=1, keepdims=True)
         vertices["vertex_normals"] = turned / np.where(lengths > 0, lengths, 1)
     for name, attribute in data.items():
-        vertices[f"vertex_{name}"] = _at_vertices(attribute, cage, vertex, f'{cage.source.name}: "{name}"')
+        vertices[f"vertex_{name}"] = _at_vertices(attribute, vertex)
     return PolygonMesh(shape.name, triangles, vertices)
 
 
@@ -108,27 +109,5 @@ def _triangles(cage: CageContents) -> IntArray:
     return np.stack([start, start + index + 1, start + index + 2], axis=1)
 
 
-def _at_vertices(attribute: Attribute, cage: CageContents, vertex: IntArray, name: str) -> NDArray:
-    values, expected = attribute.values, len(cage.positions)
-    if attribute.interpolation == "face_varying":
-        rows = np.arange(len(values)) if attribute.indices is None else attribute.indices
-        if len(rows) != len(vertex) or rows.min(initial=0) < 0 or rows.max(initial=-1) >= len(values):
-            raise CageError(f"{name} has {len(rows)} values or indices; expected {len(vertex)}, one per face corner")
-        return values[rows]
-    if len(values) != expected:
-        raise CageError(f"{name} has {len(values)} values; expected {expected}, one per vertex")
-    return values[vertex]
-
-
-def _require_mesh(cage: CageContents) -> None:
-    vertices, count = cage.face_vertices, len(cage.positions)
-    if vertices.min(initial=0) < 0 or vertices.max(initial=-1) >= count:
-        raise CageError(
-            f"{cage.source.name}: faceVertexIndices are from {vertices.min()} to {vertices.max()}; expected 0 to "
-            f"{count - 1}"
-        )
-    if not np.isfinite(cage.positions).all():
-        raise CageError(f"{cage.source.name}: points are not finite; expected finite numbers")
-    holes = cage.holes
-    if holes.min(initial=0) < 0 or holes.max(initial=-1) >= len(cage.face_sizes):
-        raise CageError(f"{cage.source.name}: holeIndices are out of range; expected 0 to {len(cage.face_sizes) - 1}")
+def _at_vertices(attribute: Attribute, vertex: IntArray) -> NDArray:
+    return attribute.values[vertex if attribute.indices is None else attribute.indices]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files.usd_values import value_at
 from .contents import LightContents
 from .stage_warnings import StageWarnings
 
@@ -63,7 +64,7 @@ def read_light(
         notes.add(f"lights of type {given} are ignored; expected one of {', '.join(KINDS)}", path)
         return None
     _note_ignored(prim, time, notes)
-    size = [float(prim.GetAttribute(name).Get(time)) for name in _SIZES[kind]]
+    size = [float(value_at(prim.GetAttribute(name), time)) for name in _SIZES[kind]]
     if kind == "distant" and size[0] > _POINTLIKE:
         notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
     if kind == "sphere" and _value(prim, "treatAsPoint", time, False):
@@ -85,15 +86,15 @@ def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
     from pxr import UsdLux
 
     light = UsdLux.LightAPI(prim)
-    color = np.array(light.GetColorAttr().Get(time), dtype=np.float64)
-    if light.GetEnableColorTemperatureAttr().Get(time):
-        color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(light.GetColorTemperatureAttr().Get(time)))
-    return color * (light.GetIntensityAttr().Get(time) * 2.0 ** light.GetExposureAttr().Get(time))
+    color = np.array(value_at(light.GetColorAttr(), time), dtype=np.float64)
+    if value_at(light.GetEnableColorTemperatureAttr(), time):
+        color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(value_at(light.GetColorTemperatureAttr(), time)))
+    return color * (value_at(light.GetIntensityAttr(), time) * 2.0 ** value_at(light.GetExposureAttr(), time))
 
 
 def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
     attribute = prim.GetAttribute(name)
-    value = attribute.Get(time) if attribute else None
+    value = value_at(attribute, time) if attribute else None
     return usual if value is None else value
 
 

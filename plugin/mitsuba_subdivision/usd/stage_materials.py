@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.equality import same
+from ..files.usd_values import value_at
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
-from .stage_networks import NetworkReader
+from .stage_networks import NetworkReader, note_unknown_inputs, source_of
 from .stage_warnings import StageWarnings
 from .surface_models import MODELS, PREVIEW, left_out
 from .texture_image import UDIM
@@ -21,6 +23,14 @@ if TYPE_CHECKING:
 
 SURFACE = "UsdPreviewSurface"
 # Occlusion is what a path tracer computes itself.
+# Inputs of the nodes of its networks.
+_INPUTS = {
+    "UsdUVTexture": {"file", "st", "wrapS", "wrapT", "fallback", "scale", "bias", "sourceColorSpace"},
+    "UsdTransform2d": {"in", "rotation", "scale", "translation"},
+    "UsdPrimvarReader": {"varname", "fallback"},
+}
+_OUTPUTS = ("rgb", "r", "g", "b", "a")
+_COLOR_SPACES = ("auto", "raw", "sRGB")
 _WRAPS = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp", "useMetadata": "repeat"}
 _DEEPEST = 16
 
@@ -76,7 +86,7 @@ class MaterialReader:
     def _read(self, material: UsdShade.Material) -> MaterialContents | None:
         try:
             return self._contents(material)
-        except (TypeError, ValueError, IndexError, RecursionError):
+        except (AttributeError, TypeError, ValueError, IndexError, RecursionError):
             what = (
                 "materials whose inputs have other types than their model's are ignored, and display colours are used"
             )
@@ -106,6 +116,7 @@ class MaterialReader:
         """Model and inputs of a surface shader; None if it is of no known model."""
         kind = surface.GetShaderId() or ""
         if kind == SURFACE:
+            note_unknown_inputs(surface, {*PREVIEW, "normal", "occlusion", *MODELS[SURFACE].left}, self._notes)
             inputs = {name: self._input(surface, name) for name in (*PREVIEW, "normal", *MODELS[SURFACE].left)}
             # The only word among numbers.
             inputs = {name: each for name, each in inputs.items() if name == "opacityMode" or not isinstance(each, str)}
@@ -127,6 +138,7 @@ class MaterialReader:
         if kind == "UsdUVTexture":
             return self._texture(source, output)
         if kind.startswith("UsdPrimvarReader"):
+            note_unknown_inputs(source, _INPUTS["UsdPrimvarReader"], self._notes)
             fallback = np.atleast_1d(self._value(source, "fallback", 0.0)).astype(float).tolist()
             return PrimvarContents(str(self._value(source, "varname", "")), fallback)
         self._notes.add(f'shaders "{kind}" are ignored; expected UsdUVTexture or UsdPrimvarReader', source.GetPath())
@@ -136,30 +148,47 @@ class MaterialReader:
         """The shader that an input is connected to and the name of its output; or None and the input's value."""
         from pxr import UsdShade
 
-        given = shader.GetInput(name)
-        if not given:
+        attribute = source_of(shader.GetInput(name), self._notes)
+        if attribute is None:
             return None, None
-        found = given.GetValueProducingAttributes()
-        if not found:
-            return None, None
-        attribute = found[0]
         if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
             return UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName()
-        return None, attribute.Get(self._time)
+        return None, value_at(attribute, self._time)
 
     def _value(self, shader: UsdShade.Shader, name: str, usual: Any) -> Any:
         """Value of an input that cannot be connected to a shader."""
         source, value = self._source(shader, name)
+        if source is not None:
+            self._notes.add(f"connections of {name} of {shader.GetShaderId()} to shaders are ignored", shader.GetPath())
         return usual if source is not None or value is None else value
+
+    def _four(self, shader: UsdShade.Shader, name: str, usual: tuple[float, ...]) -> list[float]:
+        """Value of an input of four numbers."""
+        found = np.asarray(self._value(shader, name, usual), dtype=np.float64)
+        if found.shape != (4,):
+            raise TypeError(f"{name} is {found.tolist()}; expected four numbers")
+        return [float(each) for each in found]
+
+    def _word(self, shader: UsdShade.Shader, name: str, known: Collection[str], usual: str) -> str:
+        """Value of an input that is one of some words; the usual one, with a note, in place of others."""
+        found = str(self._value(shader, name, usual))
+        if found in known:
+            return found
+        self._notes.add(f'{name} "{found}" of textures is ignored; expected {", ".join(known)}', shader.GetPath())
+        return usual
 
     def _texture(self, shader: UsdShade.Shader, output: str) -> TextureContents | None:
         path = shader.GetPath()
+        note_unknown_inputs(shader, _INPUTS["UsdUVTexture"], self._notes)
+        if output not in _OUTPUTS:
+            self._notes.add(f'the output "{output}" of textures is not there; rgb is used', path)
+            output = "rgb"
         file = self._file(shader)
         if not file:
             self._notes.add("textures without a file are ignored", path)
             return None
-        wraps = [str(self._value(shader, f"wrap{axis}", "useMetadata")) for axis in "ST"]
-        if wraps[0] != wraps[1]:
+        wraps = [self._word(shader, f"wrap{axis}", _WRAPS, "useMetadata") for axis in "ST"]
+        if _WRAPS[wraps[0]] != _WRAPS[wraps[1]]:
             self._notes.add("wrapT of textures is ignored; wrapS applies to both coordinates", path)
         if "black" in wraps:
             self._notes.add('textures with the wrap mode "black" use "clamp"', path)
@@ -167,13 +196,13 @@ class MaterialReader:
         return TextureContents(
             file,
             output,
-            str(self._value(shader, "sourceColorSpace", "auto")),
-            _WRAPS.get(wraps[0], "repeat"),
-            [float(each) for each in self._value(shader, "scale", (1, 1, 1, 1))],
-            [float(each) for each in self._value(shader, "bias", (0, 0, 0, 0))],
+            self._word(shader, "sourceColorSpace", _COLOR_SPACES, "auto"),
+            _WRAPS[wraps[0]],
+            self._four(shader, "scale", (1, 1, 1, 1)),
+            self._four(shader, "bias", (0, 0, 0, 0)),
             to_uv,
             texcoords,
-            [float(each) for each in self._value(shader, "fallback", (0, 0, 0, 1))],
+            self._four(shader, "fallback", (0, 0, 0, 1)),
         )
 
     def _file(self, shader: UsdShade.Shader) -> str:
@@ -194,12 +223,25 @@ class MaterialReader:
         """Transform ``(3, 3)`` of texture coordinates, and the name of their primvar."""
         to_uv = np.eye(3)
         for _ in range(_DEEPEST):
-            shader, _ = self._source(shader, name)
+            source, given = self._source(shader, name)
+            if source is None and given is None:
+                what = f"textures read the texture coordinates st where {name} is not connected"
+                self._notes.add(what, shader.GetPath())
+            elif source is None:
+                # The same texel everywhere.
+                constant = np.zeros((3, 3))
+                constant[:2, 2], constant[2, 2] = given, 1
+                return to_uv @ constant, "st"
+            shader = source
             kind = None if shader is None else shader.GetShaderId()
             if kind == "UsdTransform2d":
+                note_unknown_inputs(shader, _INPUTS["UsdTransform2d"], self._notes)
                 to_uv, name = to_uv @ self._transform2d(shader), "in"
                 continue
             if kind and kind.startswith("UsdPrimvarReader"):
+                note_unknown_inputs(shader, _INPUTS["UsdPrimvarReader"], self._notes)
+                if np.any(self._value(shader, "fallback", 0.0)):
+                    self._notes.add("fallback of texture coordinates is ignored, and (0, 0) is used", shader.GetPath())
                 return to_uv, str(self._value(shader, "varname", "st"))
             if kind:
                 self._notes.add(f'shaders "{kind}" of texture coordinates are ignored', shader.GetPath())

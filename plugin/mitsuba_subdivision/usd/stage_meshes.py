@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened
+from ..cage.validation import require_range
 from ..files.usd_primvars import PrimvarChoice
 from ..files.usd_reader import MeshReader
 from ..files.usd_skinning import Skinning
-from ..files.usd_stage import usd_errors_at
+from ..files.usd_values import require_types, value_at
 from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
 from .polygons import GPRIMS, read_gprim, read_normals
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 COLORS = ("displayColor", "displayOpacity")
 # Faces times parts of a mesh, up to which each part evaluates the whole surface.
 MOST_SHARED_FACES = 1_000_000
+_NO_FACES: IntArray = np.zeros(0, np.int64)
 
 
 class ShapeReader:
@@ -56,7 +59,7 @@ class ShapeReader:
         self._skinning = Skinning(time, notes.add)
 
     def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
-        """Shapes of a prim: one for each material, none if it cannot be used.
+        """Shapes of a prim: one for each material.
 
         Parameters
         ----------
@@ -64,33 +67,29 @@ class ShapeReader:
         to_world : (4, 4) float64
             From the prim's space, for column vectors.
 
-        Warns
-        -----
-        CageWarning
+        Raises
+        ------
+        CageError, TypeError, ValueError
             If it cannot be used.
         """
         location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
-        try:
-            if not is_invertible(to_world):
-                raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
-            with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-                if str(prim.GetTypeName()) in GPRIMS:
-                    cage, normals = read_gprim(prim, self._code)
-                    return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
+        if not is_invertible(to_world):
+            raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
+        with np.errstate(over="ignore", invalid="ignore"):
+            if str(prim.GetTypeName()) not in GPRIMS:
                 return self._parts(prim, to_world, location)
-        except (CageError, TypeError, ValueError) as error:
-            # Values of another type than the schema's.
-            message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
-            self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
-            return []
+            require_types(prim, self._code)
+            cage, normals = read_gprim(prim, self._code)
+            return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
-        reader = MeshReader(mesh, location, self._time, self._skinning)
+        reader = MeshReader(mesh, location, self._time, self._skinning, report=self._notes.add_message)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
+        self._note_velocities(mesh)
         materials, owner = self._materials_of_faces(mesh, reader)
         shapes = []
         # Parts whose materials need the same primvars share their arrays.
@@ -107,7 +106,7 @@ class ShapeReader:
                     f'texture coordinates "{choice.texcoords[0]}" are missing; the first others of the mesh are used',
                     prim.GetPath(),
                 )
-            normals = read_normals(reader, cage, self._notes) if cage.scheme is None else None
+            normals = read_normals(reader, cage) if cage.scheme is None else None
             shown = None
             if len(materials) > 1:
                 if cage.scheme is not None and len(materials) * len(owner) <= MOST_SHARED_FACES:
@@ -118,23 +117,30 @@ class ShapeReader:
             shapes.append(replace(self._shape(prim, to_world, cage, normals, material), shown_faces=shown))
         return shapes
 
+    def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
+        """Note velocities where points are not those of a sample."""
+        if self._code.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
+            return
+        time = self._code.GetValue()
+        if time not in mesh.GetPointsAttr().GetBracketingTimeSamples(time):
+            self._notes.add(
+                "velocities of meshes are ignored; their points are interpolated between samples", mesh.GetPath()
+            )
+
     def _materials_of_faces(self, mesh: UsdGeom.Mesh, reader: MeshReader) -> tuple[list[int | None], IntArray]:
         """Materials of a mesh, and for each face the index of its own among them."""
         from pxr import UsdShade
 
         prim = mesh.GetPrim()
         materials = [self._materials.bound(prim)]
-        owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64)), dtype=np.int64)
+        owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)), dtype=np.int64)
         for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
-            if subset.GetElementTypeAttr().Get() != "face":
+            if value_at(subset.GetElementTypeAttr(), self._code) != "face":
                 self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
-            faces = np.array(reader.value(subset.GetIndicesAttr()) or [], dtype=np.int64)
-            if len(faces) and not 0 <= faces.min() <= faces.max() < len(owner):
-                raise CageError(
-                    f"{reader.location}: subset {subset.GetPrim().GetName()} has faces from {faces.min()} to "
-                    f"{faces.max()}; expected 0 to {len(owner) - 1}"
-                )
+            read = partial(_faces_of, reader, subset, len(owner))
+            left_out = f"the subset {subset.GetPrim().GetName()} is left out"
+            faces = reader.fitting(subset.GetIndicesAttr(), left_out, read, _NO_FACES)
             material = self._materials.bound(subset.GetPrim())
             if material not in materials:
                 materials.append(material)
@@ -166,23 +172,49 @@ class ShapeReader:
 
         contents = None if material is None else self._materials.materials[material]
         if contents and contents.texcoords() and cage.texcoords is None:
-            self._notes.add(
-                "prims without texture coordinates have the colour of their texture at (0, 0)", prim.GetPath()
-            )
+            # Of those that are there and do not fit, there is a message already.
+            if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(contents.texcoords()[0]):
+                self._notes.add(
+                    "prims without texture coordinates have the colour of their texture at (0, 0)", prim.GetPath()
+                )
             cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
         names = COLORS if contents is None else contents.primvars()
-        constants = {}
-        for name in names:
-            primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-            values = np.asarray(primvar.Get(self._code) if primvar and primvar.HasValue() else [])
-            if name not in cage.attributes and values.dtype.kind == "f" and values.size in (1, 3):
-                constants[name] = values.astype(np.float64).ravel().tolist()
+        constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
+        constants = {name: values for name, values in constants.items() if values}
         radiance = None
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            if UsdLux.LightAPI(prim).GetNormalizeAttr().Get(self._code):
+            if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._code):
                 self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
             radiance = read_emission(prim, self._code).tolist()
+            if not np.isfinite(radiance).all():
+                self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
+                radiance = None
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
+
+    def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
+        """A primvar of a prim, or of those above, that has one value of one or three numbers; else nothing."""
+        from pxr import UsdGeom
+
+        primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+        if not primvar or not primvar.HasValue() or primvar.GetInterpolation() != UsdGeom.Tokens.constant:
+            return []
+        values = np.asarray(value_at(primvar.GetAttr(), self._code))
+        if primvar.IsIndexed() and values.ndim:
+            indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._code))
+            values = values[indices] if ((indices >= 0) & (indices < len(values))).all() else np.zeros(0)
+        if values.dtype.kind == "f" and values.size in (1, 3) and np.isfinite(values).all():
+            return list(values.astype(np.float64).ravel().tolist())
+        self._notes.add(
+            "constant primvars are ignored unless they have one value of one or three finite numbers",
+            primvar.GetAttr().GetPath(),
+        )
+        return []
+
+
+def _faces_of(reader: MeshReader, subset: UsdGeom.Subset, face_count: int) -> IntArray:
+    faces = reader.array(subset.GetIndicesAttr(), np.int64)
+    require_range(faces, face_count, f"{reader.location}: subset {subset.GetPrim().GetName()} has")
+    return faces
 
 
 def is_invertible(matrix: NDArray[np.float64]) -> bool:

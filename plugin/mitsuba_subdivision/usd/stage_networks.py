@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files.usd_values import value_at
 from ..srgb import decoded
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_library import library, numbers
@@ -20,15 +21,41 @@ if TYPE_CHECKING:
     import MaterialX
     from pxr import Usd, UsdShade
 
-_WRAPS = {"periodic": "repeat", "mirror": "mirror", "clamp": "clamp", "constant": "clamp"}
+# Those of MaterialX, and of UsdUVTexture.
+_WRAPS = {
+    "periodic": "repeat", "mirror": "mirror", "clamp": "clamp", "constant": "clamp",
+    "repeat": "repeat", "black": "clamp", "useMetadata": "repeat",
+}  # fmt: skip
+# Inputs of images that are ignored, and the values that have no effect.
+_NEUTRAL = {"layer": "", "filtertype": "linear", "framerange": "", "frameoffset": 0.0, "frameendaction": "constant"}
 _IS_SRGB = {
     "srgb_texture": True, "sRGB": True, "g22_rec709": True, "rec709_display": True,
     "": False, "lin_rec709": False, "raw": False, "Raw": False, "none": False, "data": False, "lin_srgb": False,
 }  # fmt: skip
+_COLOR_SPACE = "sourceColorSpace"
 # Nodes that an expression may have when what several nodes share is counted for each.
 _MOST_NODES = 10_000
 # Where a mapping of texture coordinates is tried out: whether it is affine.
 _TRIED = np.array([[0, 0], [1, 0], [0, 1], [0.37, 0.61], [-2.3, 5.7], [17.1, -3.9], [-8.4, -11.2]])
+
+
+def note_unknown_inputs(shader: UsdShade.Shader, known: Collection[str], notes: StageWarnings) -> None:
+    """Note the inputs that a shader has and its definition has not."""
+    names = sorted({each.GetBaseName() for each in shader.GetInputs()} - {*known})
+    if names:
+        what = f"inputs that {shader.GetShaderId()} does not have are ignored"
+        notes.add(what, f"{', '.join(names)} of {shader.GetPath()}")
+
+
+def source_of(given: UsdShade.Input, notes: StageWarnings) -> Usd.Attribute | None:
+    """The attribute that has the value of an input, or the output that computes it; None if there is none."""
+    found = given.GetValueProducingAttributes() if given else []
+    attribute = given.GetAttr() if given else None
+    if not found and attribute:
+        stage = attribute.GetStage()
+        if not all(stage.GetPropertyAtPath(path) for path in attribute.GetConnections()):
+            notes.add("connections of inputs to what is not there are ignored", attribute.GetPath())
+    return found[0] if found else None
 
 
 class NetworkReader:
@@ -50,6 +77,7 @@ class NetworkReader:
         """Name of the model of a surface, and all its inputs but the vectors of the surface that are its own."""
         definition = library().getNodeDef(shader.GetShaderId())
         found = {}
+        self._note_unknown_inputs(shader, definition)
         for each in definition.getActiveInputs():
             value = self._input(shader, each)
             if value is not None:
@@ -60,14 +88,12 @@ class NetworkReader:
         """An input of a shader; None for a vector of the surface."""
         from pxr import UsdShade
 
-        given = shader.GetInput(declared.getName())
-        attributes = given.GetValueProducingAttributes() if given else []
-        if not attributes:
+        attribute = source_of(shader.GetInput(declared.getName()), self._notes)
+        if attribute is None:
             return self._usual(declared)
-        attribute = attributes[0]
         if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
             return self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
-        value = attribute.Get(self._time)
+        value = value_at(attribute, self._time)
         if value is None:
             return self._usual(declared)
         if declared.getType() == "filename":
@@ -96,7 +122,10 @@ class NetworkReader:
         if not asset.resolvedPath and UDIM in asset.path:
             layer = attribute.GetPropertyStack(self._time)[0].layer
             path = UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
+        given = UsdShade.Shader(attribute.GetPrim()).GetInput(_COLOR_SPACE)
+        named = value_at(given.GetAttr(), self._time) if given else None
         space = "sRGB" if self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()) else "raw"
+        space = named if named in ("auto", "raw", "sRGB") else space
         return TextureContents(path, "rgba", space, "repeat", [1.0] * 4, [0.0] * 4, np.eye(3), "st", [0.0] * 4)
 
     def _is_srgb(self, space: str, prim: object) -> bool:
@@ -116,10 +145,16 @@ class NetworkReader:
             if definition is None:
                 self._leave(f'"{shader.GetShaderId() or shader.GetPrim().GetTypeName()}"', shader.GetPath())
             else:
+                self._note_unknown_inputs(shader, definition)
                 self._known[key] = self._made(
                     definition, output, lambda each: self._input(shader, each), shader.GetPath()
                 )
         return self._known[key]
+
+    def _note_unknown_inputs(self, shader: UsdShade.Shader, definition: MaterialX.NodeDef) -> None:
+        known = {each.getName() for each in definition.getActiveInputs()}
+        # Of the shader of USD, which the definition lacks.
+        note_unknown_inputs(shader, known | ({_COLOR_SPACE} if "wrapS" in known else set()), self._notes)
 
     def _leave(self, what: str, prim: object) -> None:
         self._notes.add(f"MaterialX nodes {what} are ignored; their first input is used instead, or 0", prim)
@@ -138,6 +173,9 @@ class NetworkReader:
         names = [each.getName() for each in outputs]
         kind = outputs[names.index(output)].getType() if output in names else definition.getType()
         declared = definition.getActiveInputs()
+        has_sets = category in ("texcoord", "geomcolor")
+        if has_sets and any(input_of(each) != 0 for each in declared if each.getName() == "index"):
+            self._notes.add(f"index of {category} is ignored; the first set of the mesh is used", prim)
         if category == "texcoord":
             return NodeContents("texcoord", "vector2", {"name": "st"})
         implementation = definition.getImplementation()
@@ -146,6 +184,9 @@ class NetworkReader:
             return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, prim)
         # Slopes are those along texture coordinates.
         unused = {"texcoord"} if category == "heighttonormal" else set()
+        for where in (input_of(each) for each in declared if each.getName() in unused):
+            if not isinstance(where, NodeContents) or where.category != "texcoord":
+                self._notes.add(f"texcoord of {category} is ignored; slopes are along those of the mesh", prim)
         given = {each.getName(): input_of(each) for each in declared if each.getName() not in unused}
         if category in _SPECIAL:
             return _SPECIAL[category](self, kind, given, prim)
@@ -199,10 +240,17 @@ class NetworkReader:
         if not isinstance(file, TextureContents) or not file.file:
             self._notes.add("textures without a file are replaced by their default", prim)
             return float(usual[0]) if width == 1 else usual[:width].tolist()
+        for name, neutral in _NEUTRAL.items():
+            if given.get(name, neutral) != neutral:
+                self._notes.add(f"{name} of images is ignored", prim)
+        if fallback is not None and not is_constant(fallback):
+            self._notes.add("default of images is ignored unless it is constant", prim)
         modes = [given.get(f"{axis}addressmode") for axis in "uv"]
+        if not {str(mode) for mode in modes} <= _WRAPS.keys():
+            self._notes.add(f"address modes other than {', '.join(_WRAPS)} are periodic", prim)
         if modes[0] != modes[1]:
             self._notes.add("vaddressmode of textures is ignored; uaddressmode is used for both", prim)
-        if "constant" in modes:
+        if "constant" in modes or "black" in modes:
             self._notes.add('textures with the address mode "constant" are clamped', prim)
         texture = replace(
             file, channel="rgba"[:width], wrap=_WRAPS.get(str(modes[0]), "repeat"), fallback=usual.tolist()
@@ -222,10 +270,12 @@ class NetworkReader:
                 return replace(texture, to_uv=matrix_or_none, texcoords=names.pop())
         return NodeContents("image", kind, {"file": texture, "texcoord": where})
 
-    def _attribute(self, kind: str, given: dict[str, Input | None], _prim: object) -> Input:
+    def _attribute(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
         """An attribute of the mesh; texture coordinates if it has two components."""
         name, fallback = given["geomprop"], given.get("default")
         if kind == "vector2":
+            if fallback is not None and (not is_constant(fallback) or np.any(np.asarray(fallback) != 0)):
+                self._notes.add("default of texture coordinates is ignored, and (0, 0) is used", prim)
             return NodeContents("texcoord", "vector2", {"name": str(name)})
         width = CHANNELS.get(kind, 1)
         usual = fallback if isinstance(fallback, (int, float, list)) else 0.0

@@ -52,7 +52,7 @@ class StageReader:
         weakref.finalize(self, library.cache_clear)
 
     def at(self, time: float | None = None) -> SceneContents:
-        """Contents of the stage at a time code; by default, at the first one of each value.
+        """Contents of the stage at a time code; see `read_stage`.
 
         Raises
         ------

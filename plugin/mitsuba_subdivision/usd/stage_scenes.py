@@ -135,7 +135,10 @@ class StageScenes:
             found = "there is no camera"
             if first.camera:
                 found = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
-            raise CageError(f"{self.name}: {found}; expected a camera whose shutter opens before it closes")
+            raise CageError(
+                f"{self.name}: {found}; expected a camera whose shutter opens before it closes, and render settings "
+                "without disableMotionBlur"
+            )
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, View, tuple[int, int]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,18 +19,19 @@ from numpy.typing import NDArray
 from ..cage.errors import CageError, shortened
 from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
+from ..files.usd_values import local_to_world, require_types, time_of, value_at
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
 from .polygons import GPRIMS
-from .stage_camera import read_camera
+from .stage_camera import FrameSettings, read_camera, read_settings
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
 from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
-    from pxr import Usd, UsdGeom
+    from pxr import Gf, Sdf, Usd, UsdGeom
 
 # Draw modes by which a viewer shows a model as it is.
 _FULL_MODES = (None, "default", "inherited")
@@ -81,7 +83,7 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
     ----------
     path : str or Path
     time : float, optional
-        Time code; by default, the first one of each value.
+        Time code; by default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional
         Path of the camera; by default, that of the stage's render settings, or its first one.
 
@@ -156,19 +158,24 @@ class _StageWalk:
     def __init__(
         self, stage: Usd.Stage, name: str, time: float | None, notes: StageWarnings, at: Callable[[str], None]
     ) -> None:
-        from pxr import Usd, UsdGeom
+        from pxr import Usd
 
         self._stage = stage
         self._name = name
         self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
         self._notes = notes
         self._at, self._count = at, 0
-        self._transforms = UsdGeom.XformCache(self._code)
+        self._transforms: dict[str, Gf.Matrix4d] = {}
         self._materials = MaterialReader(self._code, notes)
         self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
         # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
         self._numbers: dict[object, int] = {}
+        # Names of primvars that the shapes of instances read, and whether some of these have places of their own, by
+        # prototype and bindings.
+        self._inherited: dict[tuple[object, ...], tuple[list[str], bool]] = {}
         self._prototypes: list[_Subtree] = []
+        # Paths of instancers whose prototypes are being read.
+        self._open: list[Sdf.Path] = []
 
     def contents(self, camera: str | None) -> SceneContents:
         from pxr import UsdGeom
@@ -205,45 +212,59 @@ class _StageWalk:
 
     def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:
         """The camera, and the resolution of the stage's render settings; each None if there is none."""
-        chosen, resolution = self._camera(path)
-        return None if chosen is None else self._camera_contents(chosen), resolution
+        settings = read_settings(self._stage, self._code, self._notes)
+        chosen = self._camera(path or settings.camera)
+        return None if chosen is None else self._camera_contents(chosen, settings), settings.resolution
 
     def _below(self, root: Usd.Prim) -> _Subtree:
         """Visible contents of a prim and its descendants."""
-        from pxr import UsdGeom, UsdLux
-
         found, to_root = _Subtree(), _inverse(self._to_world(root))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
             name = str(prim.GetPath()).removeprefix(above)
             self._count += 1
             self._at(f"prim {self._count}")
-            draw_mode = prim.GetAttribute("model:drawMode")
-            if draw_mode and draw_mode.Get(self._code) not in _FULL_MODES:
-                self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
-            if prim != root and prim.IsInstance():
-                self._add_instance(prim, name, to_root, found)
-            elif prim.IsA(UsdGeom.PointInstancer):
-                try:
-                    self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
-                except (CageError, TypeError, ValueError) as error:
-                    location = f"{self._name}, prim {shortened(str(prim.GetPath()))}: "
-                    message = str(error) if isinstance(error, CageError) else f"{location}{error}"
-                    self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
-            elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
-                kind, path, placed = str(prim.GetTypeName()), prim.GetPath(), to_root @ self._to_world(prim)
-                if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
-                    found.shapes += [replace(shape, name=name) for shape in self._shapes.read(prim, placed)]
-                elif prim.HasAPI(UsdLux.LightAPI):
-                    light = self._light(prim, placed)
-                    found.lights += [] if light is None else [replace(light, name=name)]
-                elif kind not in _SILENT:
-                    self._notes.add(f"prims of type {kind} are ignored", path)
+            with self._left_out_if_unusable(prim):
+                self._add(prim, name, root, to_root, found)
         return found
+
+    def _add(self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], found: _Subtree) -> None:
+        """Add what a prim shows."""
+        from pxr import UsdGeom, UsdLux
+
+        draw_mode = prim.GetAttribute("model:drawMode")
+        if draw_mode and value_at(draw_mode, self._code) not in _FULL_MODES:
+            self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
+        if prim != root and prim.IsInstance():
+            self._add_instance(prim, name, to_root, found)
+        elif prim.IsA(UsdGeom.PointInstancer):
+            self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
+        elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
+            kind, path = str(prim.GetTypeName()), prim.GetPath()
+            if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
+                shapes = self._shapes.read(prim, to_root @ self._to_world(prim))
+                found.shapes += [replace(shape, name=name) for shape in shapes]
+            elif prim.HasAPI(UsdLux.LightAPI):
+                light = self._light(prim, to_root @ self._to_world(prim))
+                found.lights += [] if light is None else [replace(light, name=name)]
+            elif kind not in _SILENT:
+                self._notes.add(f"prims of type {kind} are ignored", path)
+
+    @contextmanager
+    def _left_out_if_unusable(self, prim: Usd.Prim) -> Iterator[None]:
+        """Leave out a prim that raises an error in a ``with`` block, with a note, in place of the whole stage."""
+        location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
+        try:
+            with usd_errors_at(location):
+                yield
+        except (CageError, AttributeError, TypeError, ValueError) as error:
+            message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
+            self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
 
     def _light(self, prim: Usd.Prim, placed: NDArray[np.float64]) -> LightContents | None:
         """A light; None, with a note, if it cannot be used."""
         try:
+            require_types(prim, self._code)
             light = read_light(prim, placed, self._code, self._notes)
         except (TypeError, ValueError):
             self._notes.add("lights with attributes of other types than UsdLux has are ignored", prim.GetPath())
@@ -255,12 +276,16 @@ class _StageWalk:
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
         """Visible prims of a subtree, without the descendants of other instances and instancers."""
-        from pxr import Usd, UsdGeom
+        from pxr import Sdf, Usd, UsdGeom
 
-        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
+        # Prototypes of instancers may lie below a class or an over, as their schema recommends.
+        prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)))
         for prim in prims:
+            if prim != root and prim.GetSpecifier() != Sdf.SpecifierDef:
+                prims.PruneChildren()
+                continue
             imageable = UsdGeom.Imageable(prim)
-            if imageable and imageable.GetVisibilityAttr().Get(self._code) == UsdGeom.Tokens.invisible:
+            if imageable and value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible:
                 prims.PruneChildren()
                 continue
             if prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
@@ -269,27 +294,52 @@ class _StageWalk:
 
     def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
         """Add an instance; instances that differ in appearance belong to different prototypes."""
-        from pxr import UsdGeom, UsdShade, UsdSkel
-
         matrix = to_root @ self._to_world(prim)
-        if not self._is_invertible(matrix, prim.GetPath()):
-            return
-        material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-        primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in COLORS)
+        if self._is_invertible(matrix, prim.GetPath()):
+            found.instances.append(InstanceContents(name, self._prototype(self._appearance(prim), prim), matrix))
+
+    def _appearance(self, prim: Usd.Prim) -> tuple[object, ...]:
+        """What an instance inherits that may make it look different from others of its prototype, and the prototype."""
+        from pxr import UsdGeom, UsdSkel
+
         binding = UsdSkel.BindingAPI(prim)
         skeleton, animation = binding.GetInheritedSkeleton(), binding.GetInheritedAnimationSource()
         # A skeleton outside moves the points of each instance otherwise.
         is_posed = skeleton and not skeleton.GetPath().HasPrefix(prim.GetPath())
         is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES
-        key = (
-            str(prim.GetPrototype().GetPath()),
-            str(material.GetPath()) if material else "",
-            *(str(each.Get(self._code)) if each else "" for each in primvars),
-            bool(is_hidden),
-            str(prim.GetPath()) if is_posed else "",
+        key = str(prim.GetPrototype().GetPath()), self._bindings(prim), bool(is_hidden)
+        if key not in self._inherited:
+            parts = _parts(prim)
+            materials = {self._materials.bound(part) for part in parts if _is_shape(part)}
+            names: set[str] = set()
+            for number in materials:
+                names.update(COLORS if number is None else self._materials.materials[number].primvars())
+            is_placed = any(UsdGeom.Xformable(part) and UsdGeom.Xformable(part).GetResetXformStack() for part in parts)
+            self._inherited[key] = sorted(names), is_placed
+        names_read, is_placed = self._inherited[key]
+        primvars = (UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in names_read)
+        return (
+            *key,
+            *(_texts(primvar, self._code) for primvar in primvars),
+            str(prim.GetPath()) if is_posed or is_placed else "",
             str(animation.GetPath()) if animation else "",
         )
-        found.instances.append(InstanceContents(name, self._prototype(key, prim), matrix))
+
+    def _bindings(self, prim: Usd.Prim) -> tuple[object, ...]:
+        """Bindings of materials that an instance inherits or has; of collections, the materials of its parts."""
+        from pxr import UsdShade
+
+        above = prim
+        while not above.IsPseudoRoot():
+            if above.GetPropertiesInNamespace("material:binding:collection"):
+                return tuple(self._materials.bound(part) for part in _parts(prim) if _is_shape(part))
+            above = above.GetParent()
+        found = []
+        for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview):
+            material, binding = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
+            strength = UsdShade.MaterialBindingAPI.GetMaterialBindingStrength(binding) if binding else ""
+            found.append((str(material.GetPath()), binding.GetName() if binding else "", strength))
+        return tuple(found)
 
     def _add_point_instances(
         self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64], found: _Subtree
@@ -300,6 +350,10 @@ class _StageWalk:
         path = prim.GetPath()
         if UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES:
             return
+        if path in self._open:
+            self._notes.add("point instancers in their own prototypes are ignored", path)
+            return
+        require_types(prim, self._code)
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         kinds = np.array(instancer.GetProtoIndicesAttr().Get(self._code) or [], dtype=np.int64)
         if len(kinds) and not 0 <= kinds.min() <= kinds.max() < len(targets):
@@ -308,6 +362,8 @@ class _StageWalk:
                 f"{self._name}, prim {shortened(str(path))}: protoIndices are from {kinds.min()} to {kinds.max()}; "
                 f"expected {expected}"
             )
+        if not len(kinds) and instancer.GetPositionsAttr().Get(self._code):
+            self._notes.add("point instancers without protoIndices show nothing", path)
         if any(each.GetInterpolation() != "constant" for each in UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()):
             self._notes.add("primvars of point instancers are ignored", path)
         mask = instancer.ComputeMaskAtTime(self._code)
@@ -327,9 +383,16 @@ class _StageWalk:
             self._notes.add(_SINGULAR, f"{path}/{row}")
         for number, target in enumerate(targets):
             prototype = self._stage.GetPrimAtPath(target)
-            if not prototype or number not in kinds:
+            if number not in kinds:
                 continue
-            group = self._prototype(f"{path} {target}", prototype)
+            if not prototype:
+                self._notes.add("prototypes of point instancers that are not there are ignored", target)
+                continue
+            self._open.append(path)
+            try:
+                group = self._prototype(f"{path} {target}", prototype)
+            finally:
+                self._open.pop()
             for row in np.flatnonzero((kinds == number) & is_shown & is_usable):
                 found.instances.append(InstanceContents(f"{name}/{row}", group, matrices[row]))
 
@@ -362,7 +425,7 @@ class _StageWalk:
             self._prototypes.append(flat)
         return self._numbers[key]
 
-    def _camera_contents(self, camera: UsdGeom.Camera) -> CameraContents:
+    def _camera_contents(self, camera: UsdGeom.Camera, settings: FrameSettings) -> CameraContents:
         """Parameters of a camera.
 
         Raises
@@ -371,7 +434,7 @@ class _StageWalk:
             If it cannot be used.
         """
         try:
-            contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, self._notes)
+            contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, settings, self._notes)
         except (TypeError, ValueError):
             contents = None
         if contents is None or not contents.is_usable:
@@ -381,38 +444,51 @@ class _StageWalk:
             )
         return contents
 
-    def _camera(self, path: str | None) -> tuple[UsdGeom.Camera | None, list[int] | None]:
-        """The camera, and the resolution of the stage's render settings; each None if there is none.
+    def _camera(self, path: str | None) -> UsdGeom.Camera | None:
+        """The camera of a path, or by default the first one; None if there is none.
 
         Raises
         ------
         CageError
             If there is no camera of the path.
         """
-        from pxr import Usd, UsdGeom, UsdRender
+        from pxr import Usd, UsdGeom
 
-        resolution = None
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
         cameras = {str(prim.GetPath()): UsdGeom.Camera(prim) for prim in prims if prim.IsA(UsdGeom.Camera)}
-        settings = UsdRender.Settings.GetStageRenderSettings(self._stage)
-        chosen = path
-        if settings:
-            resolution = [int(each) for each in settings.GetResolutionAttr().Get()]
-            targets = settings.GetCameraRel().GetForwardedTargets()
-            chosen = path or (str(targets[0]) if targets else None)
-        if chosen is not None:
-            if chosen not in cameras:
+        if path is not None:
+            if path not in cameras:
                 there = ", ".join(cameras) or "none"
-                raise CageError(
-                    f'{self._name}: there is no camera "{chosen}"; expected one of those there are: {there}'
-                )
-            return cameras[chosen], resolution
+                raise CageError(f'{self._name}: there is no camera "{path}"; expected one of those there are: {there}')
+            return cameras[path]
         if len(cameras) > 1:
             self._notes.add("there are several cameras, and the first is used", ", ".join(cameras))
-        return next(iter(cameras.values()), None), resolution
+        return next(iter(cameras.values()), None)
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
-        return np.array(self._transforms.GetLocalToWorldTransform(prim)).T
+        return np.array(local_to_world(prim, lambda attribute: time_of(attribute, self._code), self._transforms)).T
+
+
+def _parts(instance: Usd.Prim) -> list[Usd.Prim]:
+    """Prims of an instance."""
+    from pxr import Usd
+
+    return list(Usd.PrimRange(instance, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)))
+
+
+def _is_shape(prim: Usd.Prim) -> bool:
+    """Whether a material may be bound to what a prim shows."""
+    from pxr import UsdGeom
+
+    return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.Subset))
+
+
+def _texts(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> tuple[str, str]:
+    """Values and indices of a primvar, to be compared."""
+    if not primvar:
+        return "", ""
+    indices = primvar.GetIndicesAttr()
+    return str(value_at(primvar.GetAttr(), time)), str(value_at(indices, time)) if indices else ""
 
 
 def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
