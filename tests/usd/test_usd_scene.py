@@ -611,6 +611,42 @@ def test_normal_maps_turn_the_normal(stage, tmp_path):
     assert 2.5 < found[36.87] / found[-36.87] < 1 / 0.28
 
 
+# Radiance of a plane in a white environment of radiance 1, by Cycles of Blender 5.0.1: a Diffuse BSDF of 0.8, and a
+# Principled BSDF of 0.8, metallic, of roughness 0.5. The view is 20 degrees above the plane.
+OF_CYCLES = {
+    ("diffuse", (0.0, -0.6, 0.8)): 0.659,
+    ("diffuse", (0.0, 0.6, 0.8)): 0.659,
+    ("diffuse", (0.6, 0.0, 0.8)): 0.659,
+    ("metal", (0.0, -0.6, 0.8)): 0.772,
+    ("metal", (0.0, 0.6, 0.8)): 0.743,
+    ("metal", (0.6, 0.0, 0.8)): 0.714,
+}
+# Noise of diffuse surfaces. Cycles turns normals of metals towards the viewer, and adds what they scatter between their
+# facets.
+CYCLES_TOLERANCE = {"diffuse": 0.005, "metal": 0.12}
+
+
+@pytest.mark.parametrize(("kind", "normal"), OF_CYCLES)
+def test_planes_with_normal_maps_are_as_bright_as_in_cycles(stage, tmp_path, kind, normal):
+    """Also where the normal faces away from the viewer."""
+    texels = np.broadcast_to(np.round((np.array(normal) + 1) / 2 * 255), (2, 2, 3)).astype(np.uint8)
+    mi.Bitmap(texels).write(str(tmp_path / "n.png"))
+    inputs = f"""normal3f inputs:normal.connect = </paint/texture.outputs:rgb>
+        color3f inputs:diffuseColor = (0.8, 0.8, 0.8)
+        int inputs:useSpecularWorkflow = {int(kind == "diffuse")}
+        float inputs:metallic = {int(kind == "metal")}
+        float inputs:roughness = 0.5"""
+    space = "float4 inputs:scale = (2, 2, 2, 1)\nfloat4 inputs:bias = (-1, -1, -1, 0)"
+    # The aperture shows the middle of the square.
+    view = CAMERA.replace("(0, 0, 10)", "(0, 0, 10)\nfloat xformOp:rotateX = 70")
+    view = view.replace("Aperture = 10", "Aperture = 1").replace(
+        '["xformOp:translate"]', '["xformOp:rotateX", "xformOp:translate"]'
+    )
+    text = view + 'def DomeLight "dome" {}\n' + material(inputs, texture("n.png", "raw", space))
+    found = rendered(msub.usd_scene(stage(text + mesh("square", SQUARE + BOUND)), mi, size=(8, 8)), spp=1024)
+    assert found.mean() == pytest.approx(OF_CYCLES[kind, normal], abs=CYCLES_TOLERANCE[kind])
+
+
 def light(kind, attributes, place=(0, 0, 4), scale=1.0):
     lines = "\n".join(f"        {each}" for each in attributes)
     return f"""def {kind} "lamp" {{

@@ -202,26 +202,30 @@ class _Surface:
         if is_constant(weight) and _first(weight) <= 0:
             found = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
-            found = self._turned(self._glass())
+            found = self._turned(self._glass(), is_diffuse=False)
         else:
             found = {
                 "type": "blendbsdf",
                 "weight": self._values.number(weight),
                 "bsdf_0": self._opaque(),
-                "bsdf_1": self._turned(self._glass()),
+                "bsdf_1": self._turned(self._glass(), is_diffuse=False),
             }
         return _masked(found, self._values.number(self._inputs["opacity"]))
 
-    def _turned(self, bsdf: SceneNode) -> SceneNode:
-        """A BSDF with the normal map, if there is one."""
+    def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
+        """A BSDF with the normal map, if there is one.
+
+        Normals that face away from the viewer are flipped, which leaves no black patches. Cycles has the shadowing
+        function for diffuse lobes only.
+        """
         normals = self._values.normals(self._inputs.get("normal", 0.0))
         if normals is None:
             return bsdf
         return {
             "type": "normalmap",
             "normalmap": normals,
-            "use_shadowing_function": False,
-            "flip_invalid_normals": False,
+            "use_shadowing_function": is_diffuse,
+            "flip_invalid_normals": True,
             "bsdf": bsdf,
         }
 
@@ -231,7 +235,7 @@ class _Surface:
             return self._turned(self._sheet(0.0))
         is_bare = self._is("coat", 0) and self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
-            return _both_sides(self._turned(self._metal()))
+            return _both_sides(self._turned(self._metal(), is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
             diffuse = {"type": "diffuse", "reflectance": self._values.color(self._inputs["base_color"])}
             return _both_sides(self._turned(diffuse))
