@@ -800,8 +800,9 @@ def test_domes_turn_their_picture_as_usd_does(stage, tmp_path):
             assert value.max() > 0.5
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
+@pytest.mark.parametrize("projection", ["perspective", "orthographic", "thin lens"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_points_are_projected_as_by_the_camera_of_usd(stage, projection, sign):
     from pxr import Usd, UsdGeom
 
     path = stage(
@@ -809,12 +810,14 @@ def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
         float3 xformOp:scale = (2, 2, 2)
         uniform token[] xformOpOrder = ["xformOp:scale"]
         def Camera "camera" {{
-            token projection = "{projection}"
+            token projection = "{projection.replace("thin lens", "perspective")}"
+            float fStop = {2 * (projection == "thin lens")}
+            float focusDistance = 5
             float focalLength = 35
             float horizontalAperture = 30
             float verticalAperture = 20
-            float horizontalApertureOffset = 4
-            float verticalApertureOffset = -3
+            float horizontalApertureOffset = {3.75 * sign}
+            float verticalApertureOffset = {-3 * sign}
             float2 clippingRange = (0.1, 1000)
             float3 xformOp:rotateXYZ = (30, 20, 10)
             double3 xformOp:translate = (1, 2, 6)
@@ -824,9 +827,8 @@ def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
         + mesh("cube", CUBE)
     )
     scene = msub.usd_scene(path, mi, spp=4)
-    film = scene["sensor"]["film"]
-    assert (film["width"], film["height"]) == (640, 427)
     sensor = mi.load_dict(scene["sensor"])
+    assert tuple(sensor.film().crop_size()) == (640, 427)
     usd_stage = Usd.Stage.Open(str(path))
     frustum = UsdGeom.Camera(usd_stage.GetPrimAtPath("/dolly/camera")).GetCamera(Usd.TimeCode(0)).frustum
     to_world = np.array((frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()).GetInverse())
