@@ -41,6 +41,8 @@ CAMERA = """def Camera "camera" {
 """
 # The largest light is 5 units wide at a distance of 7: what its sides send comes from farther away, and at an angle.
 AREA_LIGHT = 0.15
+# Of 256 samples in 16 pixels.
+LAMPS_NOISE = 0.02
 DARK = 'def DomeLight "dome" { float inputs:intensity = 0 }\n'
 
 
@@ -696,6 +698,18 @@ LIGHTS = {
         light("SphereLight", ["bool treatAsPoint = 1", "bool inputs:normalize = 1", "float inputs:intensity = 100"]),
         25 / 16,
     ),
+    "spot": (
+        light(
+            "SphereLight",
+            [
+                "bool treatAsPoint = 1",
+                "bool inputs:normalize = 1",
+                "float inputs:intensity = 100",
+                "float inputs:shaping:cone:angle = 30",
+            ],
+        ),
+        25 / 16,
+    ),
     "distant": (
         light("DistantLight", ["float inputs:angle = 0.8", "float inputs:intensity = 50000"]),
         50000 * np.pi * np.sin(np.radians(0.4)) ** 2,
@@ -734,10 +748,30 @@ def test_a_sphere_is_a_point_where_the_stage_says_so(stage, is_point):
     assert found.kind == ("point" if is_point else "sphere")
 
 
+def test_cones_of_spheres_are_spots(stage):
+    """With the softness of USD, of which Mitsuba's ends and middle are the same."""
+    cone = ["float inputs:shaping:cone:angle = 40", "float inputs:shaping:cone:softness = 0.5"]
+    with pytest.warns(CageWarning, match=r"sphere lights with a cone have a radius of 0, and sharp shadows \(/lamp\)"):
+        scene = msub.usd_scene(stage(CAMERA + light("SphereLight", cone, scale=2) + mesh("square", SQUARE)), mi)
+    lamp = mi.load_dict(scene["lamp"])
+    angles = np.radians([5, 19, 30, 39.99, 45, 135])
+    seen = dr.zeros(mi.SurfaceInteraction3f, len(angles))
+    seen.p = mi.Point3f(2 * np.sin(angles), 0 * angles, 4 - 2 * np.cos(angles))
+    found = np.array(lamp.sample_direction(seen, dr.zeros(mi.Point2f, len(angles)))[1])[0]
+    # A sphere of radius 1 and radiance 1, seen from a distance of 2.
+    np.testing.assert_allclose(found, np.pi / 4 * np.array([1, 1, 0.5, 0, 0, 0]), atol=2e-3)
+
+
+def test_cones_of_other_lights_are_told(stage):
+    cone = ["float inputs:shaping:cone:angle = 40"]
+    with pytest.warns(CageWarning, match=r"inputs:shaping:cone:angle of lights is ignored; .* \(/lamp\)"):
+        msub.usd_scene(stage(CAMERA + light("DiskLight", cone) + mesh("square", SQUARE)), mi)
+
+
 @pytest.mark.parametrize(
     ("schema", "attribute", "is_told"),
     [
-        ("ShapingAPI", "float inputs:shaping:cone:angle = 30", True),
+        ("ShapingAPI", "float inputs:shaping:cone:angle = 30", False),
         # It shines everywhere in its half of the directions, or in all.
         ("ShapingAPI", "float inputs:shaping:cone:angle = 180", False),
         ("ShapingAPI", "float inputs:shaping:focus = 2", True),
@@ -754,6 +788,35 @@ def test_what_lights_cannot_do_is_told(stage, schema, attribute, is_told):
         msub.usd_scene(stage(text + mesh("square", SQUARE)), mi)
     name = attribute.split()[1]
     assert (f"{name} of lights is ignored" in told(record)) == is_told
+
+
+@pytest.mark.parametrize("other", ["DistantLight", "SphereLight", "RectLight", "DomeLight"])
+def test_lamps_cast_no_shadows(stage, other):
+    """Light of another lamp shines through them; both add up in the middle of a plane."""
+    square = mesh("square", SQUARE + "color3f[] primvars:displayColor = [(0.5, 0.5, 0.5)]")
+    near = CAMERA.replace("focalLength = 50", "focalLength = 2000").replace("0, 0, 10", "0, 0, 1.4")
+    lamp = light("SphereLight", ["float inputs:radius = 0.5", "float inputs:intensity = 5"], (0, 0, 2))
+    intensity = ["float inputs:intensity = 10", "bool inputs:normalize = 1"]
+    point = ["bool treatAsPoint = 1"] if other == "SphereLight" else []
+    behind = light(other, ["float inputs:intensity = 1"] if other == "DomeLight" else intensity + point, (0, 0, 6))
+    behind = behind.replace('"lamp"', '"behind"')
+    one, two, both = (
+        rendered(msub.usd_scene(stage(near + text + square), mi, size=(4, 4)), spp=256).mean()
+        for text in (lamp, behind, lamp + behind)
+    )
+    assert both == pytest.approx(one + two, rel=LAMPS_NOISE)
+    assert min(one, two) > 2 * LAMPS_NOISE * both
+
+
+@pytest.mark.parametrize(("place", "is_between"), [((0, 0, 2), True), ((5, 0, 6), False)])
+def test_lamps_are_clear_where_they_are_in_the_way_of_other_lights(stage, place, is_between):
+    """Otherwise the path tracer is faster."""
+    lamps = light("SphereLight", ["float inputs:radius = 0.5"], place) + light("RectLight", [], (0, 0, 6)).replace(
+        '"lamp"', '"other"'
+    )
+    scene = msub.usd_scene(stage(CAMERA + lamps + mesh("square", SQUARE)), mi)
+    assert (scene["integrator"]["type"] == "volpath") == is_between
+    assert ("bsdf" in scene["lamp"]) == is_between
 
 
 def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(stage):

@@ -110,20 +110,22 @@ def absorbs(material: MaterialContents) -> bool:
     return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
 
 
-def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:
-    """An integrator with as long paths as glass needs, and that knows media if there are any.
+def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear_lamps: bool = False) -> SceneNode:
+    """An integrator with as long paths as glass needs, and that knows media and clear surfaces if there are any.
 
-    Roulette ends paths earlier than by default, as most of the long ones carry little.
+    Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
 
     Parameters
     ----------
     materials : list of MaterialContents
     usual : dict
         The integrator of scenes without glass.
+    has_clear_lamps : bool
+        Whether lights shine through the shapes of other lights.
     """
+    kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
     if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):
-        return usual
-    kind = "volpath" if any(map(absorbs, materials)) else usual["type"]
+        return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
 

@@ -180,7 +180,10 @@ class StageScenes:
         else:
             contents, triangles = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
         size = self._look.texture_size
-        made = SceneEntries(contents, notes, parameters, self._surfaces, triangles, needed, size)
+        is_clear = rest is not None and _passes_lamps(rest)
+        made = SceneEntries(
+            contents, notes, parameters, self._surfaces, triangles, needed, size, has_clear_lamps=is_clear
+        )
         notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
@@ -251,6 +254,7 @@ class StageScenes:
                 needed=self._needed,
                 texture_size=self._look.texture_size,
                 loaded=shapes,
+                has_clear_lamps=_passes_lamps(rest),
             )
             notes.warn(self.name, self._warned)
             before = given, seen, load_quietly({**made.scene, **rest, "sensor": seen}, filter_name)
@@ -282,6 +286,11 @@ class StageScenes:
             for file, texels in texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed
+
+
+def _passes_lamps(rest: SceneNode) -> bool:
+    """Whether the integrator sees lights through shapes that are clear."""
+    return bool(rest["integrator"]["type"] == "volpath")
 
 
 def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
