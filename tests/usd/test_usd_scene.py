@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
+import OpenEXR
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
@@ -515,6 +516,30 @@ def test_tiles_of_all_kinds_make_one_picture(tmp_path):
     assert (np.diff(found.pixels[0, :6, 0].astype(float)) >= 0).all()
     np.testing.assert_allclose(found.pixels[:, [0, 5]], np.broadcast_to([[[0], [1]]], (4, 2, 3)), atol=1e-3)
     np.testing.assert_allclose(found.to_uv @ [[0, 3], [0, 1], [1, 1]], [[0, 1], [0, 1], [1, 1]], atol=1e-15)
+
+
+# Red, green, blue and white: of ACEScg, and of XYZ.
+ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
+# White, red, green and blue in Rec. 709: of ACEScg by Bradford's adaptation of its white, as in ACES's own transforms.
+FROM_ACESCG = [[1, 1, 1], [1.70505, -0.13026, -0.024], [-0.62179, 1.1408, -0.12897], [-0.08326, -0.01055, 1.15297]]
+FROM_XYZ = [[1.20498, 0.94829, 0.90862], [3.24097, -0.96924, 0.05563], [-1.53738, 1.87597, -0.20398]]
+FROM_XYZ.append([-0.49861, 0.04156, 1.05697])
+
+
+@pytest.mark.parametrize(("primaries", "expected"), [(ACESCG, FROM_ACESCG), (XYZ, FROM_XYZ)], ids=["ACEScg", "XYZ"])
+@pytest.mark.parametrize("channels", ["RGB", "RGBA"])
+def test_colours_of_files_with_primaries_of_their_own_are_converted(tmp_path, primaries, expected, channels):
+    colors = np.ones((1, 4, len(channels)), np.float32)
+    colors[0, 1:, :3] = np.eye(3)
+    colors[0, :, 3:] = 0.5
+    path = str(tmp_path / "wide.exr")
+    OpenEXR.File({"chromaticities": primaries, "type": OpenEXR.scanlineimage}, {channels: colors}).write(path)
+    found = read_texture_image(path).pixels[0]
+    np.testing.assert_allclose(found[:, :3], expected, atol=2e-4)
+    np.testing.assert_array_equal(found[:, 3:], colors[0, :, 3:])
+    # Data are what the file says.
+    np.testing.assert_allclose(read_texture_image(path, "raw").pixels, colors, atol=1e-6)
 
 
 def test_numbers_come_from_the_channel_that_is_connected(stage, tmp_path):
