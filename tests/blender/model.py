@@ -1,10 +1,13 @@
 """A script for Blender: makes a scene, and tells what Blender's own subdivision of it is.
 
 ``blender -b --python model.py -- MODEL.blend ANSWERS.json``
+
+From Blender 5.0 on, its own exporter writes the scene as well, beside the model: ``own.usda``.
 """
 
 import itertools
 import json
+import os
 import sys
 
 import bpy
@@ -155,6 +158,8 @@ def main(model, answers):
     bpy.ops.wm.open_mainfile(filepath=model)
     with open(answers, "w") as file:
         json.dump({name: subdivided(bpy.data.objects[name]) for name in compared}, file)
+    if bpy.app.version >= (5, 0):
+        bpy.ops.wm.usd_export(filepath=os.path.join(os.path.dirname(model), "own.usda"))
 
 
 if __name__ == "__main__":
