@@ -833,6 +833,12 @@ def test_lamps_cast_no_shadows(stage, other):
     assert min(one, two) > 2 * LAMPS_NOISE * both
 
 
+def test_a_uniform_dome_needs_no_volumetric_path_tracer(stage):
+    """Which is slower."""
+    scene = msub.usd_scene(stage(CAMERA + light("SphereLight", []) + DARK + mesh("square", SQUARE)), mi)
+    assert (scene["integrator"]["type"], scene["lamp"]["bsdf"]["type"]) == ("path", "null")
+
+
 @pytest.mark.parametrize(("place", "is_between"), [((0, 0, 2), True), ((5, 0, 6), False)])
 def test_lamps_are_clear_where_they_are_in_the_way_of_other_lights(stage, place, is_between):
     """Otherwise the path tracer is faster."""

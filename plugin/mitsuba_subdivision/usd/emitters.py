@@ -160,13 +160,18 @@ def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[L
 
 
 def are_lamps_in_the_way(lights: list[LightContents], points: NDArray[np.float64]) -> bool:
-    """Whether shapes of lights may come between points ``(n, 3)`` and other lights, by their bounding spheres."""
+    """Whether shapes of lights may come between points ``(n, 3)`` and other lights, by their bounding spheres.
+
+    A dome without a picture does not count: paths that a BSDF samples find it behind clear shapes.
+    """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = np.linalg.norm(points - middle, axis=1).max()
     for lamp in (each for each in lights if each.kind in _WITH_SHAPES):
         place = lamp.to_world[:3, 3]
         for other in (each for each in lights if each is not lamp):
             if other.kind == "dome":
+                if other.texture is None:
+                    continue
                 return True
             start, start_radius = other.to_world[:3, 3], _bounding_radius(other)
             if other.kind == "distant":

@@ -180,7 +180,7 @@ class StageScenes:
         else:
             contents, triangles = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
         size = self._look.texture_size
-        is_clear = rest is not None and _passes_lamps(rest)
+        is_clear = rest is not None and _has_clear_lamps(contents, rest)
         made = SceneEntries(
             contents, notes, parameters, self._surfaces, triangles, needed, size, has_clear_lamps=is_clear
         )
@@ -254,7 +254,7 @@ class StageScenes:
                 needed=self._needed,
                 texture_size=self._look.texture_size,
                 loaded=shapes,
-                has_clear_lamps=_passes_lamps(rest),
+                has_clear_lamps=_has_clear_lamps(contents, rest),
             )
             notes.warn(self.name, self._warned)
             before = given, seen, load_quietly({**made.scene, **rest, "sensor": seen}, filter_name)
@@ -288,9 +288,9 @@ class StageScenes:
         return needed
 
 
-def _passes_lamps(rest: SceneNode) -> bool:
-    """Whether the integrator sees lights through shapes that are clear."""
-    return bool(rest["integrator"]["type"] == "volpath")
+def _has_clear_lamps(contents: SceneContents, rest: SceneNode) -> bool:
+    """Whether the integrator finds lights behind shapes of other lights that are clear."""
+    return rest["integrator"]["type"] == "volpath" or any(light.kind == "dome" for light in contents.lights)
 
 
 def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
