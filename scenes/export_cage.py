@@ -66,6 +66,7 @@ class Cage:
     face_varying: str = "cornersPlus1"
     creases: list = dataclasses.field(default_factory=list)  # (vertex, vertex, sharpness)
     sharp: list = dataclasses.field(default_factory=list)  # (vertex, sharpness)
+    normals: list = dataclasses.field(default_factory=list)  # (x, y, z) of each face corner, if it is not subdivided
     uvs: dict = dataclasses.field(default_factory=dict)  # name: (values, index of each face corner); "st" is rendered
     materials: list = dataclasses.field(default_factory=list)  # names, or None
     face_materials: list = dataclasses.field(default_factory=list)  # index into materials of each face
@@ -147,6 +148,8 @@ def read_cage(thing, modifier, named):
             cage.face_varying = FACE_VARYING[modifier.uv_smooth]
             if cage.scheme == "catmullClark":
                 set_sharpness(cage, mesh, edges, modifier.use_creases)
+        elif any(values_of(mesh.polygons, "use_smooth", len(sizes), "b", 1)):
+            cage.normals = corner_normals(mesh, len(corners))
         for layer in sorted(mesh.uv_layers, key=lambda layer: not layer.active_render):
             values = values_of(layer.data, "uv", 2 * len(corners))
             joined = joined_uvs(cage, list(zip(values[::2], values[1::2], strict=True)))
@@ -266,9 +269,17 @@ def faces_of(cage):
         corner += size
 
 
-def values_of(items, name, count, code="f"):
-    """An attribute of all items of a collection, as a flat list."""
-    values = array.array(code, bytes(4 * count))
+def corner_normals(mesh, count):
+    """Normals of all face corners."""
+    if bpy.app.version < (4, 1):
+        mesh.calc_normals_split()
+        return triples(values_of(mesh.loops, "normal", 3 * count))
+    return triples(values_of(mesh.corner_normals, "vector", 3 * count))
+
+
+def values_of(items, name, count, code="f", size=4):
+    """An attribute of all items of a collection, as a flat list of numbers of a size in bytes."""
+    values = array.array(code, bytes(size * count))
     items.foreach_get(name, values)
     return list(values)
 
@@ -291,6 +302,12 @@ def cages_of_the_scene():
         if not instance.show_self or thing.type in UNSEEN:
             continue
         name = thing.original.name_full
+        rays = ("camera", "diffuse", "glossy", "transmission", "shadow")
+        unseen = [ray for ray in rays if not getattr(thing, f"visible_{ray}")]
+        if unseen or thing.is_holdout or thing.is_shadow_catcher:
+            special = ["holdout"] * thing.is_holdout + ["shadow catcher"] * thing.is_shadow_catcher
+            kept = ", ".join([f"invisible to {ray} rays" for ray in unseen] + special)
+            warn(f'object "{name}" is like others in the file, but here {kept}')
         if any(system.settings.type == "HAIR" for system in thing.particle_systems):
             hairy.add(f'"{name}"')
         if thing.type != "MESH":
@@ -446,6 +463,8 @@ def usda_mesh(usda, cage, materials):
     if cage.sharp:
         usda.line(f"int[] cornerIndices = {[vertex for vertex, _ in cage.sharp]}")
         usda.line(f"float[] cornerSharpnesses = {[sharpness for _, sharpness in cage.sharp]}")
+    if cage.normals:
+        usda.line(f'normal3f[] normals = {rows(cage.normals)} (interpolation = "faceVarying")')
     for name, (values, indices) in cage.uvs.items():
         usda.line(f'texCoord2f[] primvars:{name} = {rows(values)} (interpolation = "faceVarying")')
         usda.line(f"int[] primvars:{name}:indices = {indices}")
@@ -902,6 +921,7 @@ def usda_light(usda, thing, matrix):
         color = [a * b for a, b in zip(color, emission.inputs["Color"].default_value, strict=False)]
     left = ["its nodes"] * bool(emission and not is_plain)
     left += ["its spread"] * (light.type == "AREA" and light.spread < math.pi - SPREAD_LIMIT)
+    left += ["that it is a portal"] * (light.type == "AREA" and light.cycles.is_portal)
     left += ["the square of its cone"] * (light.type == "SPOT" and light.use_square)
     left += ["its neglect of shadows"] * (not light.use_shadow)
     if left:

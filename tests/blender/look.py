@@ -135,7 +135,8 @@ def tiles(folder):
 def what_is_left_out():
     """A tile behind the camera with all that has no place in the file."""
     tile = Tile()
-    bpy.data.objects[f"tile_{tile.number}"].location = (0, -30, 0)
+    thing = bpy.data.objects[f"tile_{tile.number}"]
+    thing.location, thing.visible_shadow = (0, -30, 0), False
     noise = tile.node("ShaderNodeTexNoise")
     tile.set("Base Color", noise.outputs["Color"])
     ramp = bpy.data.images["ramp.png"]

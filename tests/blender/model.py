@@ -22,6 +22,7 @@ FACES = [*SIDES, *((i, (i + 1) % 5, 14) for i in range(5)), (6, 5, 10, 13, 11), 
 # Of edges, by their vertices, and of vertices.
 EDGE_CREASES = {(0, 1): 1.0, (1, 2): 0.5, (2, 7): 0.3, (5, 10): 0.6, (10, 13): 0.4, (0, 5): 0.2, (8, 9): 0.7}
 VERTEX_CREASES = {4: 0.55, 9: 1.0, 13: 0.3}
+TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 BOUNDARIES = ("ALL", "PRESERVE_CORNERS")
 UV_RULES = (
     "NONE",
@@ -152,6 +153,10 @@ def main(model, answers):
     ground = bpy.data.meshes.new("Ground")
     ground.from_pydata([(-9, -9, -1), (9, -9, -1), (9, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("Ground", ground))
+    smooth = bpy.data.meshes.new("Smooth")
+    smooth.from_pydata([(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)], [], TETRAHEDRON)
+    smooth.polygons.foreach_set("use_smooth", [True] * len(TETRAHEDRON))
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Smooth", smooth))
     dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
     # Versions before 4.0 round creases when they save.

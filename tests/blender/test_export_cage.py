@@ -202,6 +202,19 @@ def test_materials_lights_and_camera_are_usds(scene):
     assert UsdLux.LightAPI(lights["World"]).GetColorAttr().Get() == pytest.approx((0.1, 0.2, 0.3))
 
 
+def test_polygons_with_smooth_shading_have_normals(scene):
+    """Those of a tetrahedron around the origin point away from it."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(scene[1]))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Smooth/Cage"))
+    corners = np.array(mesh.GetPointsAttr().Get())[np.array(mesh.GetFaceVertexIndicesAttr().Get())]
+    np.testing.assert_allclose(mesh.GetNormalsAttr().Get(), corners / np.sqrt(3), atol=1e-3)
+    assert mesh.GetNormalsInterpolation() == "faceVarying"
+    # Facets have none.
+    assert not UsdGeom.Mesh(stage.GetPrimAtPath("/World/Ground/Cage")).GetNormalsAttr().HasAuthoredValue()
+
+
 def bound_color(UsdShade, prim):
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
     shader, _, _ = material.ComputeSurfaceSource()
@@ -267,6 +280,7 @@ def test_what_is_left_out_is_told(look):
         'material "paint_10": the coordinates of "Image Texture" are left out',
         'material "paint_10": the Bump at "Normal" is left out',
         'light "Lamp": left out: its spread',
+        'object "tile_10" is like others in the file, but here invisible to shadow rays',
     ):
         assert told.count(f"export_cage: {what}") == 1, told
     if "Coat IOR" in told:
