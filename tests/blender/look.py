@@ -164,7 +164,7 @@ def what_is_left_out():
     add("Line", curve, (0, -30, 0))
     wire = curve.copy()
     wire.bevel_depth = 0.1
-    add("Wire", wire, (0, -30, 0))
+    add("Wire", wire, (0, -30, 0)).modifiers.new("Subdivision", "SUBSURF").render_levels = 2
 
 
 def sky(folder):

@@ -260,6 +260,13 @@ def test_images_are_beside_the_file_as_they_were(look):
     assert moved.GetInput("wrapS").Get() in ("mirror", "clamp")
 
 
+def test_a_curve_with_a_subdivision_modifier_is_a_cage(look):
+    """With a bevel of 12 sides, of one segment."""
+    cage = msub.ControlCage.from_file(look[1], prim="/World/Wire/Cage")
+    assert cage.contents.scheme == "catmull_clark"
+    assert cage.face_count == 12
+
+
 def test_alpha_is_no_glass(look):
     from pxr import Usd, UsdShade
 
