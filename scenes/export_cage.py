@@ -602,8 +602,7 @@ def usda_material(usda, material, images):
     usda.line('uniform token info:id = "UsdPreviewSurface"')
     if inputs:
         color = tuple(inputs["Base Color"].default_value)[:3]
-        lines = Inputs(material, inputs, path, images, textures)
-        for line in lines.all():
+        for line in Inputs(material, inputs, path, images, textures).all():
             usda.line(line)
     else:
         warn(f'material "{material.name}" has no Principled BSDF at its output; its viewport colour is written')
@@ -626,7 +625,8 @@ class Inputs:
 
     def all(self):
         """Lines of all inputs; what is left out is told."""
-        yield self.color("diffuseColor", "Base Color")
+        color = self.inputs["Base Color"]
+        yield self.line("color3f", "diffuseColor", color, tuple(color.default_value)[:3])
         for name, names in NUMBERS.items():
             socket = next(self.inputs[each] for each in names if each in self.inputs)
             if name in ("clearcoat", "clearcoatRoughness") and not self.has_coat():
@@ -642,11 +642,6 @@ class Inputs:
         """An input with its image, or else its value."""
         connection = self.connection(socket, **texture) if socket.is_linked else None
         return f"{kind} inputs:{name}" + (f".connect = {connection}" if connection else f" = {value!r}")
-
-    def color(self, name, socket_name):
-        """Line of an input that is a colour."""
-        socket = self.inputs[socket_name]
-        return self.line("color3f", name, socket, tuple(socket.default_value)[:3])
 
     def connection(self, socket, **changes):
         """Output of the image texture at an input; None if there is no such, which is told."""
@@ -665,8 +660,7 @@ class Inputs:
         if node.interpolation == "Closest":
             self.tell(f'"{node.name}" is interpolated linearly')
         primvar, transform = self.coordinates(node)
-        texture = Texture(node.image, WRAPS[node.extension], primvar, transform)
-        texture = dataclasses.replace(texture, **changes)
+        texture = Texture(node.image, WRAPS[node.extension], primvar, transform, **changes)
         if texture not in self.textures:
             self.textures.append(texture)
         return f"<{self.path}/Texture_{self.textures.index(texture)}.outputs:{channel}>"
