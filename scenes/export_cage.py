@@ -17,6 +17,7 @@ import argparse
 import array
 import collections
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -41,8 +42,12 @@ FACE_VARYING = {
 OBJ_BOUNDARY = {"edgeAndCorner": 1, "edgeOnly": 2}
 OBJ_FACE_VARYING = {"none": 0, "cornersOnly": 1, "cornersPlus1": 2, "cornersPlus2": 3, "boundaries": 4, "all": 5}
 INFINITE = 10.0  # OpenSubdiv's infinite sharpness.
+SPREAD_LIMIT = 1e-4  # An angle in single precision.
 UV_LIMIT = 1e-4  # Blender joins texture coordinates of a vertex that differ by less.
 TENTHS = 0.01  # Millimetres in tenths of a metre, the unit of a USD camera where the scene's unit is the metre.
+# Types of objects that may be meshes when they are evaluated, and those that a render does not show themselves.
+SURFACES = ("MESH", "CURVE", "FONT", "SURFACE", "META")
+UNSEEN = ("CAMERA", "LIGHT", "EMPTY", "ARMATURE", "LATTICE", "SPEAKER")
 
 
 class ExportError(Exception):
@@ -61,11 +66,13 @@ class Cage:
     face_varying: str = "cornersPlus1"
     creases: list = dataclasses.field(default_factory=list)  # (vertex, vertex, sharpness)
     sharp: list = dataclasses.field(default_factory=list)  # (vertex, sharpness)
+    normals: list = dataclasses.field(default_factory=list)  # (x, y, z) of each face corner, if it is not subdivided
     uvs: dict = dataclasses.field(default_factory=dict)  # name: (values, index of each face corner); "st" is rendered
     materials: list = dataclasses.field(default_factory=list)  # names, or None
     face_materials: list = dataclasses.field(default_factory=list)  # index into materials of each face
 
 
+@functools.cache  # Once.
 def warn(message):
     """Tell what is left out."""
     print(f"export_cage: {message}", file=sys.stderr)
@@ -117,8 +124,11 @@ def take_off_subdivision(thing):
 # Meshes
 
 
-def read_cage(thing, modifier):
-    """The mesh of an evaluated object as a cage, with the rules of its subdivision modifier, if it has one."""
+def read_cage(thing, modifier, named):
+    """The mesh of an evaluated object as a cage, with the rules of its subdivision modifier, if it has one.
+
+    UV maps have their names; the one that is rendered is "st", and has its name as well if that is among ``named``.
+    """
     mesh = thing.to_mesh()
     try:
         points = triples(values_of(mesh.vertices, "co", 3 * len(mesh.vertices)))
@@ -138,16 +148,31 @@ def read_cage(thing, modifier):
             cage.face_varying = FACE_VARYING[modifier.uv_smooth]
             if cage.scheme == "catmullClark":
                 set_sharpness(cage, mesh, edges, modifier.use_creases)
+        elif any(values_of(mesh.polygons, "use_smooth", len(sizes), "b", 1)):
+            cage.normals = corner_normals(mesh, len(corners))
         for layer in sorted(mesh.uv_layers, key=lambda layer: not layer.active_render):
             values = values_of(layer.data, "uv", 2 * len(corners))
-            name = "st" if layer.active_render else identifier(layer.name)
-            while name in cage.uvs:
-                name += "_"
-            cage.uvs[name] = joined_uvs(cage, list(zip(values[::2], values[1::2], strict=True)))
+            joined = joined_uvs(cage, list(zip(values[::2], values[1::2], strict=True)))
+            if layer.active_render:
+                cage.uvs["st"] = joined
+            if not layer.active_render or layer.name in named:
+                cage.uvs[map_name(layer.name)] = joined
         keep_used_vertices(cage, thing.name)
         return cage
     finally:
         thing.to_mesh_clear()
+
+
+def map_name(name):
+    """Name of the primvar of a UV map; "st" is the one that is rendered."""
+    found = identifier(name)
+    return f"{found}_" if found == "st" else found
+
+
+def named_uv_maps():
+    """Names of UV maps that materials ask for."""
+    trees = [material.node_tree for material in bpy.data.materials if material.node_tree]
+    return {getattr(node, "uv_map", "") for tree in trees for node in tree.nodes}
 
 
 def set_sharpness(cage, mesh, edges, use_creases):
@@ -244,9 +269,17 @@ def faces_of(cage):
         corner += size
 
 
-def values_of(items, name, count, code="f"):
-    """An attribute of all items of a collection, as a flat list."""
-    values = array.array(code, bytes(4 * count))
+def corner_normals(mesh, count):
+    """Normals of all face corners."""
+    if bpy.app.version < (4, 1):
+        mesh.calc_normals_split()
+        return triples(values_of(mesh.loops, "normal", 3 * count))
+    return triples(values_of(mesh.corner_normals, "vector", 3 * count))
+
+
+def values_of(items, name, count, code="f", size=4):
+    """An attribute of all items of a collection, as a flat list of numbers of a size in bytes."""
+    values = array.array(code, bytes(size * count))
     items.foreach_get(name, values)
     return list(values)
 
@@ -259,27 +292,43 @@ def triples(values):
 def cages_of_the_scene():
     """All meshes that a render shows: (name, matrix, cage). Equal meshes are one cage."""
     show_what_renders_show()
-    subdivisions = {thing.name_full: take_off_subdivision(thing) for thing in bpy.data.objects if thing.type == "MESH"}
-    shared, of_data, found, left = {}, {}, [], set()
+    subdivisions = {
+        thing.name_full: take_off_subdivision(thing) for thing in bpy.data.objects if thing.type in SURFACES
+    }
+    named = named_uv_maps()
+    shared, of_data, found, left, hairy = {}, {}, [], set(), set()
     for instance in bpy.context.evaluated_depsgraph_get().object_instances:
         thing, matrix = instance.object, instance.matrix_world.copy()
-        if not instance.show_self or thing.type in ("CAMERA", "LIGHT", "EMPTY", "ARMATURE", "LATTICE", "SPEAKER"):
+        if not instance.show_self or thing.type in UNSEEN:
             continue
         name = thing.original.name_full
+        rays = ("camera", "diffuse", "glossy", "transmission", "shadow")
+        unseen = [ray for ray in rays if not getattr(thing, f"visible_{ray}")]
+        if unseen or thing.is_holdout or thing.is_shadow_catcher:
+            special = ["holdout"] * thing.is_holdout + ["shadow catcher"] * thing.is_shadow_catcher
+            kept = ", ".join([f"invisible to {ray} rays" for ray in unseen] + special)
+            warn(f'object "{name}" is like others in the file, but here {kept}')
+        if any(system.settings.type == "HAIR" for system in thing.particle_systems):
+            hairy.add(f'"{name}"')
         if thing.type != "MESH":
-            left.add(f'"{name}" ({thing.type.lower()})')
+            left.add((name, thing.type.lower()))
             continue
         if matrix.to_3x3().determinant() == 0:
             warn(f'object "{name}" is scaled to nothing and left out')
             continue
         key = name, thing.data.as_pointer()
         if key not in of_data:
-            cage = read_cage(thing, subdivisions.get(name))
+            cage = read_cage(thing, subdivisions.get(name), named)
             of_data[key] = shared.setdefault(repr(cage), cage)
         if of_data[key].sizes:
             found.append((name, matrix, of_data[key]))
+    # Curves and texts are there twice, with their mesh if they have one.
+    written = {name for name, _, _ in found}
+    left = [f'"{name}" ({kind})' for name, kind in sorted(left) if name not in written]
     if left:
-        warn(f"objects that are no meshes are left out: {', '.join(sorted(left))}; convert them to meshes in Blender")
+        warn(f"objects that are no meshes are left out: {', '.join(left)}; convert them to meshes in Blender")
+    if hairy:
+        warn(f"hair of particle systems is left out: {', '.join(sorted(hairy))}")
     return found
 
 
@@ -352,12 +401,13 @@ def identifier(name):
     return re.sub(r"^(?=\d|$)", "_", re.sub(r"[^A-Za-z0-9_]", "_", name))
 
 
-def usda_text(found, directory):
-    """The scene as a USD layer; ``directory`` is where it will lie."""
+def usda_text(found, images):
+    """The scene as a USD layer."""
     usda, scene = Usda(), bpy.context.scene
-    usda.lines = ["#usda 1.0", "(", '    defaultPrim = "World"', "    metersPerUnit = 1", '    upAxis = "Z"', ")", ""]
+    usda.lines = ["#usda 1.0", "(", '    defaultPrim = "World"', "    metersPerUnit = 1"]
+    usda.lines += ['    renderSettingsPrimPath = "/Render/Settings"', '    upAxis = "Z"', ")", ""]
     usda.open("Xform", "World")
-    materials = usda_materials(usda, found, directory)
+    materials = usda_materials(usda, found, images)
     prototypes = usda_prototypes(usda, found, materials)
     for name, matrix, cage in found:
         if id(cage) in prototypes:
@@ -368,14 +418,14 @@ def usda_text(found, directory):
             usda.transform(matrix)
             usda_mesh(usda, cage, materials)
         usda.close()
-    if scene.camera:
-        usda_camera(usda, scene)
+    camera = usda_camera(usda, scene) if scene.camera else None
     for instance in bpy.context.evaluated_depsgraph_get().object_instances:
         if instance.object.type == "LIGHT" and instance.show_self:
             usda_light(usda, instance.object, instance.matrix_world)
     if scene.world:
-        usda_world(usda, scene.world)
+        usda_world(usda, scene.world, images)
     usda.close()
+    usda_render_settings(usda, scene.render, camera)
     return "\n".join(usda.lines) + "\n"
 
 
@@ -413,6 +463,8 @@ def usda_mesh(usda, cage, materials):
     if cage.sharp:
         usda.line(f"int[] cornerIndices = {[vertex for vertex, _ in cage.sharp]}")
         usda.line(f"float[] cornerSharpnesses = {[sharpness for _, sharpness in cage.sharp]}")
+    if cage.normals:
+        usda.line(f'normal3f[] normals = {rows(cage.normals)} (interpolation = "faceVarying")')
     for name, (values, indices) in cage.uvs.items():
         usda.line(f'texCoord2f[] primvars:{name} = {rows(values)} (interpolation = "faceVarying")')
         usda.line(f"int[] primvars:{name}:indices = {indices}")
@@ -435,13 +487,99 @@ def usda_mesh(usda, cage, materials):
 # Materials
 
 Material = collections.namedtuple("Material", "path color")
-# Inputs of UsdPreviewSurface that are numbers, and the Principled BSDF's names of them.
-NUMBERS = {"metallic": "Metallic", "roughness": "Roughness", "ior": "IOR", "opacity": "Alpha"}
-# Inputs that make a surface that UsdPreviewSurface cannot be; newer versions append " Weight".
-LOST = ("Transmission", "Subsurface", "Sheen")
+Mapping = collections.namedtuple("Mapping", "location rotation scale")
+# Inputs of UsdPreviewSurface, and the Principled BSDF's names of them.
+NUMBERS = {
+    "metallic": ("Metallic",),
+    "roughness": ("Roughness",),
+    "clearcoat": ("Coat Weight", "Clearcoat"),
+    "clearcoatRoughness": ("Coat Roughness", "Clearcoat Roughness"),
+}
+# Inputs that UsdPreviewSurface lacks, and the values that have no effect; those after the first depend on it.
+LOST = (
+    ("Subsurface Weight", "Subsurface", 0),
+    ("Sheen Weight", "Sheen", 0),
+    ("Anisotropic", "Anisotropic", 0),
+    ("Diffuse Roughness", "Diffuse Roughness", 0),
+    ("Thin Film Thickness", "Thin Film Thickness", 0),
+    ("Specular Tint", "Specular Tint", 1 if bpy.app.version >= (4, 0) else 0),
+)
+LOST_COAT = (("Coat IOR", 1.5), ("Coat Tint", 1))
+WRAPS = {"REPEAT": "repeat", "EXTEND": "clamp", "CLIP": "black", "MIRROR": "mirror"}
 
 
-def usda_materials(usda, found, directory):
+@dataclasses.dataclass(frozen=True)
+class Texture:
+    """An image texture and where it is looked up."""
+
+    image: object
+    wrap: str
+    primvar: str
+    transform: tuple = ()  # Rotation in degrees, scale and translation.
+    scale: tuple = (1.0, 1.0, 1.0, 1.0)
+    bias: tuple = (0.0, 0.0, 0.0, 0.0)
+
+
+class Images:
+    """Files of images, beside the layer.
+
+    Images that are packed into the scene, or that have no file, are written into a folder ``NAME_textures``.
+    """
+
+    def __init__(self, output):
+        self.directory = os.path.dirname(os.path.abspath(output))
+        self.folder = os.path.splitext(os.path.basename(output))[0] + "_textures"
+        self.files = {}
+
+    def file(self, image):
+        """Path of an image from the layer on; "" if it has none, which is told."""
+        if image not in self.files:
+            self.files[image] = self._file(image)
+        return self.files[image]
+
+    def _file(self, image):
+        if image.source not in ("FILE", "GENERATED", "TILED") or (image.source == "TILED" and image.packed_files):
+            warn(f'image "{image.name}" is left out: its source is {image.source.lower()}; expected one file or tiles')
+            return ""
+        if image.packed_file or image.source == "GENERATED":
+            file = self._written(image)
+        else:
+            file = os.path.abspath(bpy.path.abspath(image.filepath, library=image.library))
+            if not os.path.exists(file.replace("<UDIM>", "1001")):
+                warn(f'image "{image.name}": the file {file} is missing')
+        file = os.path.relpath(file, self.directory).replace(os.sep, "/")
+        return file if file.startswith(".") else "./" + file
+
+    def _written(self, image):
+        extension = os.path.splitext(image.filepath)[1].lower() if image.packed_file else ""
+        if not extension:
+            extension = ".exr" if image.is_float else ".png"
+        os.makedirs(os.path.join(self.directory, self.folder), exist_ok=True)
+        name, taken = identifier(os.path.splitext(image.name)[0]), set(self.files.values())
+        while f"./{self.folder}/{name}{extension}" in taken:
+            name += "_"
+        path = os.path.join(self.directory, self.folder, name + extension)
+        if image.packed_file:
+            with open(path, "wb") as file:
+                file.write(image.packed_file.data)
+        else:
+            image.file_format = "OPEN_EXR" if image.is_float else "PNG"
+            image.filepath_raw = path
+            image.save()
+        return path
+
+    def color_space(self, image):
+        """USD's name of a colour space."""
+        space = image.colorspace_settings.name
+        if space not in COLOR_SPACES:
+            warn(f'image "{image.name}": its colour space {space} is taken as linear Rec. 709')
+        return COLOR_SPACES.get(space, "raw")
+
+
+COLOR_SPACES = {"sRGB": "sRGB", "Non-Color": "raw", "Raw": "raw", "Linear": "raw", "Linear Rec.709": "raw"}
+
+
+def usda_materials(usda, found, images):
     """Write the materials that faces have; path and base colour of each by name."""
     cages = {id(cage): cage for _, _, cage in found}.values()
     names = sorted({name for cage in cages for name in cage.materials if name})
@@ -449,47 +587,194 @@ def usda_materials(usda, found, directory):
     if names:
         usda.open("Scope", "Materials")
         for name in names:
-            written[name] = usda_material(usda, bpy.data.materials[name], directory)
+            written[name] = usda_material(usda, bpy.data.materials[name], images)
         usda.close()
     return written
 
 
-def usda_material(usda, material, directory):
+def usda_material(usda, material, images):
     """A Principled BSDF as UsdPreviewSurface."""
     inputs = principled_inputs(material)
     path = usda.open("Material", material.name_full)
     usda.line(f"token outputs:surface.connect = <{path}/Surface.outputs:surface>")
-    color, texture = tuple(material.diffuse_color)[:3], None
+    color, textures = tuple(material.diffuse_color)[:3], []
     usda.open("Shader", "Surface")
     usda.line('uniform token info:id = "UsdPreviewSurface"')
     if inputs:
         color = tuple(inputs["Base Color"].default_value)[:3]
-        texture = base_texture(material, inputs["Base Color"])
-        for name, of in NUMBERS.items():
-            constant(material, inputs[of])
-            usda.line(f"float inputs:{name} = {inputs[of].default_value!r}")
-        emission = inputs.get("Emission Color") or inputs.get("Emission")
-        strength = inputs["Emission Strength"].default_value
-        if constant(material, emission) and strength * max(tuple(emission.default_value)[:3]) > 0:
-            emitted = tuple(strength * channel for channel in tuple(emission.default_value)[:3])
-            usda.line(f"color3f inputs:emissiveColor = {row(emitted)}")
-        for lost in LOST:
-            found = inputs.get(f"{lost} Weight") or inputs.get(lost)
-            if found and (found.is_linked or found.default_value > 0):
-                warn(f'material "{material.name}": {lost} is left out')
+        for line in Inputs(material, inputs, path, images, textures).all():
+            usda.line(line)
     else:
         warn(f'material "{material.name}" has no Principled BSDF at its output; its viewport colour is written')
-        usda.line("float inputs:roughness = 0.5")
-    if texture:
-        usda.line(f"color3f inputs:diffuseColor.connect = <{path}/Texture.outputs:rgb>")
-    else:
         usda.line(f"color3f inputs:diffuseColor = {row(color)}")
+        usda.line("float inputs:roughness = 0.5")
     usda.line("token outputs:surface")
     usda.close()
-    if texture:
-        usda_texture(usda, path, texture, directory)
+    for number, texture in enumerate(textures):
+        usda_texture(usda, path, number, texture, images)
     usda.close()
     return Material(path, color)
+
+
+class Inputs:
+    """Lines of the inputs of a preview surface; image textures that they read are added to ``textures``."""
+
+    def __init__(self, material, inputs, path, images, textures):
+        self.material, self.inputs, self.path = material, inputs, path
+        self.images, self.textures = images, textures
+
+    def all(self):
+        """Lines of all inputs; what is left out is told."""
+        color = self.inputs["Base Color"]
+        yield self.line("color3f", "diffuseColor", color, tuple(color.default_value)[:3])
+        for name, names in NUMBERS.items():
+            socket = next(self.inputs[each] for each in names if each in self.inputs)
+            if name in ("clearcoat", "clearcoatRoughness") and not self.has_coat():
+                continue
+            yield self.line("float", name, socket, socket.default_value)
+        yield from self.opacity()
+        yield f"float inputs:ior = {self.ior()!r}"
+        yield from self.emission()
+        yield from self.normal()
+        self.tell_lost()
+
+    def line(self, kind, name, socket, value, **texture):
+        """An input with its image, or else its value."""
+        connection = self.connection(socket, **texture) if socket.is_linked else None
+        return f"{kind} inputs:{name}" + (f".connect = {connection}" if connection else f" = {value!r}")
+
+    def connection(self, socket, **changes):
+        """Output of the image texture at an input; None if there is no such, which is told."""
+        node, output = origin(socket) or (None, None)
+        channel = "r" if socket.type == "VALUE" else "rgb"
+        if node and node.type in ("SEPARATE_COLOR", "SEPRGB") and getattr(node, "mode", "RGB") == "RGB":
+            channel = output.name[0].lower()
+            node, output = origin(node.inputs[0]) or (None, None)
+        elif output and output.name == "Alpha":
+            channel = "a"
+        if not node or node.type != "TEX_IMAGE" or not node.image or not self.images.file(node.image):
+            self.tell(f'the node at "{socket.name}" is left out')
+            return None
+        if node.projection != "FLAT":
+            self.tell(f'the projection {node.projection.lower()} of "{node.name}" is left out')
+        if node.interpolation == "Closest":
+            self.tell(f'"{node.name}" is interpolated linearly')
+        primvar, transform = self.coordinates(node)
+        texture = Texture(node.image, WRAPS[node.extension], primvar, transform, **changes)
+        if texture not in self.textures:
+            self.textures.append(texture)
+        return f"<{self.path}/Texture_{self.textures.index(texture)}.outputs:{channel}>"
+
+    def coordinates(self, node):
+        """Primvar and transform of the texture coordinates of an image texture."""
+        source, transform = origin(node.inputs["Vector"]), ()
+        if source and source[0].type == "MAPPING":
+            mapping = mapping_of(source[0])
+            if mapping and not any(mapping.rotation[:2]):
+                transform = math.degrees(mapping.rotation.z), tuple(mapping.scale)[:2], tuple(mapping.location)[:2]
+            else:
+                self.tell(f'the mapping "{source[0].name}" is left out')
+            source = origin(source[0].inputs["Vector"])
+        if source is None or (source[0].type == "TEX_COORD" and source[1].name == "UV"):
+            return "st", transform
+        if source[0].type == "UVMAP":
+            return map_name(source[0].uv_map) if source[0].uv_map else "st", transform
+        self.tell(f'the coordinates of "{node.name}" are left out; it has those of the UV map that is rendered')
+        return "st", transform
+
+    def has_coat(self):
+        """Whether there is a coat."""
+        socket = self.inputs.get("Coat Weight") or self.inputs.get("Clearcoat")
+        return socket.is_linked or socket.default_value > 0
+
+    def opacity(self):
+        """Lines of alpha, which leaves holes, and of transmission, which is glass where there are none."""
+        transmission = self.inputs.get("Transmission Weight") or self.inputs["Transmission"]
+        alpha, color = self.inputs["Alpha"], self.inputs["Base Color"]
+        has_holes = alpha.is_linked or alpha.default_value < 1
+        is_glass = not (has_holes or transmission.is_linked) and transmission.default_value > 0
+        if not is_glass and not is_neutral(transmission, 0):
+            self.tell("Transmission is left out")
+        if is_glass and not is_neutral(color, 1):
+            self.tell("the colour of its transmission is left out")
+        yield f'token inputs:opacityMode = "{"transparent" if is_glass else "presence"}"'
+        if is_glass:
+            yield f"float inputs:opacity = {1 - transmission.default_value!r}"
+        else:
+            yield self.line("float", "opacity", alpha, alpha.default_value)
+
+    def ior(self):
+        """Index of refraction that reflects as much head-on as the specular level has it."""
+        socket = self.inputs.get("Specular IOR Level") or self.inputs["Specular"]
+        for each in (socket, self.inputs["IOR"]):
+            if each.is_linked:
+                self.tell(f'the node at "{each.name}" is left out')
+        ior = self.inputs["IOR"].default_value if bpy.app.version >= (4, 0) else 1.5
+        if socket.default_value == 0.5:
+            return ior
+        root = math.sqrt(min(2 * socket.default_value * ((ior - 1) / (ior + 1)) ** 2, 0.99))
+        return (1 + root) / (1 - root) if ior >= 1 else (1 - root) / (1 + root)
+
+    def emission(self):
+        """Lines of what shines."""
+        socket = self.inputs.get("Emission Color") or self.inputs.get("Emission")
+        strength = self.inputs["Emission Strength"]
+        if strength.is_linked:
+            self.tell(f'the node at "{strength.name}" is left out')
+        factor = strength.default_value
+        emitted = tuple(factor * channel for channel in tuple(socket.default_value)[:3])
+        if factor > 0 and (socket.is_linked or max(emitted) > 0):
+            yield self.line("color3f", "emissiveColor", socket, emitted, scale=(factor, factor, factor, 1.0))
+
+    def normal(self):
+        """Line of a normal map in tangent space."""
+        socket = self.inputs["Normal"]
+        node, _ = origin(socket) or (None, None)
+        if not node:
+            return
+        if node.type != "NORMAL_MAP" or node.space != "TANGENT" or node.inputs["Strength"].is_linked:
+            self.tell(f'the {node.bl_label} at "{socket.name}" is left out')
+            return
+        strength = node.inputs["Strength"].default_value
+        # Of the normal, x and y are multiplied by it, and z is mixed with 1.
+        scale = (2 * strength, 2 * strength, 2 * strength, 1.0)
+        bias = (-strength, -strength, 1 - 2 * strength, 0.0)
+        if node.inputs["Color"].is_linked:
+            connection = self.connection(node.inputs["Color"], scale=scale, bias=bias)
+            if connection:
+                yield f"normal3f inputs:normal.connect = {connection}"
+        layers = [mesh.uv_layers.get(node.uv_map) for mesh in bpy.data.meshes]
+        if not all(layer.active_render for layer in layers if layer):
+            self.tell(f'the tangents of the UV map "{node.uv_map}" are left out')
+
+    def tell_lost(self):
+        """Tell inputs that are left out."""
+        for new, old, neutral in LOST:
+            socket = self.inputs.get(new) or self.inputs.get(old)
+            if socket and not is_neutral(socket, neutral):
+                self.tell(f"{new.removesuffix(' Weight')} is left out")
+        if self.has_coat():
+            for name, neutral in LOST_COAT:
+                if name in self.inputs and not is_neutral(self.inputs[name], neutral):
+                    self.tell(f"{name} is left out")
+            normal = self.inputs.get("Coat Normal") or self.inputs.get("Clearcoat Normal")
+            if normal.is_linked:
+                self.tell(f"{normal.name} is left out")
+        output = self.material.node_tree.get_output_node("ALL")
+        for name in ("Displacement", "Volume"):
+            if output.inputs[name].is_linked:
+                self.tell(f"its {name.lower()} is left out")
+
+    def tell(self, what):
+        """Tell what of the material is left out."""
+        warn(f'material "{self.material.name}": {what}')
+
+
+def is_neutral(socket, neutral):
+    """Whether an input has no effect."""
+    value = socket.default_value
+    numbers = [value] if isinstance(value, float) else tuple(value)[:3]
+    return not socket.is_linked and all(number == neutral for number in numbers)
 
 
 def principled_inputs(material):
@@ -502,46 +787,56 @@ def surface_node(owner):
     """The node at the output of a material or a world; None if there is none."""
     uses_nodes = bpy.app.version >= (5, 0) or owner.use_nodes
     output = owner.node_tree.get_output_node("ALL") if uses_nodes and owner.node_tree else None
-    links = output.inputs["Surface"].links if output else ()
-    return links[0].from_node if links else None
+    source = origin(output.inputs["Surface"]) if output else None
+    return source and source[0]
 
 
-def constant(material, socket):
-    """Whether an input is a value. If a node gives it, this is told, and the value that the node hides is written."""
-    if socket.is_linked:
-        warn(f'material "{material.name}": the node at "{socket.name}" is left out')
-    return not socket.is_linked
+def origin(socket):
+    """The node and its output that an input is linked to, through reroutes; None if there is none."""
+    while socket.links and socket.links[0].from_node.type == "REROUTE":
+        socket = socket.links[0].from_node.inputs[0]
+    return (socket.links[0].from_node, socket.links[0].from_socket) if socket.links else None
 
 
-def base_texture(material, socket):
-    """Image of an image texture at an input; None if there is none."""
-    node = socket.links[0].from_node if socket.is_linked else None
-    image = node.image if node and node.type == "TEX_IMAGE" else None
-    if image and image.source == "FILE" and not image.packed_file:
-        return image
-    constant(material, socket)
-    return None
+def mapping_of(node):
+    """Values of a mapping node; None if nodes give them, or they are for other things than points."""
+    sockets = [node.inputs.get(name) for name in ("Location", "Rotation", "Scale")]
+    if node.vector_type != "POINT" or any(socket is None or socket.is_linked for socket in sockets):
+        return None
+    return Mapping(*(socket.default_value.copy() for socket in sockets))
 
 
-def usda_texture(usda, path, image, directory):
-    """The nodes that look up an image by the texture coordinates of the render."""
-    file = os.path.abspath(bpy.path.abspath(image.filepath, library=image.library))
-    if not os.path.exists(file):
-        warn(f'image "{image.name}": the file {file} is missing')
-    file = os.path.relpath(file, directory).replace(os.sep, "/")
-    space = "sRGB" if image.colorspace_settings.name == "sRGB" else "raw"
-    usda.open("Shader", "Texture")
+def usda_texture(usda, path, number, texture, images):
+    """The nodes that look up an image."""
+    coordinates = f"{path}/TexCoords_{number}.outputs:result"
+    if texture.transform:
+        rotation, scale, translation = texture.transform
+        usda.open("Shader", f"Mapping_{number}")
+        usda.line('uniform token info:id = "UsdTransform2d"')
+        usda.line(f"float2 inputs:in.connect = <{coordinates}>")
+        usda.line(f"float inputs:rotation = {rotation!r}")
+        usda.line(f"float2 inputs:scale = {row(scale)}")
+        usda.line(f"float2 inputs:translation = {row(translation)}")
+        usda.line("float2 outputs:result")
+        usda.close()
+        coordinates = f"{path}/Mapping_{number}.outputs:result"
+    usda.open("Shader", f"Texture_{number}")
     usda.line('uniform token info:id = "UsdUVTexture"')
-    usda.line(f"asset inputs:file = @@@{file if file.startswith('.') else './' + file}@@@")
-    usda.line(f'token inputs:sourceColorSpace = "{space}"')
-    usda.line('token inputs:wrapS = "repeat"')
-    usda.line('token inputs:wrapT = "repeat"')
-    usda.line(f"float2 inputs:st.connect = <{path}/TexCoords.outputs:result>")
+    usda.line(f"asset inputs:file = @@@{images.file(texture.image)}@@@")
+    usda.line(f'token inputs:sourceColorSpace = "{images.color_space(texture.image)}"')
+    usda.line(f'token inputs:wrapS = "{texture.wrap}"')
+    usda.line(f'token inputs:wrapT = "{texture.wrap}"')
+    if texture.scale != Texture.scale or texture.bias != Texture.bias:
+        usda.line(f"float4 inputs:scale = {row(texture.scale)}")
+        usda.line(f"float4 inputs:bias = {row(texture.bias)}")
+    usda.line(f"float2 inputs:st.connect = <{coordinates}>")
     usda.line("float3 outputs:rgb")
+    for channel in "rgba":
+        usda.line(f"float outputs:{channel}")
     usda.close()
-    usda.open("Shader", "TexCoords")
+    usda.open("Shader", f"TexCoords_{number}")
     usda.line('uniform token info:id = "UsdPrimvarReader_float2"')
-    usda.line('string inputs:varname = "st"')
+    usda.line(f'string inputs:varname = "{texture.primvar}"')
     usda.line("float2 outputs:result")
     usda.close()
 
@@ -555,7 +850,7 @@ def usda_camera(usda, scene):
     camera, render = thing.data, scene.render
     if camera.type == "PANO":
         warn(f'camera "{thing.name}" is panoramic and left out')
-        return
+        return None
     aspect = render.resolution_x * render.pixel_aspect_x / (render.resolution_y * render.pixel_aspect_y)
     perspective = camera.type == "PERSP"
     fits_height = camera.sensor_fit == "VERTICAL" or (camera.sensor_fit == "AUTO" and aspect < 1)
@@ -563,7 +858,7 @@ def usda_camera(usda, scene):
     if not perspective:
         size = camera.ortho_scale * 10
     width, height = (size * aspect, size) if fits_height else (size, size / aspect)
-    usda.open("Camera", thing.name)
+    path = usda.open("Camera", thing.name)
     usda.transform(thing.matrix_world.normalized())
     usda.line(f'token projection = "{"perspective" if perspective else "orthographic"}"')
     usda.line(f"float focalLength = {camera.lens * TENTHS!r}")
@@ -580,6 +875,22 @@ def usda_camera(usda, scene):
             distance = -towards.dot(thing.matrix_world.to_3x3().normalized().col[2])
         usda.line(f"float focusDistance = {distance!r}")
         usda.line(f"float fStop = {camera.dof.aperture_fstop!r}")
+        if camera.dof.aperture_blades > 2 or camera.dof.aperture_ratio != 1:
+            warn(f'camera "{thing.name}": the aperture is written as a circle')
+    usda.close()
+    return path
+
+
+def usda_render_settings(usda, render, camera):
+    """The resolution of pictures."""
+    usda.open("Scope", "Render")
+    usda.open("RenderSettings", "Settings")
+    if camera:
+        usda.line(f"rel camera = <{camera}>")
+    size = [max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y)]
+    usda.line(f"uniform int2 resolution = {row(size)}")
+    usda.line(f"uniform float pixelAspectRatio = {render.pixel_aspect_x / render.pixel_aspect_y!r}")
+    usda.close()
     usda.close()
 
 
@@ -597,8 +908,23 @@ def usda_light(usda, thing, matrix):
         color = [a * b for a, b in zip(color, light.temperature_color, strict=True)]
     if kind == "RectLight" and light.shape in ("DISK", "ELLIPSE"):
         kind = "DiskLight"
+    emission = surface_node(light) if getattr(light, "use_nodes", False) else None
+    is_plain = emission and emission.type == "EMISSION" and not any(each.is_linked for each in emission.inputs)
+    if is_plain:
+        intensity *= emission.inputs["Strength"].default_value
+        color = [a * b for a, b in zip(color, emission.inputs["Color"].default_value, strict=False)]
+    left = ["its nodes"] * bool(emission and not is_plain)
+    left += ["its spread"] * (light.type == "AREA" and light.spread < math.pi - SPREAD_LIMIT)
+    left += ["that it is a portal"] * (light.type == "AREA" and light.cycles.is_portal)
+    left += ["the square of its cone"] * (light.type == "SPOT" and light.use_square)
+    left += ["its neglect of shadows"] * (not light.use_shadow)
+    if left:
+        warn(f'light "{thing.name}": left out: {", ".join(left)}')
     usda.open(kind, thing.name, ['prepend apiSchemas = ["ShapingAPI"]'] if light.type == "SPOT" else [])
-    usda.transform(matrix)
+    # Other lights are not scaled with their objects; an ellipse is a scaled disk.
+    stretch = light.size_y / light.size if light.type == "AREA" and light.shape == "ELLIPSE" else 1
+    shape = mathutils.Matrix.Diagonal((1, stretch, 1, 1))
+    usda.transform(matrix @ shape if light.type == "AREA" else matrix.normalized())
     usda.line(f"color3f inputs:color = {row(color)}")
     usda.line(f"float inputs:intensity = {intensity!r}")
     usda.line(f"float inputs:exposure = {getattr(light, 'exposure', 0.0)!r}")
@@ -609,11 +935,12 @@ def usda_light(usda, thing, matrix):
         usda.line(f"float inputs:radius = {light.shadow_soft_size!r}")
         usda.line(f"bool treatAsPoint = {int(light.shadow_soft_size == 0)}")
         if light.type == "SPOT":
-            usda.line(f"float inputs:shaping:cone:angle = {math.degrees(light.spot_size) / 2!r}")
-            usda.line(f"float inputs:shaping:cone:softness = {light.spot_blend!r}")
+            # Blender blends by cosines, USD by angles; both ends are the same.
+            half, edge = light.spot_size / 2, math.cos(light.spot_size / 2)
+            inner = math.acos(min(edge + (1 - edge) * light.spot_blend, 1))
+            usda.line(f"float inputs:shaping:cone:angle = {math.degrees(half)!r}")
+            usda.line(f"float inputs:shaping:cone:softness = {1 - inner / half!r}")
     elif kind == "DiskLight":
-        if light.shape == "ELLIPSE":
-            warn(f'light "{thing.name}": the ellipse is written as a disk')
         usda.line(f"float inputs:radius = {light.size / 2!r}")
     else:
         usda.line(f"float inputs:width = {light.size!r}")
@@ -621,19 +948,54 @@ def usda_light(usda, thing, matrix):
     usda.close()
 
 
-def usda_world(usda, world):
-    """The world's background as light from all sides."""
-    color, strength, node = tuple(world.color), 1.0, surface_node(world)
+# From Blender's axes to those of a dome: the middle of an image is at x instead of z, and z is up instead of y.
+DOME = mathutils.Matrix(((0, 0, 1), (1, 0, 0), (0, 1, 0)))
+
+
+def usda_world(usda, world, images):
+    """The world's background as light from all sides: a colour, or an image."""
+    color, strength, node, texture = tuple(world.color), 1.0, surface_node(world), None
+    turn = mathutils.Matrix.Identity(3)
     if node:
-        if node.type != "BACKGROUND" or any(socket.is_linked for socket in node.inputs):
-            warn(f'world "{world.name}" is more than a colour and left out')
+        source = origin(node.inputs["Color"]) if node.type == "BACKGROUND" else None
+        if source and source[0].type == "TEX_ENVIRONMENT":
+            texture = source[0]
+            turn = environment_turn(texture)
+        if node.type != "BACKGROUND" or node.inputs["Strength"].is_linked or (source and (not texture or not turn)):
+            warn(f'world "{world.name}" is more than a colour or an image and left out')
             return
         color, strength = tuple(node.inputs["Color"].default_value)[:3], node.inputs["Strength"].default_value
+    if texture:
+        color, file = (1.0, 1.0, 1.0), images.file(texture.image)
+        if not file:
+            return
+        if (images.color_space(texture.image) == "sRGB") == texture.image.is_float:
+            warn(f'world "{world.name}": its image is taken as sRGB if it has eight bits, and else as linear')
     if strength * max(color) > 0:
         usda.open("DomeLight", world.name)
         usda.line(f"color3f inputs:color = {row(color)}")
         usda.line(f"float inputs:intensity = {strength!r}")
+        if texture:
+            usda.transform((turn @ DOME).to_4x4())
+            usda.line(f"asset inputs:texture:file = @@@{file}@@@")
+            usda.line('token inputs:texture:format = "latlong"')
         usda.close()
+
+
+def environment_turn(node):
+    """Rotation of an environment image; None if its coordinates are others than turned directions."""
+    if node.projection != "EQUIRECTANGULAR" or not node.image or node.image.source not in ("FILE", "GENERATED"):
+        return None
+    source = origin(node.inputs["Vector"])
+    turn = mathutils.Matrix.Identity(3)
+    if source and source[0].type == "MAPPING":
+        mapping = mapping_of(source[0])
+        if not mapping or any(mapping.location) or tuple(mapping.scale) != (1, 1, 1):
+            return None
+        turn = mapping.rotation.to_matrix().inverted()
+        source = origin(source[0].inputs["Vector"])
+    is_direction = not source or (source[0].type == "TEX_COORD" and source[1].name == "Generated")
+    return turn if is_direction else None
 
 
 # OBJ
@@ -698,8 +1060,7 @@ def export(arguments):
         raise ExportError(f'a render shows no mesh of the object "{options.object}"; expected one of {listed}')
     if options.object and extension == ".usda":
         found = [each for each in found if each[0] == options.object]
-    directory = os.path.dirname(os.path.abspath(options.output))
-    text = usda_text(found, directory) if extension == ".usda" else obj_text(found, options.object)
+    text = usda_text(found, Images(options.output)) if extension == ".usda" else obj_text(found, options.object)
     # Beside the file and renamed, so that there is never half of one.
     part = f"{options.output}.part"
     try:

@@ -1,10 +1,13 @@
 """A script for Blender: makes a scene, and tells what Blender's own subdivision of it is.
 
 ``blender -b --python model.py -- MODEL.blend ANSWERS.json``
+
+From Blender 5.0 on, its own exporter writes the scene as well, beside the model: ``own.usda``.
 """
 
 import itertools
 import json
+import os
 import sys
 
 import bpy
@@ -19,6 +22,7 @@ FACES = [*SIDES, *((i, (i + 1) % 5, 14) for i in range(5)), (6, 5, 10, 13, 11), 
 # Of edges, by their vertices, and of vertices.
 EDGE_CREASES = {(0, 1): 1.0, (1, 2): 0.5, (2, 7): 0.3, (5, 10): 0.6, (10, 13): 0.4, (0, 5): 0.2, (8, 9): 0.7}
 VERTEX_CREASES = {4: 0.55, 9: 1.0, 13: 0.3}
+TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 BOUNDARIES = ("ALL", "PRESERVE_CORNERS")
 UV_RULES = (
     "NONE",
@@ -149,12 +153,18 @@ def main(model, answers):
     ground = bpy.data.meshes.new("Ground")
     ground.from_pydata([(-9, -9, -1), (9, -9, -1), (9, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
     bpy.context.scene.collection.objects.link(bpy.data.objects.new("Ground", ground))
+    smooth = bpy.data.meshes.new("Smooth")
+    smooth.from_pydata([(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)], [], TETRAHEDRON)
+    smooth.polygons.foreach_set("use_smooth", [True] * len(TETRAHEDRON))
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Smooth", smooth))
     dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
     # Versions before 4.0 round creases when they save.
     bpy.ops.wm.open_mainfile(filepath=model)
     with open(answers, "w") as file:
         json.dump({name: subdivided(bpy.data.objects[name]) for name in compared}, file)
+    if bpy.app.version >= (5, 0):
+        bpy.ops.wm.usd_export(filepath=os.path.join(os.path.dirname(model), "own.usda"))
 
 
 if __name__ == "__main__":

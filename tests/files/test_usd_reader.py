@@ -135,6 +135,26 @@ def test_face_varying_texture_coordinates_keep_their_indices(read):
     assert cage.texcoords.indices.tolist() == [0, 1, 4, 3, 1, 2, 2, 4]
 
 
+@pytest.mark.parametrize(("end", "shared"), [(1.0, True), (0.25, False)], ids=["one island", "mirrored"])
+def test_equal_texture_coordinates_without_indices_are_shared(read, end, shared):
+    """Where the winding of both faces is the same, as in Blender."""
+    first, second = [(0, 0), (0.5, 0), (0.5, 1), (0, 1)], [(0.5, 0), (end, 0), (end, 1), (0.5, 1)]
+    cage = read(f'texCoord2f[] primvars:st = {first + second} (interpolation = "faceVarying")')
+    np.testing.assert_array_equal(cage.texcoords.values[cage.texcoords.indices], first + second)
+    index = cage.texcoords.indices
+    assert len(cage.texcoords.values) == len(set(index.tolist())) == (6 if shared else 8)
+    assert [index[1] == index[4], index[2] == index[7]] == [shared, shared]
+
+
+def test_corners_of_other_vertices_share_no_value(read):
+    """Though they are equal."""
+    cage = read('float[] primvars:a = [1, 1, 1, 1, 1, 1, 2, 1] (interpolation = "faceVarying")')
+    assert cage.attributes["a"].values.ravel().tolist() == [1, 1, 1, 1, 1, 2]
+    index = cage.attributes["a"].indices.tolist()
+    assert (index[1], index[2]) == (index[4], index[7])
+    assert len(set(index)) == 6
+
+
 def test_names_of_texture_coordinates(read):
     other, uv_map, st = (UV.format(name, name) for name in ("zzz", "UVMap", "st"))
     assert list(read(other + uv_map + st).attributes) == ["UVMap", "zzz"]

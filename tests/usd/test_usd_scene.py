@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
+import OpenEXR
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
@@ -42,6 +43,8 @@ CAMERA = """def Camera "camera" {
 """
 # The largest light is 5 units wide at a distance of 7: what its sides send comes from farther away, and at an angle.
 AREA_LIGHT = 0.15
+# Of 256 samples in 16 pixels.
+LAMPS_NOISE = 0.02
 DARK = 'def DomeLight "dome" { float inputs:intensity = 0 }\n'
 
 
@@ -730,6 +733,30 @@ def test_tiles_of_all_kinds_make_one_picture(tmp_path):
     np.testing.assert_allclose(found.to_uv @ [[0, 3], [0, 1], [1, 1]], [[0, 1], [0, 1], [1, 1]], atol=1e-15)
 
 
+# Red, green, blue and white: of ACEScg, and of XYZ.
+ACESCG = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
+# White, red, green and blue in Rec. 709: of ACEScg by Bradford's adaptation of its white, as in ACES's own transforms.
+FROM_ACESCG = [[1, 1, 1], [1.70505, -0.13026, -0.024], [-0.62179, 1.1408, -0.12897], [-0.08326, -0.01055, 1.15297]]
+FROM_XYZ = [[1.20498, 0.94829, 0.90862], [3.24097, -0.96924, 0.05563], [-1.53738, 1.87597, -0.20398]]
+FROM_XYZ.append([-0.49861, 0.04156, 1.05697])
+
+
+@pytest.mark.parametrize(("primaries", "expected"), [(ACESCG, FROM_ACESCG), (XYZ, FROM_XYZ)], ids=["ACEScg", "XYZ"])
+@pytest.mark.parametrize("channels", ["RGB", "RGBA"])
+def test_colours_of_files_with_primaries_of_their_own_are_converted(tmp_path, primaries, expected, channels):
+    colors = np.ones((1, 4, len(channels)), np.float32)
+    colors[0, 1:, :3] = np.eye(3)
+    colors[0, :, 3:] = 0.5
+    path = str(tmp_path / "wide.exr")
+    OpenEXR.File({"chromaticities": primaries, "type": OpenEXR.scanlineimage}, {channels: colors}).write(path)
+    found = read_texture_image(path).pixels[0]
+    np.testing.assert_allclose(found[:, :3], expected, atol=2e-4)
+    np.testing.assert_array_equal(found[:, 3:], colors[0, :, 3:])
+    # Data are what the file says.
+    np.testing.assert_allclose(read_texture_image(path, "raw").pixels, colors, atol=1e-6)
+
+
 def test_numbers_come_from_the_channel_that_is_connected(stage, tmp_path):
     """Linear alpha, and a colour's channel as it is decoded."""
     mi.Bitmap(np.full((2, 2, 4), [128, 64, 0, 51], np.uint8)).write(str(tmp_path / "four.png"))
@@ -911,6 +938,42 @@ def test_normal_maps_turn_the_normal(stage, tmp_path):
     assert 2.5 < found[36.87] / found[-36.87] < 1 / 0.28
 
 
+# Radiance of a plane in a white environment of radiance 1, by Cycles of Blender 5.0.1: a Diffuse BSDF of 0.8, and a
+# Principled BSDF of 0.8, metallic, of roughness 0.5. The view is 20 degrees above the plane.
+OF_CYCLES = {
+    ("diffuse", (0.0, -0.6, 0.8)): 0.659,
+    ("diffuse", (0.0, 0.6, 0.8)): 0.659,
+    ("diffuse", (0.6, 0.0, 0.8)): 0.659,
+    ("metal", (0.0, -0.6, 0.8)): 0.772,
+    ("metal", (0.0, 0.6, 0.8)): 0.743,
+    ("metal", (0.6, 0.0, 0.8)): 0.714,
+}
+# Noise of diffuse surfaces. Cycles turns normals of metals towards the viewer, and adds what they scatter between their
+# facets.
+CYCLES_TOLERANCE = {"diffuse": 0.005, "metal": 0.12}
+
+
+@pytest.mark.parametrize(("kind", "normal"), OF_CYCLES)
+def test_planes_with_normal_maps_are_as_bright_as_in_cycles(stage, tmp_path, kind, normal):
+    """Also where the normal faces away from the viewer."""
+    texels = np.broadcast_to(np.round((np.array(normal) + 1) / 2 * 255), (2, 2, 3)).astype(np.uint8)
+    mi.Bitmap(texels).write(str(tmp_path / "n.png"))
+    inputs = f"""normal3f inputs:normal.connect = </paint/texture.outputs:rgb>
+        color3f inputs:diffuseColor = (0.8, 0.8, 0.8)
+        int inputs:useSpecularWorkflow = {int(kind == "diffuse")}
+        float inputs:metallic = {int(kind == "metal")}
+        float inputs:roughness = 0.5"""
+    space = "float4 inputs:scale = (2, 2, 2, 1)\nfloat4 inputs:bias = (-1, -1, -1, 0)"
+    # The aperture shows the middle of the square.
+    view = CAMERA.replace("(0, 0, 10)", "(0, 0, 10)\nfloat xformOp:rotateX = 70")
+    view = view.replace("Aperture = 10", "Aperture = 1").replace(
+        '["xformOp:translate"]', '["xformOp:rotateX", "xformOp:translate"]'
+    )
+    text = view + 'def DomeLight "dome" {}\n' + material(inputs, texture("n.png", "raw", space))
+    found = rendered(msub.usd_scene(stage(text + mesh("square", SQUARE + BOUND)), mi, size=(8, 8)), spp=1024)
+    assert found.mean() == pytest.approx(OF_CYCLES[kind, normal], abs=CYCLES_TOLERANCE[kind])
+
+
 def light(kind, attributes, place=(0, 0, 4), scale=1.0):
     lines = "\n".join(f"        {each}" for each in attributes)
     return f"""def {kind} "lamp" {{
@@ -960,6 +1023,18 @@ LIGHTS = {
         light("SphereLight", ["bool treatAsPoint = 1", "bool inputs:normalize = 1", "float inputs:intensity = 100"]),
         25 / 16,
     ),
+    "spot": (
+        light(
+            "SphereLight",
+            [
+                "bool treatAsPoint = 1",
+                "bool inputs:normalize = 1",
+                "float inputs:intensity = 100",
+                "float inputs:shaping:cone:angle = 30",
+            ],
+        ),
+        25 / 16,
+    ),
     "distant": (
         light("DistantLight", ["float inputs:angle = 0.8", "float inputs:intensity = 50000"]),
         50000 * np.pi * np.sin(np.radians(0.4)) ** 2,
@@ -998,10 +1073,30 @@ def test_a_sphere_is_a_point_where_the_stage_says_so(stage, is_point):
     assert found.kind == ("point" if is_point else "sphere")
 
 
+def test_cones_of_spheres_are_spots(stage):
+    """With the softness of USD, of which Mitsuba's ends and middle are the same."""
+    cone = ["float inputs:shaping:cone:angle = 40", "float inputs:shaping:cone:softness = 0.5"]
+    with pytest.warns(CageWarning, match=r"sphere lights with a cone have a radius of 0, and sharp shadows \(/lamp\)"):
+        scene = msub.usd_scene(stage(CAMERA + light("SphereLight", cone, scale=2) + mesh("square", SQUARE)), mi)
+    lamp = mi.load_dict(scene["lamp"])
+    angles = np.radians([5, 19, 30, 39.99, 45, 135])
+    seen = dr.zeros(mi.SurfaceInteraction3f, len(angles))
+    seen.p = mi.Point3f(2 * np.sin(angles), 0 * angles, 4 - 2 * np.cos(angles))
+    found = np.array(lamp.sample_direction(seen, dr.zeros(mi.Point2f, len(angles)))[1])[0]
+    # A sphere of radius 1 and radiance 1, seen from a distance of 2.
+    np.testing.assert_allclose(found, np.pi / 4 * np.array([1, 1, 0.5, 0, 0, 0]), atol=2e-3)
+
+
+def test_cones_of_other_lights_are_told(stage):
+    cone = ["float inputs:shaping:cone:angle = 40"]
+    with pytest.warns(CageWarning, match=r"inputs:shaping:cone:angle of lights is ignored; .* \(/lamp\)"):
+        msub.usd_scene(stage(CAMERA + light("DiskLight", cone) + mesh("square", SQUARE)), mi)
+
+
 @pytest.mark.parametrize(
     ("schema", "attribute", "is_told"),
     [
-        ("ShapingAPI", "float inputs:shaping:cone:angle = 30", True),
+        ("ShapingAPI", "float inputs:shaping:cone:angle = 30", False),
         # It shines everywhere in its half of the directions, or in all.
         ("ShapingAPI", "float inputs:shaping:cone:angle = 180", False),
         ("ShapingAPI", "float inputs:shaping:focus = 2", True),
@@ -1018,6 +1113,41 @@ def test_what_lights_cannot_do_is_told(stage, schema, attribute, is_told):
         msub.usd_scene(stage(text + mesh("square", SQUARE)), mi)
     name = attribute.split()[1]
     assert (f"{name} of lights is ignored" in told(record)) == is_told
+
+
+@pytest.mark.parametrize("other", ["DistantLight", "SphereLight", "RectLight", "DomeLight"])
+def test_lamps_cast_no_shadows(stage, other):
+    """Light of another lamp shines through them; both add up in the middle of a plane."""
+    square = mesh("square", SQUARE + "color3f[] primvars:displayColor = [(0.5, 0.5, 0.5)]")
+    near = CAMERA.replace("focalLength = 50", "focalLength = 2000").replace("0, 0, 10", "0, 0, 1.4")
+    lamp = light("SphereLight", ["float inputs:radius = 0.5", "float inputs:intensity = 5"], (0, 0, 2))
+    intensity = ["float inputs:intensity = 10", "bool inputs:normalize = 1"]
+    point = ["bool treatAsPoint = 1"] if other == "SphereLight" else []
+    behind = light(other, ["float inputs:intensity = 1"] if other == "DomeLight" else intensity + point, (0, 0, 6))
+    behind = behind.replace('"lamp"', '"behind"')
+    one, two, both = (
+        rendered(msub.usd_scene(stage(near + text + square), mi, size=(4, 4)), spp=256).mean()
+        for text in (lamp, behind, lamp + behind)
+    )
+    assert both == pytest.approx(one + two, rel=LAMPS_NOISE)
+    assert min(one, two) > 2 * LAMPS_NOISE * both
+
+
+def test_a_uniform_dome_needs_no_volumetric_path_tracer(stage):
+    """Which is slower."""
+    scene = msub.usd_scene(stage(CAMERA + light("SphereLight", []) + DARK + mesh("square", SQUARE)), mi)
+    assert (scene["integrator"]["type"], scene["lamp"]["bsdf"]["type"]) == ("path", "null")
+
+
+@pytest.mark.parametrize(("place", "is_between"), [((0, 0, 2), True), ((5, 0, 6), False)])
+def test_lamps_are_clear_where_they_are_in_the_way_of_other_lights(stage, place, is_between):
+    """Otherwise the path tracer is faster."""
+    lamps = light("SphereLight", ["float inputs:radius = 0.5"], place) + light("RectLight", [], (0, 0, 6)).replace(
+        '"lamp"', '"other"'
+    )
+    scene = msub.usd_scene(stage(CAMERA + lamps + mesh("square", SQUARE)), mi)
+    assert (scene["integrator"]["type"] == "volpath") == is_between
+    assert ("bsdf" in scene["lamp"]) == is_between
 
 
 def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(stage):
@@ -1064,8 +1194,9 @@ def test_domes_turn_their_picture_as_usd_does(stage, tmp_path):
             assert value.max() > 0.5
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
+@pytest.mark.parametrize("projection", ["perspective", "orthographic", "thin lens"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_points_are_projected_as_by_the_camera_of_usd(stage, projection, sign):
     from pxr import Usd, UsdGeom
 
     path = stage(
@@ -1073,12 +1204,14 @@ def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
         float3 xformOp:scale = (2, 2, 2)
         uniform token[] xformOpOrder = ["xformOp:scale"]
         def Camera "camera" {{
-            token projection = "{projection}"
+            token projection = "{projection.replace("thin lens", "perspective")}"
+            float fStop = {2 * (projection == "thin lens")}
+            float focusDistance = 5
             float focalLength = 35
             float horizontalAperture = 30
             float verticalAperture = 20
-            float horizontalApertureOffset = 4
-            float verticalApertureOffset = -3
+            float horizontalApertureOffset = {3.75 * sign}
+            float verticalApertureOffset = {-3 * sign}
             float2 clippingRange = (0.1, 1000)
             float3 xformOp:rotateXYZ = (30, 20, 10)
             double3 xformOp:translate = (1, 2, 6)
@@ -1088,9 +1221,8 @@ def test_points_are_projected_as_by_the_camera_of_usd(stage, projection):
         + mesh("cube", CUBE)
     )
     scene = msub.usd_scene(path, mi, spp=4)
-    film = scene["sensor"]["film"]
-    assert (film["width"], film["height"]) == (640, 427)
     sensor = mi.load_dict(scene["sensor"])
+    assert tuple(sensor.film().crop_size()) == (640, 427)
     usd_stage = Usd.Stage.Open(str(path))
     frustum = UsdGeom.Camera(usd_stage.GetPrimAtPath("/dolly/camera")).GetCamera(Usd.TimeCode(0)).frustum
     to_world = np.array((frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()).GetInverse())

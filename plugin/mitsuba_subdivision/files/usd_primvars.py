@@ -145,6 +145,31 @@ def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
     return array.astype(np.float64).reshape(-1, width) if array.size % width == 0 else None
 
 
+def with_shared_values(
+    values: NDArray[np.float64], sizes: IntArray, vertices: IntArray
+) -> tuple[NDArray[np.float64], IntArray | None]:
+    """Distinct values and the index of each face corner, where corners of a vertex share equal values.
+
+    As in Blender, pairs of numbers are only shared by faces that have the same winding in their plane: a mirrored half
+    of a texture is an island of its own. Without as many values as corners, they are returned as they are.
+    """
+    if len(values) != len(vertices) or sizes.sum() != len(vertices) or not sizes.all():
+        return values, None
+    keys = [vertices, *(values + 0.0).T]
+    if values.shape[1] == 2:
+        starts = np.cumsum(sizes) - sizes
+        after = np.arange(1, len(vertices) + 1)
+        after[starts + sizes - 1] = starts
+        (u, v), (next_u, next_v) = values.T, values[after].T
+        keys.append(np.repeat(np.add.reduceat(u * next_v - v * next_u, starts) > 0, sizes))
+    order = np.lexsort(keys)
+    is_first = np.ones(len(order), dtype=bool)
+    is_first[1:] = np.any([key[order[1:]] != key[order[:-1]] for key in keys], axis=0)
+    indices = np.empty(len(order), dtype=np.int64)
+    indices[order] = np.cumsum(is_first) - 1
+    return values[order[is_first]], indices
+
+
 def _read(
     reader: AttributeReader,
     mesh: UsdGeom.Mesh,
@@ -165,7 +190,11 @@ def _read(
             raise CageError(f"{where} has {len(faces)} values or indices; expected {len(sizes)}, one per face")
         attribute = Attribute(values, "face_varying", np.repeat(faces, sizes))
     else:
-        attribute = _attribute(values, INTERPOLATIONS[primvar.GetInterpolation()], indices, order, where)
+        interpolation = INTERPOLATIONS[primvar.GetInterpolation()]
+        if indices is None and interpolation == "face_varying":
+            corners = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
+            values, indices = with_shared_values(values, *(reader.array(each, np.int64) for each in corners))
+        attribute = _attribute(values, interpolation, indices, order, where)
     if topology is None:
         return attribute
     return attribute.validated(primvar.GetPrimvarName(), topology, CageSource(reader.location), width)

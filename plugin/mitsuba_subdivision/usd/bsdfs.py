@@ -110,20 +110,22 @@ def absorbs(material: MaterialContents) -> bool:
     return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
 
 
-def integrator(materials: list[MaterialContents], usual: SceneNode) -> SceneNode:
-    """An integrator with as long paths as glass needs, and that knows media if there are any.
+def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear_lamps: bool = False) -> SceneNode:
+    """An integrator with as long paths as glass needs, and that knows media and clear surfaces if there are any.
 
-    Roulette ends paths earlier than by default, as most of the long ones carry little.
+    Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
 
     Parameters
     ----------
     materials : list of MaterialContents
     usual : dict
         The integrator of scenes without glass.
+    has_clear_lamps : bool
+        Whether lights shine through the shapes of other lights.
     """
+    kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
     if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):
-        return usual
-    kind = "volpath" if any(map(absorbs, materials)) else usual["type"]
+        return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
 
@@ -202,26 +204,30 @@ class _Surface:
         if is_constant(weight) and _first(weight) <= 0:
             found = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
-            found = self._turned(self._glass())
+            found = self._turned(self._glass(), is_diffuse=False)
         else:
             found = {
                 "type": "blendbsdf",
                 "weight": self._values.number(weight),
                 "bsdf_0": self._opaque(),
-                "bsdf_1": self._turned(self._glass()),
+                "bsdf_1": self._turned(self._glass(), is_diffuse=False),
             }
         return _masked(found, self._values.number(self._inputs["opacity"]))
 
-    def _turned(self, bsdf: SceneNode) -> SceneNode:
-        """A BSDF with the normal map, if there is one."""
+    def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
+        """A BSDF with the normal map, if there is one.
+
+        Normals that face away from the viewer are flipped, which leaves no black patches. Cycles has the shadowing
+        function for diffuse lobes only.
+        """
         normals = self._values.normals(self._inputs.get("normal", 0.0))
         if normals is None:
             return bsdf
         return {
             "type": "normalmap",
             "normalmap": normals,
-            "use_shadowing_function": False,
-            "flip_invalid_normals": False,
+            "use_shadowing_function": is_diffuse,
+            "flip_invalid_normals": True,
             "bsdf": bsdf,
         }
 
@@ -231,7 +237,7 @@ class _Surface:
             return self._turned(self._sheet(0.0))
         is_bare = self._is("coat", 0) and self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
-            return _both_sides(self._turned(self._metal()))
+            return _both_sides(self._turned(self._metal(), is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
             diffuse = {"type": "diffuse", "reflectance": self._values.color(self._inputs["base_color"])}
             return _both_sides(self._turned(diffuse))

@@ -192,14 +192,15 @@ class LightContents:
     name : str
         Path of the prim.
     kind : str
-        "distant", "rect", "disk", "sphere", "point", "cylinder" or "dome".
+        "distant", "rect", "disk", "sphere", "point", "spot", "cylinder" or "dome".
     to_world : (4, 4) float64
     emission : list of 3 floats
         Colour times intensity.
     is_normalized : bool
         Whether the emission is that of the whole light: its area does not change its power.
     size : list of floats
-        Angle in degrees, width and height, radius, or length and radius.
+        Angle in degrees, width and height, radius, or length and radius. Of a spot, its radius, and the angle and the
+        softness of its cone.
     texture : str or None
         Path of a picture that multiplies the radiance.
     pole : "y", "z" or "scene"
@@ -219,7 +220,7 @@ class LightContents:
     def is_usable(self) -> bool:
         """Whether its transform and size are finite and not degenerate."""
         numbers = np.array([*self.emission, *self.size, *self.to_world.ravel()])
-        has_size = self.kind in ("distant", "dome", "point") or min(self.size) > 0
+        has_size = self.kind in ("distant", "dome", "point", "spot") or min(self.size) > 0
         return bool(np.isfinite(numbers).all()) and np.linalg.det(self.to_world[:3, :3]) != 0 and has_size
 
 

@@ -19,6 +19,9 @@ from .textures import Textures
 _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 # From a light that emits along z, as Mitsuba's, to one that emits along -z with the same y.
 _TURNED = np.diag([-1.0, 1, -1, 1])
+# Mitsuba divides by the width of the edge of a cone.
+_LEAST_SOFTNESS = 1e-3
+_WITH_SHAPES = ("rect", "disk", "sphere", "cylinder")
 
 
 def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
@@ -94,6 +97,18 @@ def _point(light: LightContents, *_others: object) -> SceneNode:
     return {"type": "point", "position": light.to_world[:3, 3].tolist(), "intensity": rgb(intensity)}
 
 
+def _spot(light: LightContents, *others: object) -> SceneNode:
+    _, angle, softness = light.size
+    place, forward = light.to_world[:3, 3], -light.to_world[:3, 2]
+    return {
+        "type": "spot",
+        "to_world": mi.ScalarTransform4f().look_at(place, place + forward, light.to_world[:3, 1]),
+        "intensity": _point(light, *others)["intensity"],
+        "cutoff_angle": angle,
+        "beam_width": angle * (1 - np.clip(softness, _LEAST_SOFTNESS, 1)),
+    }
+
+
 def _cylinder(light: LightContents, *_others: object) -> SceneNode:
     length = light.size[0]
     radius = light.size[1] * math.sqrt(_stretch(light.to_world, 1, 2))
@@ -126,6 +141,7 @@ _MAKERS: dict[str, Callable[[LightContents, str, Textures], SceneNode]] = {
     "disk": _disk,
     "sphere": _sphere,
     "point": _point,
+    "spot": _spot,
     "cylinder": _cylinder,
     "dome": _dome,
 }
@@ -141,6 +157,37 @@ def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[L
     for light in left:
         notes.add("further dome lights are ignored; a scene of Mitsuba has one environment", light.name)
     return [light for light in lights if light not in left]
+
+
+def are_lamps_in_the_way(lights: list[LightContents], points: NDArray[np.float64]) -> bool:
+    """Whether shapes of lights may come between points ``(n, 3)`` and other lights, by their bounding spheres.
+
+    A dome without a picture does not count: paths that a BSDF samples find it behind clear shapes.
+    """
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = np.linalg.norm(points - middle, axis=1).max()
+    for lamp in (each for each in lights if each.kind in _WITH_SHAPES):
+        place = lamp.to_world[:3, 3]
+        for other in (each for each in lights if each is not lamp):
+            if other.kind == "dome":
+                if other.texture is None:
+                    continue
+                return True
+            start, start_radius = other.to_world[:3, 3], _bounding_radius(other)
+            if other.kind == "distant":
+                towards = other.to_world[:3, 2] / np.linalg.norm(other.to_world[:3, 2])
+                start, start_radius = middle + towards * (radius + np.linalg.norm(place - middle)), radius
+            # The cone around the other light and the points, at the place along its axis that is next to the lamp.
+            axis = middle - start
+            along = np.clip((place - start) @ axis / max(axis @ axis, 1e-30), 0, 1)
+            cone_radius = start_radius + along * (radius - start_radius)
+            if np.linalg.norm(place - start - along * axis) < cone_radius + _bounding_radius(lamp):
+                return True
+    return False
+
+
+def _bounding_radius(light: LightContents) -> float:
+    return float(np.linalg.norm(light.to_world[:3, :3], 2) * np.linalg.norm(light.size))
 
 
 def _radiance(light: LightContents, area: float) -> NDArray[np.float64]:

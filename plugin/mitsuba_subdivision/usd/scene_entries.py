@@ -46,6 +46,8 @@ class SceneEntries:
         Pixels along the sides of textures of materials at most.
     loaded : LoadedShapes, optional
         If given, its objects are used as shapes.
+    has_clear_lamps : bool
+        Whether shapes of lights let light through, which takes the integrator ``volpath``.
 
     Attributes
     ----------
@@ -62,6 +64,7 @@ class SceneEntries:
         needed: Mapping[str, float] | None = None,
         texture_size: int | None = None,
         loaded: LoadedShapes | None = None,
+        has_clear_lamps: bool = False,
     ) -> None:
         self._contents = contents
         self._notes = notes
@@ -71,6 +74,7 @@ class SceneEntries:
         self._surfaces = surfaces
         self._triangles = triangles or {}
         self._loaded = loaded
+        self._has_clear_lamps = has_clear_lamps
         # Entries of BSDFs that are the same for all shapes, by material.
         self._shared: dict[int, str] = {}
         self.scene: SceneNode = {"type": "scene"}
@@ -95,7 +99,9 @@ class SceneEntries:
             if group is not None:
                 self._add(each.name, self._instance(group, each.to_world))
         for light in one_environment(contents.lights, self._notes):
-            self._add(light.name, emitter(light, contents.up, self._textures))
+            entry = emitter(light, contents.up, self._textures)
+            is_clear = self._has_clear_lamps and "emitter" in entry
+            self._add(light.name, {**entry, "bsdf": {"type": "null"}} if is_clear else entry)
 
     def _add(self, name: str, entry: Any) -> str:
         """Add an entry with the name of a prim, and return its key."""

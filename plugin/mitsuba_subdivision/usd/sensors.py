@@ -34,7 +34,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
     near = max(camera.near, _LEAST_NEAR)
     if camera.shutter[0] < camera.shutter[1]:
         notes.add(NO_BLUR, camera.name)
-    common = {
+    common: SceneNode = {
         "near_clip": near,
         "far_clip": max(camera.far, 2 * near),
         "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"},
@@ -45,19 +45,28 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
         matrix[:3, 3] += matrix[:3, :2] @ camera.offset
         matrix = matrix @ np.diag([-wide / 2, wide / 2, -1, 1])
         return {"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix.tolist()), **common}
-    common |= {
-        "to_world": mi.ScalarTransform4f(matrix.tolist()),
-        "fov": math.degrees(2 * math.atan(wide / (2 * camera.focal_length))),
-        "fov_axis": "x",
-    }
+    common["to_world"] = mi.ScalarTransform4f(matrix.tolist())
     if camera.lens_radius > 0:
-        if any(camera.offset):
-            notes.add("aperture offsets of cameras with depth of field are ignored", camera.name)
+        # A thin lens has no principal point: the film is a window of a larger one, whose middle is on the axis.
+        halves = [
+            round(2 * size * camera.offset[axis] / (wide, high)[axis]) for axis, size in enumerate((width, height))
+        ]
+        full = width + abs(halves[0]), height + abs(halves[1])
+        window = {
+            "width": full[0],
+            "height": full[1],
+            "crop_width": width,
+            "crop_height": height,
+            "crop_offset_x": max(halves[0], 0),
+            "crop_offset_y": max(-halves[1], 0),
+        }
         return {
             "type": "thinlens",
             "aperture_radius": camera.lens_radius,
             "focus_distance": camera.focus_distance,
             **common,
+            **_field_of_view(wide * full[0] / width, camera),
+            "film": {**common["film"], **(window if any(halves) else {})},
         }
     return {
         "type": "perspective",
@@ -65,6 +74,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
         "principal_point_offset_x": camera.offset[0] / wide,
         "principal_point_offset_y": -camera.offset[1] / high,
         **common,
+        **_field_of_view(wide, camera),
     }
 
 
@@ -81,3 +91,7 @@ def film_window(camera: CameraContents, aspect_ratio: float) -> tuple[float, flo
         "adjustApertureHeight": own,
     }[camera.conform_policy]
     return wide, wide / aspect_ratio
+
+
+def _field_of_view(wide: float, camera: CameraContents) -> SceneNode:
+    return {"fov": math.degrees(2 * math.atan(wide / (2 * camera.focal_length))), "fov_axis": "x"}

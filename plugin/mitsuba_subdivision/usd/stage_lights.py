@@ -34,11 +34,12 @@ _SIZES = {
 }
 # Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
 _POINTLIKE = 1.0
+CONE = "inputs:shaping:cone:angle"
 # Attributes of lights that are ignored, and the values that have no effect.
 _NEUTRAL = {
     "inputs:diffuse": 1,
     "inputs:specular": 1,
-    "inputs:shaping:cone:angle": 90,
+    CONE: 90,
     "inputs:shaping:focus": 0,
     "inputs:shaping:ies:file": None,
     "inputs:shadow:enable": True,
@@ -67,7 +68,14 @@ def read_light(
     size = [float(value_at(prim.GetAttribute(name), time)) for name in _SIZES[kind]]
     if kind == "distant" and size[0] > _POINTLIKE:
         notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
-    if kind == "sphere" and _value(prim, "treatAsPoint", time, False):
+    is_point = bool(kind == "sphere" and _value(prim, "treatAsPoint", time, False))
+    angle = float(_value(prim, CONE, time, 90.0))
+    if kind == "sphere" and 0 <= angle < 90:
+        size += [angle, float(_value(prim, "inputs:shaping:cone:softness", time, 0.0))]
+        if not is_point and size[0] > 0:
+            notes.add("sphere lights with a cone have a radius of 0, and sharp shadows", path)
+        kind = "spot"
+    elif is_point:
         kind = "point"
     return LightContents(
         str(path),
@@ -101,7 +109,8 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
 def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> None:
     for name, neutral in _NEUTRAL.items():
         value = _value(prim, name, time, neutral)
-        if value != neutral and not (name == "inputs:shaping:cone:angle" and value >= 90):
+        is_cone_kept = name == CONE and (value >= neutral or prim.GetTypeName() == "SphereLight")
+        if value != neutral and not is_cone_kept:
             notes.add(
                 f"{name} of lights is ignored; lights illuminate all materials, in all directions", prim.GetPath()
             )

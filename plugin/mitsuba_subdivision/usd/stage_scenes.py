@@ -185,7 +185,10 @@ class StageScenes:
         else:
             contents, triangles = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
         size = self._look.texture_size
-        made = SceneEntries(contents, notes, parameters, self._surfaces, triangles, needed, size)
+        is_clear = rest is not None and _has_clear_lamps(contents, rest)
+        made = SceneEntries(
+            contents, notes, parameters, self._surfaces, triangles, needed, size, has_clear_lamps=is_clear
+        )
         notes.warn(self.name, self._warned)
         if rest is None:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
@@ -256,6 +259,7 @@ class StageScenes:
                 needed=self._needed,
                 texture_size=self._look.texture_size,
                 loaded=shapes,
+                has_clear_lamps=_has_clear_lamps(contents, rest),
             )
             notes.warn(self.name, self._warned)
             before = given, seen, load_quietly({**made.scene, **rest, "sensor": seen}, filter_name)
@@ -287,6 +291,11 @@ class StageScenes:
             for file, texels in texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed
+
+
+def _has_clear_lamps(contents: SceneContents, rest: SceneNode) -> bool:
+    """Whether the integrator finds lights behind shapes of other lights that are clear."""
+    return rest["integrator"]["type"] == "volpath" or any(light.kind == "dome" for light in contents.lights)
 
 
 def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bool:

@@ -13,6 +13,7 @@ from ..studio.view import View
 from ..variants import SceneNode
 from .bsdfs import integrator, rgb
 from .contents import CameraContents, SceneContents
+from .emitters import are_lamps_in_the_way
 from .sensors import sensor
 from .stage_warnings import StageWarnings
 
@@ -70,7 +71,8 @@ def with_studio_defaults(
         bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())
     view = angles_for(contents, look)
     entries = studio(bounds, up=contents.up, view=view, size=size, spp=look.spp, points=points, name=name)
-    found = {"integrator": integrator(contents.materials, entries["integrator"])}
+    has_clear_lamps = are_lamps_in_the_way(contents.lights, points)
+    found = {"integrator": integrator(contents.materials, entries["integrator"], has_clear_lamps=has_clear_lamps)}
     found["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
     if is_lit:
         return found

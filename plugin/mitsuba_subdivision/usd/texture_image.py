@@ -20,6 +20,12 @@ UDIM = "<UDIM>"
 # A file within an archive: archive.usdz[folder/file.png].
 _IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
 _JPEG = b"\xff\xd8"
+_EXR = b"\x76\x2f\x31\x01"
+# Chromaticities of red, green, blue and white. Mitsuba leaves those that are nearly these as they are.
+_REC_709 = np.array([(0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3127, 0.329)])
+_SAME_PRIMARIES = 1e-6
+# From XYZ to responses of cones (Lam 1985).
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 # Of blocks of 8 by 8 pixels, one value.
 _MOST_SCALE = 8
 # Tile 1001 + u + 10 v lies at texture coordinates from (u, v) to (u + 1, v + 1).
@@ -170,9 +176,48 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
         stream = mi.MemoryStream()
         stream.write(content)
         stream.seek(0)
-        pixels = np.array(mi.Bitmap(stream))
+        bitmap = mi.Bitmap(stream)
+        pixels = np.array(bitmap)
+        if content.startswith(_EXR) and pixels.ndim == 3 and pixels.shape[2] >= 3:
+            pixels = _in_rec_709(pixels, bitmap.pixel_format().name.startswith("XYZ"), content, color_space)
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     return reduced(pixels, needed, most, is_srgb=is_srgb_image(pixels, color_space))
+
+
+def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str) -> NDArray:
+    """Pixels of an OpenEXR file with the primaries and the white of Rec. 709; raw ones as they are in the file.
+
+    Mitsuba converts primaries that the header names, but neither XYZ nor the white: grey would get the tint of the
+    header's white.
+    """
+    import OpenEXR
+
+    chroma = OpenEXR.InputFile(io.BytesIO(content)).header().get("chromaticities")
+    if chroma is None:
+        return pixels
+    named = np.array([(each.x, each.y) for each in (chroma.red, chroma.green, chroma.blue, chroma.white)])
+    from_xyz = np.linalg.inv(_to_xyz(_REC_709))
+    if np.square(named - _REC_709).sum() < _SAME_PRIMARIES or (is_xyz and color_space == "raw"):
+        return pixels
+    if is_xyz:
+        matrix = from_xyz
+    elif color_space == "raw":
+        matrix = np.linalg.inv(from_xyz @ _to_xyz(named))
+    else:
+        # From what is white under one light to what is white under the other, by Bradford's cones.
+        before, after = (_BRADFORD @ _to_xyz(each) @ np.ones(3) for each in (named, _REC_709))
+        adaptation = np.linalg.inv(_BRADFORD) @ np.diag(after / before) @ _BRADFORD
+        matrix = from_xyz @ adaptation @ np.linalg.inv(from_xyz)
+    color = pixels[..., :3].astype(np.float32) @ matrix.T.astype(np.float32)
+    return np.concatenate([color, pixels[..., 3:]], axis=2, dtype=np.float32)
+
+
+def _to_xyz(chromaticities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrix ``(3, 3)`` to XYZ from primaries ``(4, 2)``, the last of which is the white, with Y = 1."""
+    x, y = chromaticities.T
+    red, green, blue, white = np.stack([x, y, 1 - x - y], axis=1)
+    primaries = np.stack([red, green, blue], axis=1)
+    return np.asarray(primaries * np.linalg.solve(primaries, white / white[1]))
 
 
 def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | None) -> NDArray[np.uint8] | None:
