@@ -15,8 +15,7 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..images.probe_tier import normal_angle
 from ..surface import LimitSurface
 from .figure_scenes import in_8_bits, load_stage, render
-from .normal_error import draw as draw_normal_error
-from .output import FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
+from .output import FigureOptions, panels, scene_path, scientific, show, write_pixels, write_plot
 from .projection import project
 
 if TYPE_CHECKING:
@@ -79,9 +78,9 @@ ROWS = (
     Row("doo_sabin", 5, 1e-7, 4),
 )
 RULES = (
-    NormalRule("Stam's form, equation (11)", "stam", at_point=False),
-    NormalRule("stabilised form, equation (12)", "stabilized", at_point=False),
-    NormalRule("normal at the point, equation (13)", "stabilized", at_point=True),
+    NormalRule("Stam's form (11)", "stam", at_point=False),
+    NormalRule("stabilised (12)", "stabilized", at_point=False),
+    NormalRule("at the point (13)", "stabilized", at_point=True),
 )
 
 
@@ -106,46 +105,42 @@ def vertex_normal(row: Row, rule: NormalRule) -> VertexNormal:
 
 
 def draw(options: FigureOptions) -> list[Path]:
-    """Render valences 3 and 5 with vertex normals by (11), (12) and (13), and plot normal error against level.
+    """Render valences 3 and 5 with vertex normals by (11), (12) and (13).
 
     Only the arithmetic of (11) in float32 darkens the first column: scene, light, tessellation and positions are the
-    same in all columns. The plot is drawn for Catmull-Clark only.
+    same in all columns.
     """
-    plt = pyplot()
     rows = [row for row in ROWS if row.scheme == options.scheme]
-    figure, axes = plt.subplots(len(rows), len(RULES), figsize=(9.6, 7.2))
-    panels, records = [], []
+    figure, axes = panels(options, len(rows), len(RULES))
+    rendered, records = [], []
     for row, row_axes in zip(rows, axes, strict=True):
         for rule, axis in zip(RULES, row_axes, strict=True):
             vertex = vertex_normal(row, rule)
             pixels, overlay = _render(row, rule, options)
             location, error = _caption(row, rule, vertex)
             options.report(f"valence {row.valence}, {rule.title}: {location}; {error}")
-            _draw_panel(axis, pixels, overlay, f"{location.replace('c1', 'c$_1$')}\n{error}")
-            panels.append(pixels)
+            _draw_panel(axis, pixels, overlay, f"{location}\n{error}")
+            rendered.append(pixels)
             records.append({"valence": row.valence, "rule": rule.title, **vars(vertex)})
-        row_axes[0].set_ylabel(f"valence {row.valence}", fontsize=11)
+        row_axes[0].set_ylabel(f"valence {row.valence}, |c₁| = {vertex.offset:.1f}")
     for axis, rule in zip(axes[0], RULES, strict=True):
-        axis.set_title(rule.title, fontsize=10)
-    figure.tight_layout(h_pad=1.2)
+        axis.set_title(rule.title)
     name = "artifact" if options.scheme == "catmull_clark" else f"artifact_{options.scheme}"
-    written = write_plot(options, name, figure, "png", dpi=100)
-    strips = [np.concatenate(panels[i : i + len(RULES)], axis=1) for i in range(0, len(panels), len(RULES))]
+    written = write_plot(options, name, figure)
+    strips = [np.concatenate(rendered[i : i + len(RULES)], axis=1) for i in range(0, len(rendered), len(RULES))]
     metadata = {"pictures": records, "spp": options.spp, "variant": mi.variant()}
-    written += write_pixels(options, name, np.concatenate(strips), metadata)
-    return written + (draw_normal_error(options) if options.scheme == "catmull_clark" else [])
+    return written + write_pixels(options, name, np.concatenate(strips), metadata)
 
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
     """Label with the sample location of the vertex and the error of its normal."""
     location = (
-        "u = v = 0" if vertex.level is None else f"u = v = {rule.sample_offset(row):.0e}, level n = {vertex.level}"
+        "u = v = 0" if vertex.level is None else f"u = v = {scientific(rule.sample_offset(row))}, n = {vertex.level}"
     )
     if vertex.error >= 0.1:
-        size = f"{vertex.error:.1f}°"
-    else:
-        size = f"{vertex.error:.0e}°" if vertex.error >= NEGLIGIBLE else f"below {NEGLIGIBLE:.0e}°"
-    return f"{location}, |c1| = {vertex.offset:.1f}", f"normal error at the vertex {size}"
+        return location, f"error {vertex.error:.1f}°"
+    is_negligible = vertex.error < NEGLIGIBLE
+    return location, f"error {'below ' * is_negligible}{scientific(max(vertex.error, NEGLIGIBLE))}°"
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,12 +205,10 @@ def _edges(surface: LimitSurface, corners: NDArray[np.floating]) -> NDArray[np.f
 def _draw_panel(axis: Axes, pixels: NDArray[np.float32], overlay: Overlay, caption: str) -> None:
     from matplotlib.collections import LineCollection
 
-    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+    show(axis, in_8_bits(pixels), caption=caption)
     axis.set_xlim(0, pixels.shape[1])
     axis.set_ylim(pixels.shape[0], 0)
     own, *others = overlay.needles
-    axis.add_collection(LineCollection(list(overlay.edges), colors="#40362a", linewidths=0.5, alpha=0.35))
-    axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.9, capstyle="round"))
-    axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=2.2, capstyle="round"))
-    hide_frame(axis)
-    axis.set_xlabel(caption, fontsize=8.5)
+    axis.add_collection(LineCollection(list(overlay.edges), colors="#40362a", linewidths=0.3, alpha=0.4))
+    axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
+    axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=1.5, capstyle="round"))

@@ -15,7 +15,7 @@ from ..mesh.connectivity import Topology
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .figure_scenes import load_stage, make_mesh, on_white, render, staged
-from .output import FigureError, FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
 from .projection import project, visible, visible_runs
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ RATE = 6
 
 def draw(options: FigureOptions) -> list[Path]:
     """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
-    plt = pyplot()
     stage = load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
     while len(cages) < LEVELS:
@@ -41,8 +40,10 @@ def draw(options: FigureOptions) -> list[Path]:
         raise FigureError(
             f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}; expected as many at each"
         )
-    figure, axes = plt.subplots(1, LEVELS + 1, figsize=(12.8, 2.5), layout="constrained")
-    panels = []
+    figure, axes = panels(options, *rows_of(options, LEVELS + 1))
+    for axis in axes.flat[LEVELS + 1 :]:
+        axis.set_axis_off()
+    axes, rendered = axes.flat[: LEVELS + 1], []
     for level, (cage, axis) in enumerate(zip(cages, axes, strict=False)):
         surface = LimitSurface(cage)
         regular = regular_elements(surface)
@@ -55,12 +56,12 @@ def draw(options: FigureOptions) -> list[Path]:
             pixels,
             _edges(cage, EDGE_SEGMENTS >> level),
             _extraordinary_points(cage),
-            1.0 - 0.22 * level,
+            0.55 - 0.12 * level,
             options.resolution,
         )
-        axis.set_title(f"level {level}", fontsize=11)
-        axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular", fontsize=10)
-        panels.append(pixels)
+        axis.set_title(f"level {level}")
+        axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
+        rendered.append(pixels)
     options.report("limit surface")
     limit = LimitSurface(cages[-1])
     pixels, scene = _render_limit(stage, limit, options)
@@ -70,15 +71,15 @@ def draw(options: FigureOptions) -> list[Path]:
         pixels,
         _isolines(limit, EDGE_SEGMENTS >> (LEVELS - 1)),
         _limit_points(limit),
-        0.28,
+        0.17,
         options.resolution,
     )
-    axes[-1].set_title("limit surface", fontsize=11)
-    axes[-1].set_xlabel(f"regular but for {counts.pop()} points", fontsize=10)
-    panels.append(pixels)
-    written = write_plot(options, "subdivision", figure, "png", "pdf")
+    axes[-1].set_title("limit surface")
+    axes[-1].set_xlabel(f"regular but for {counts.pop()} points")
+    rendered.append(pixels)
+    written = write_plot(options, "subdivision", figure)
     metadata = {"levels": LEVELS, "spp": options.spp}
-    return written + write_pixels(options, "subdivision", np.concatenate(panels, axis=1)[..., :3], metadata)
+    return written + write_pixels(options, "subdivision", np.concatenate(rendered, axis=1)[..., :3], metadata)
 
 
 def refined(cage: ControlCage) -> ControlCage:
@@ -195,13 +196,12 @@ def _draw(
     """Draw a rendered image, and the lines and points on its surface that the camera sees."""
     from matplotlib.collections import LineCollection
 
-    axis.imshow(on_white(pixels), interpolation="lanczos")
+    show(axis, on_white(pixels))
     axis.add_collection(
         LineCollection(visible_runs(scene, lines, resolution), colors="#14181c", linewidths=width, capstyle="round")
     )
     seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
-    axis.plot(*seen.T, "o", color="#d1432b", markersize=2.6, markeredgewidth=0)
+    axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
     # The part of the square image that the surface fills.
     axis.set_xlim(0, resolution)
     axis.set_ylim(0.84 * resolution, 0.13 * resolution)
-    hide_frame(axis)
