@@ -98,6 +98,7 @@ RENDER = ["render", "scene.xml", "-o", "picture.exr"]
         (["render", "missing.xml", "-o", "new/picture.exr"], 'scene "missing.xml" is not a file'),
         (["figure", "domains", "--format", "exr"], 'the figure "domains" is not drawn as exr; expected png or pdf'),
         (["figure", "creases", "--scheme", "loop"], 'on the figure "creases"; expected one of "domains", "artifact"'),
+        (["figure", "hero", "--cage", "cube.obj"], '"hero"; expected one of "subdivision", "artifact", "error"'),
         (["figure", "domains", "--spp", "2"], '--spp has no effect on the figure "domains"'),
         (["tessellate", "cube.obj", "-o", "./cube.obj"], 'output "cube.obj" is an input as well'),
         (["tessellate", "cube.obj", "-o", "cube.obj/a.ply"], '"cube.obj" is a file; expected a folder'),

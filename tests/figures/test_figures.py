@@ -10,6 +10,8 @@ import pytest
 
 # Small enough that all together take seconds; `error` plots 60-digit arithmetic and has tests of its own.
 RESOLUTION, SPP, DPI = 12, 1, 20
+# The narrowest figures in millimetres, and points of their smallest text, indices and exponents included.
+COLUMN, LEAST_TEXT = 84, 6
 
 
 @pytest.fixture
@@ -25,7 +27,7 @@ def options(tmp_path):
 def coarse(monkeypatch):
     """Figures without the pixels and triangles that a printer needs: most of the time to draw one goes into these."""
     from matplotlib.figure import Figure
-    from mitsuba_subdivision.figures import creases, displacement, output, zebra
+    from mitsuba_subdivision.figures import creases, displacement, normal_error, output, zebra
 
     save = Figure.savefig
     monkeypatch.setattr(
@@ -33,6 +35,7 @@ def coarse(monkeypatch):
     )
     for module, names in {
         creases: {"RATE": 3},
+        normal_error: {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
         output: {"LAYOUTS": 1},
         displacement: {"COLUMNS": 96, "ROWS": 96},
         zebra: {"RATE": 8, "STRIPE_PIXELS": 256},
@@ -104,6 +107,82 @@ def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
     assert second.items() <= first.items()
 
 
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "few_steps")
+@pytest.mark.parametrize("name", [*DRAWN, "artifact", "error"])
+def test_a_pdf_is_as_printers_want_it(name, options):
+    """Text of 6 points in a column, fonts that are embedded, and the pixels that were rendered."""
+    from mitsuba_subdivision.figures import FIGURES
+
+    pypdf = pytest.importorskip("pypdf")
+    (path,) = FIGURES[name](options(formats=("pdf",), width=COLUMN))
+    page = pypdf.PdfReader(path).pages[0]
+    assert float(page.mediabox.width) == pytest.approx(COLUMN / 25.4 * 72)
+    sizes = []
+    page.extract_text(visitor_text=lambda text, _cm, _tm, _font, size: sizes.append(size) if text.strip() else None)
+    assert min(sizes, default=LEAST_TEXT) >= LEAST_TEXT
+    assert bool(sizes) == (name not in ("hero", "displacement"))
+    for font in page["/Resources"]["/Font"].values():
+        assert "/FontFile2" in font.get("/DescendantFonts", [font])[0]["/FontDescriptor"]
+    widths = [image.image.width for image in page.images]
+    expected = 0 if "spp" not in FIGURES[name].options else round(2.25 * RESOLUTION) if not sizes else RESOLUTION
+    assert name == "curvature" or max(widths, default=0) == expected
+
+
+@pytest.fixture
+def own_cage(tmp_path):
+    """A bent box with two creases, far from the origin and not of the size of any figure."""
+    from mitsuba_subdivision import ControlCage
+    from mitsuba_subdivision.cage.named_cages import cube
+
+    positions = 30 * cube().positions * [1, 0.7, 1.5] + [50, -20, 10] + np.random.default_rng(3).normal(size=(8, 3))
+    faces = cube().face_vertices.reshape(-1, 4)
+    cage = ControlCage(positions, faces, creases=[[*cube().edges[0], 2.5], [*cube().edges[1], 10]])
+    cage.save(tmp_path / "own.obj")
+    return tmp_path / "own.obj"
+
+
+def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage):
+    from mitsuba_subdivision import ControlCage, LimitSurface
+    from mitsuba_subdivision.cage.named_cages import extraordinary
+    from mitsuba_subdivision.figures.own_cage import around_vertices, frame
+
+    like = frame(LimitSurface(extraordinary(5)))
+    ((valence, cage),) = around_vertices(own_cage, 3, like).items()
+    assert valence == 3 == cage.topology.vertex_face_count[0]
+    assert cage.face_vertices.reshape(-1, 4)[:valence, 0].tolist() == [0] * valence
+    assert len(cage.holes) < cage.face_count
+    for found, expected in zip(frame(LimitSurface(cage)), like, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    # The same surface, but for where it lies: ratios of distances stay.
+    original = ControlCage.from_file(own_cage)
+    while original.face_count < cage.face_count:
+        original = original.refined()
+    spread = [np.linalg.norm(each.positions - each.positions.mean(axis=0), axis=1) for each in (original, cage)]
+    np.testing.assert_allclose(*(np.sort(each / each.max()) for each in spread), rtol=1e-9)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
+@pytest.mark.parametrize("name", ["artifact", "error", "creases", "subdivision", "curvature"])
+def test_figures_take_cages_of_users(name, options, own_cage):
+    from mitsuba_subdivision.figures import FIGURES
+
+    (path,) = FIGURES[name](options(formats=("png",), cage=own_cage))
+    first = path.read_bytes()
+    FIGURES[name](options(formats=("png",)))
+    assert path.read_bytes() != first
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_cages_that_do_not_fit_a_figure_are_told(options, tmp_path):
+    from mitsuba_subdivision.cage.named_cages import torus
+    from mitsuba_subdivision.figures import FIGURES, FigureError
+
+    torus(5, 4).save(tmp_path / "torus.obj")
+    for name, message in (("error", "no extraordinary vertex"), ("creases", "no creases")):
+        with pytest.raises(FigureError, match=f'torus.obj" has {message}'):
+            FIGURES[name](options(cage=tmp_path / "torus.obj"))
+
+
 @pytest.mark.usefixtures("variant_scalar_rgb", "coarse")
 @pytest.mark.parametrize("name", ["subdivision", "zebra", "displacement"])
 def test_scalar_variants_draw_too(name, options):
@@ -162,7 +241,7 @@ def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_
 
 def test_each_panel_of_creases_has_tags_of_its_own():
     from mitsuba_subdivision import ControlCage
-    from mitsuba_subdivision.figures.creases import INFINITE, LABELS, TITLES, _tagged
+    from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, labels
     from mitsuba_subdivision.figures.output import scene_path
 
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
@@ -172,7 +251,7 @@ def test_each_panel_of_creases_has_tags_of_its_own():
     assert np.array_equal(infinite, np.where(own > 0, INFINITE, 0))
     # The legend tells every sharpness there is.
     assert set(own[own > 0]) == {1.2, 1.5, 2, 3, 4, 10}
-    assert list(LABELS.values()) == ["1.2\u20132", "3\u20134", "∞"]
+    assert list(labels(own).values()) == ["1.2\u20132", "3\u20134", "∞"]
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -237,7 +316,7 @@ def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
 def test_subdivision_keeps_the_number_of_extraordinary_points():
     from mitsuba_subdivision import ControlCage, LimitSurface
     from mitsuba_subdivision.figures.output import scene_path
-    from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, refined, regular_elements
+    from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, regular_elements
 
     cage = ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")
     assert set(cage.face_sizes) == {3, 4, 5, 6}
@@ -246,7 +325,7 @@ def test_subdivision_keeps_the_number_of_extraordinary_points():
         surface = LimitSurface(cage)
         assert extraordinary_count(cage.topology) == 20
         shares.append(area_share(surface, regular_elements(surface)))
-        cage = refined(cage)
+        cage = cage.refined()
     assert shares[0] == 0 < shares[1] < shares[2] < 1
     # Every irregular patch of level 2 has one extraordinary vertex: as many as the vertices have corners.
     valences = surface.cage.topology.vertex_face_count
@@ -284,18 +363,19 @@ def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG00
 
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_curvature_grows_as_the_eigenvalues_say(valence):
-    from mitsuba_subdivision.figures.curvature import growth, largest_by_level
+    from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 
-    largest = largest_by_level(valence)
+    largest = largest_by_level(bent_ball(valence), valence)
     assert (largest[-1] / largest[-5]) ** (1 / 4) == pytest.approx(growth(valence), abs=0.02)
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
+    from mitsuba_subdivision.cage.named_cages import extraordinary
     from mitsuba_subdivision.figures.figure_scenes import load_stage
     from mitsuba_subdivision.figures.normal_error import offset_cage
     from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
 
-    view = TangentView.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
     stage = load_stage("zoom", resolution=RESOLUTION)
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
         samples = _sample(view, magnification, 8)

@@ -55,6 +55,8 @@ def add_parser(commands: Commands) -> None:
         metavar="SCHEME",
         help=f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)",
     )
+    takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
+    figure.add_argument("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
     figure.add_argument(
         "--format",
         choices=FigureOptions.formats,
@@ -68,9 +70,8 @@ def add_parser(commands: Commands) -> None:
 
 
 def _figure(options: argparse.Namespace) -> None:
-    given = {
-        name: getattr(options, name) for name in ("resolution", "spp", "width", "scheme") if getattr(options, name)
-    }
+    names = ("resolution", "spp", "width", "scheme", "cage")
+    given = {name: getattr(options, name) for name in names if getattr(options, name)}
     formats = tuple(options.formats or ())
     if options.name != "all":
         require_options(options.name, given, formats)

@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..images.probe_tier import normal_angle
+from ..schemes import scheme_named
 from ..surface import LimitSurface
-from .figure_scenes import in_8_bits, load_stage, render
-from .output import FigureOptions, panels, scene_path, scientific, show, write_pixels, write_plot
+from .characteristic import patch_of_valence
+from .figure_scenes import in_8_bits, load_stage, render, staged
+from .output import FigureError, FigureOptions, panels, scene_path, scientific, show, write_pixels, write_plot
+from .own_cage import around_vertices, frame
 from .projection import project
 
 if TYPE_CHECKING:
@@ -26,6 +29,8 @@ NEEDLE_RADIUS = 0.3
 NEEDLE_LENGTH = 0.07
 # Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
 EDGE_RADIUS = 0.8
+# Of single precision's epsilon, |c1| over what is left of a tangent where its normal is lost.
+LOST = 1 / 3
 # Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
 NEGLIGIBLE = 1e-8
 
@@ -44,16 +49,20 @@ class NormalRule:
 
 @dataclass(frozen=True)
 class Row:
-    """A scene of one scheme, the ``u = v`` at which its extraordinary point is sampled, and the tessellation rate."""
+    """A scene of one scheme, the ``u = v`` at which its extraordinary point is sampled, and the tessellation rate.
+
+    A cage of a user takes the place of the scene's own.
+    """
 
     scheme: str
     valence: int
     sample_offset: float
     rate: int
+    own: ControlCage | None = None
 
     @property
     def scene(self) -> Path:
-        return scene_path(f"valence{self.valence}")
+        return scene_path(f"valence{5 if self.own else self.valence}")
 
     @property
     def cage(self) -> str:
@@ -63,7 +72,7 @@ class Row:
 
     def surface(self) -> LimitSurface:
         """The scene's surface. The extraordinary point is corner 0 of element 0, and vertex 0 of a tessellation."""
-        return LimitSurface(ControlCage.from_file(self.scene.parent / self.cage), self.scheme)
+        return LimitSurface(self.own or ControlCage.from_file(self.scene.parent / self.cage), self.scheme)
 
 
 # At |c1| = 10 and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the
@@ -111,6 +120,8 @@ def draw(options: FigureOptions) -> list[Path]:
     same in all columns.
     """
     rows = [row for row in ROWS if row.scheme == options.scheme]
+    if options.cage:
+        rows = _own_rows(options.cage, options.scheme)
     figure, axes = panels(options, len(rows), len(RULES))
     rendered, records = [], []
     for row, row_axes in zip(rows, axes, strict=True):
@@ -130,6 +141,20 @@ def draw(options: FigureOptions) -> list[Path]:
     strips = [np.concatenate(rendered[i : i + len(RULES)], axis=1) for i in range(0, len(rendered), len(RULES))]
     metadata = {"pictures": records, "spp": options.spp, "variant": mi.variant()}
     return written + write_pixels(options, name, np.concatenate(strips), metadata)
+
+
+def _own_rows(path: Path, scheme: str) -> list[Row]:
+    """Rows of a user's cage, moved to where the scene of valence 5 has its vertex."""
+    if scheme != "catmull_clark":
+        raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
+    like = ROWS[1]
+    rows = []
+    for valence, cage in around_vertices(path, 2, frame(like.surface())).items():
+        # Where Stam's form has lost the normal, as above.
+        subdominant = patch_of_valence(scheme_named(like.scheme), valence).basis.subdominant
+        level = np.log(LOST * np.finfo(np.float32).eps) / np.log(subdominant)
+        rows.append(Row(like.scheme, valence, float(f"{0.5**level:.0e}"), like.rate, cage))
+    return rows
 
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
@@ -161,44 +186,38 @@ class Overlay:
 
 def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray[np.float32], Overlay]:
     offset, resolution = rule.sample_offset(row), options.resolution
-    scene = load_stage(
-        row.scene.stem,
-        cage=row.cage,
-        scheme=row.scheme,
-        resolution=resolution,
-        rate=row.rate,
-        evaluator=rule.evaluator,
-        sample_offset=repr(offset),
-    )
+    surface, stage = row.surface(), load_stage(row.scene.stem, resolution=resolution)
+    shape = {
+        "type": "subdivision",
+        **surface.cage.as_properties(mi),
+        "scheme": row.scheme,
+        "tessellation_rate": row.rate,
+        "evaluator": rule.evaluator,
+        "sample_offset": offset,
+        "bsdf": next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter()),
+    }
+    scene = staged(stage, [shape for shape in stage.shapes() if shape.is_emitter()], surface=mi.load_dict(shape))
     pixels = render(scene, options, f"valence {row.valence}, {rule.title}")[..., :3]
-    surface = row.surface()
     tessellation = surface.tessellate(row.rate, rule.evaluator, np.float32, offset)
     distance = np.linalg.norm(tessellation.positions - tessellation.positions[0], axis=1)
     near = np.flatnonzero(distance < NEEDLE_RADIUS)
     start = tessellation.positions[near].astype(np.float64)
     needles = np.stack([start, start + NEEDLE_LENGTH * tessellation.normals[near]], axis=1)
     sensor = scene.sensors()[0]
-    return pixels, Overlay(
-        project(sensor, needles, resolution), project(sensor, _edges(surface, tessellation.positions), resolution)
-    )
+    return pixels, Overlay(project(sensor, needles, resolution), project(sensor, _edges(surface), resolution))
 
 
-def _edges(surface: LimitSurface, corners: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Curves between the elements near the extraordinary point: ``(m, 17, 3)``.
-
-    Parameters
-    ----------
-    corners : (n, 3)
-        Limit points of the elements' corners, the extraordinary point first.
-    """
+def _edges(surface: LimitSurface) -> NDArray[np.float64]:
+    """Curves between the elements near the extraordinary point: ``(m, 17, 3)``."""
     elements = surface.patches.elements
     along = np.stack([np.linspace(0, 1, 17), np.zeros(17)], axis=1)
-    distance = np.linalg.norm(corners[elements.face_vertices] - corners[0], axis=1)
-    begins = np.flatnonzero(distance < EDGE_RADIUS)
-    element = elements.face[begins]
-    corner = begins - elements.face_offsets[element]
+    corner = np.arange(len(elements.face)) - elements.face_offsets[elements.face]
+    begin = surface.evaluate(elements.face, np.zeros((len(corner), 2)), corner).p
+    near = np.flatnonzero(np.linalg.norm(begin - begin[0], axis=1) < EDGE_RADIUS)
     # Elements that are a part of a face end in the middle of an edge.
-    samples = surface.evaluate(np.repeat(element, 17), np.tile(along, (len(element), 1)), np.repeat(corner, 17))
+    samples = surface.evaluate(
+        np.repeat(elements.face[near], 17), np.tile(along, (len(near), 1)), np.repeat(corner[near], 17)
+    )
     return samples.p.reshape(-1, 17, 3).astype(np.float64, copy=False)
 
 

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..variants import SceneNode
 from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
-from .output import FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .own_cage import fitted, read
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,12 +40,16 @@ MATERIAL = {
 # Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
 PALE = "#e4e4e1"
 EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
-LABELS = {1: "1.2\u20132", 3: "3\u20134", INFINITE: "∞"}
 
 
 def draw(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
+    if options.cage:
+        box = cage.positions.min(axis=0), cage.positions.max(axis=0)
+        cage = fitted(read(options.cage), *box, height=0)
+        if not cage.tags.edges.any():
+            raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
     stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
     scenes = {CAGE_TITLE: staged(stage, **_cage_shapes(cage))}
     for name, title in TITLES.items():
@@ -55,7 +61,7 @@ def draw(options: FigureOptions) -> list[Path]:
         options.report(f"{headline}, {caption}" if caption else headline)
         rendered.append(render(scene, options, headline)[..., :3])
         show(axis, in_8_bits(rendered[-1]), headline, caption)
-    _draw_legend(axes[0, 0])
+    _draw_legend(axes[0, 0], cage)
     written = write_plot(options, "creases", figure)
     metadata = {"pictures": [CAGE_TITLE[0], *TITLES], "spp": options.spp}
     return written + write_pixels(options, "creases", np.concatenate(rendered, axis=1), metadata)
@@ -91,11 +97,24 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
     return shapes
 
 
-def _draw_legend(axis: Axes) -> None:
+def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
+    """Ranges of the sharpness of creases by their least values in `EDGES`."""
+    ends = [*EDGES, np.inf]
+    found = {}
+    for least, end in itertools.pairwise(ends):
+        values = np.unique(sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)])
+        if len(values):
+            ends_of_range = dict.fromkeys(f"{value:g}" for value in values[[0, -1]])
+            found[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends_of_range)
+    return found
+
+
+def _draw_legend(axis: Axes, cage: ControlCage) -> None:
     """Draw the colours of sharpness below the cage."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=EDGES[least][0], linewidth=2, label=text) for least, text in LABELS.items()]
+    shown = labels(cage.tags.edges)
+    handles = [Line2D([], [], color=EDGES[least][0], linewidth=2, label=label) for least, label in shown.items()]
     handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
     legend = axis.legend(
         handles=handles,

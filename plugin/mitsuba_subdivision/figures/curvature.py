@@ -14,6 +14,7 @@ from ..schemes import scheme_named
 from ..surface import LimitSurface, SurfaceSamples
 from .characteristic import patch_of_valence
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_plot
+from .own_cage import around_vertices, frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,9 +65,8 @@ def growth(valence: int) -> float:
     return float(patch.basis.moduli[3] / patch.basis.subdominant**2)
 
 
-def curvature_map(valence: int, count: int) -> CurvatureMap:
+def curvature_map(surface: LimitSurface, valence: int, count: int) -> CurvatureMap:
     """Sample the elements at the vertex, more densely towards it."""
-    surface = bent_ball(valence)
     at = surface.evaluate(0, np.zeros((1, 2)))
     # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
     along = np.concatenate([[0], np.geomspace(1e-3, 1, count)])
@@ -89,9 +89,8 @@ def _curvatures(samples: SurfaceSamples) -> tuple[NDArray[np.float64], NDArray[n
     return samples.gaussian_curvature.astype(np.float64), samples.mean_curvature.astype(np.float64)
 
 
-def largest_by_level(valence: int) -> NDArray[np.float64]:
+def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]:
     """Largest absolute principal curvature of a few samples on each level: ``(levels,)``."""
-    surface = bent_ball(valence)
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     largest = np.zeros(len(LEVELS))
     for element in range(valence):
@@ -105,11 +104,15 @@ def draw(options: FigureOptions) -> list[Path]:
     """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level."""
     from matplotlib.colors import SymLogNorm
 
-    figure, axes = panels(options, 3, len(VALENCES), sharey="row")
+    surfaces = {valence: bent_ball(valence) for valence in VALENCES}
+    if options.cage:
+        cages = around_vertices(options.cage, len(VALENCES), frame(bent_ball(5)))
+        surfaces = {valence: LimitSurface(cage) for valence, cage in cages.items()}
+    figure, axes = panels(options, 3, len(surfaces), sharey="row")
     norm = SymLogNorm(LINEAR, vmin=-LIMIT, vmax=LIMIT)
-    for valence, column in zip(VALENCES, axes.T, strict=True):
-        found, rate = curvature_map(valence, max(options.resolution // 4, 8)), growth(valence)
-        measured = largest_by_level(valence)
+    for (valence, surface), column in zip(surfaces.items(), axes.T, strict=True):
+        found, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
+        measured = largest_by_level(surface, valence)
         options.report(f"valence {valence}: {rate:.4f} per level; largest at level {LEVELS[-1]} {measured[-1]:.3g}")
         for axis, values in zip(column, (found.gaussian, found.mean), strict=False):
             shown = _draw_disc(axis, found, values, norm)

@@ -61,9 +61,9 @@ def make_mesh(
     return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=normals is None)
 
 
-def staged(stage: mi.Scene, **objects: Any) -> mi.Scene:
-    """Make a scene with the camera, integrator, emitters and shapes of another, and with more objects."""
-    children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes())}
+def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects: Any) -> mi.Scene:
+    """Make a scene with the camera, integrator, emitters and all or some shapes of another, and with more objects."""
+    children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes() if shapes is None else shapes)}
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
     children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
     return mi.load_dict(

@@ -48,18 +48,18 @@ class Figure:
 
 
 FIGURES: dict[str, Figure] = {
-    "subdivision": Figure("subdivision", "a cage and its refinements, irregular patches grey", ("spp",)),
+    "subdivision": Figure("subdivision", "a cage and its refinements, irregular patches grey", ("spp", "cage")),
     "refinement": Figure("refinement", "control points of a patch before and after one refinement", (), COLUMN),
     "domains": Figure("domains", "parameter domains of the regular patches at each level", ("scheme",), COLUMN),
-    "artifact": Figure("artifact", "normals by (11), (12) and (13), rendered", ("spp", "scheme")),
-    "error": Figure("normal_error", "normal error against level by (11), (12), (13)"),
+    "artifact": Figure("artifact", "normals by (11), (12) and (13), rendered", ("spp", "scheme", "cage")),
+    "error": Figure("normal_error", "normal error against level by (11), (12), (13)", ("cage",)),
     "schemes": Figure("schemes", "one cage under the three schemes", ("spp",)),
-    "creases": Figure("creases", "one cage with smooth, semi-sharp and sharp creases", ("spp",)),
+    "creases": Figure("creases", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
     "shading": Figure("shading", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     "displacement": Figure("displacement", "a jar before and after it is displaced, and its triangles", ("spp",)),
     "zoom": Figure("zoom", "an extraordinary vertex, magnified up to a million times", ("spp",)),
     "zebra": Figure("zebra", "reflection lines, with exact normals and with others", ("spp",)),
-    "curvature": Figure("curvature", "curvature around extraordinary vertices"),
+    "curvature": Figure("curvature", "curvature around extraordinary vertices", ("cage",)),
     "fit": Figure("fit", "cages fitted to pictures, and how near they come", ("spp",)),
     "hero": Figure("hero", "a human figure and its control cage", ("spp",)),
 }

@@ -18,6 +18,7 @@ from ..mesh.signature import signature_at
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_plot
+from .own_cage import around_vertices, frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,10 +41,13 @@ def draw(options: FigureOptions) -> list[Path]:
 
     The exact normals come from powers of the subdivision matrix in 60-digit arithmetic.
     """
-    figure, axes = panels(options, len(VALENCES), len(OFFSETS), sharex=True, sharey=True)
-    for row, valence in zip(axes, VALENCES, strict=True):
+    cages = {valence: extraordinary(valence) for valence in VALENCES}
+    if options.cage:
+        cages = around_vertices(options.cage, len(VALENCES), frame(LimitSurface(extraordinary(5))))
+    figure, axes = panels(options, len(cages), len(OFFSETS), sharex=True, sharey=True)
+    for row, (valence, cage) in zip(axes, cages.items(), strict=True):
         for axis, offset in zip(row, OFFSETS, strict=True):
-            _draw_panel(axis, offset_cage(valence, offset))
+            _draw_panel(axis, offset_cage(cage, offset))
         row[0].set_ylabel(f"valence {valence}\nerror (degrees)")
     for axis, offset in zip(axes[0], OFFSETS, strict=True):
         axis.set_title(f"|c₁| = {offset}")
@@ -71,12 +75,11 @@ def _draw_panel(axis: Axes, cage: ControlCage) -> None:
     axis.grid()
 
 
-def offset_cage(valence: int, offset: float) -> ControlCage:
-    """The cage `extraordinary`, moved so that the limit point of vertex 0 has this distance from the origin.
+def offset_cage(cage: ControlCage, offset: float) -> ControlCage:
+    """A cage, moved so that the limit point of vertex 0 has this distance from the origin.
 
     Its coordinates are rounded to float32, so that every evaluator gets the same numbers.
     """
-    cage = extraordinary(valence)
     limit = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
     # A direction that favours no axis, and is neither normal nor tangent to the surface.
     direction = np.array([0.48, 0.6, 0.64])

@@ -81,6 +81,8 @@ class FigureOptions:
         Which of "png", "pdf" and "exr" to write, if the figure has them.
     scheme : str
         Subdivision scheme, for the figures that show one scheme of several.
+    cage : Path or None
+        File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one.
     report : callable
         Is called with a line of text for each step.
     progress : callable
@@ -93,6 +95,7 @@ class FigureOptions:
     width: float = PAGE
     formats: tuple[str, ...] = ("png", "pdf", "exr")
     scheme: str = "catmull_clark"
+    cage: Path | None = None
     report: Callable[[str], None] = field(default=_to_terminal)
     progress: Callable[[str, int, int], None] = field(default=draw_bar)
 

@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..evaluation.patch_pieces import lattice_stencils
 from ..mesh.connectivity import Topology
-from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .figure_scenes import load_stage, make_mesh, on_white, render, staged
 from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .own_cage import fitted, read
 from .projection import project, visible, visible_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEVELS = 4
+# Corners of the box for cages of users.
+BOX = np.array([(-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)])
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
 # Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
 EDGE_SEGMENTS = 24
@@ -33,8 +35,10 @@ def draw(options: FigureOptions) -> list[Path]:
     """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
     stage = load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
+    if options.cage:
+        cages = [fitted(read(options.cage), *BOX)]
     while len(cages) < LEVELS:
-        cages.append(refined(cages[-1]))
+        cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
     if len(counts) != 1:
         raise FigureError(
@@ -82,16 +86,9 @@ def draw(options: FigureOptions) -> list[Path]:
     return written + write_pixels(options, "subdivision", np.concatenate(rendered, axis=1)[..., :3], metadata)
 
 
-def refined(cage: ControlCage) -> ControlCage:
-    """The cage after one Catmull-Clark refinement, which has the same limit surface."""
-    refinement = scheme_named("catmull_clark").refine(cage.topology)
-    topology = refinement.topology
-    return ControlCage.from_arrays(refinement.apply(cage.positions), topology.face_sizes, topology.face_vertices)
-
-
 def extraordinary_count(topology: Topology) -> int:
-    """Number of vertices of valence other than 4, and of faces other than quads. A refinement keeps this number."""
-    return int((topology.vertex_face_count != 4).sum() + (topology.face_sizes != 4).sum())
+    """Number of inner vertices of valence other than 4, and of faces but quads. A refinement keeps this number."""
+    return int(_is_extraordinary(topology).sum() + (topology.face_sizes != 4).sum())
 
 
 def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
@@ -169,15 +166,20 @@ def _isolines(surface: LimitSurface, segments: int) -> NDArray[np.float64]:
     return found.p.reshape(-1, segments + 1, 3).astype(np.float64, copy=False)
 
 
+def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether a vertex inside has another valence than 4."""
+    return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
+
+
 def _extraordinary_points(cage: ControlCage) -> NDArray[np.float64]:
     t = cage.topology
     centres = np.add.reduceat(cage.positions[t.face_vertices], t.face_offsets[:-1]) / t.face_sizes[:, None]
-    return np.concatenate([cage.positions[t.vertex_face_count != 4], centres[t.face_sizes != 4]])
+    return np.concatenate([cage.positions[_is_extraordinary(t)], centres[t.face_sizes != 4]])
 
 
 def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
     t = surface.cage.topology
-    half_edge = t.vertex_half_edge[t.vertex_face_count != 4]
+    half_edge = t.vertex_half_edge[_is_extraordinary(t)]
     face = t.face[half_edge]
     return surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face]).p.astype(
         np.float64, copy=False

@@ -21,7 +21,6 @@ from .figure_scenes import grid_triangles, load_stage, make_mesh, on_white, rend
 from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
-from .subdivision import refined
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -145,7 +144,7 @@ def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
 def _refined_mesh(cage: ControlCage) -> mi.Mesh:
     """The cage refined `LEVEL` times, as triangles; Mitsuba averages their normals at the vertices."""
     for _ in range(LEVEL):
-        cage = refined(cage)
+        cage = cage.refined()
     return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)), MIRROR)
 
 

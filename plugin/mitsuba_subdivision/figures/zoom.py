@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
+from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
 from ..images.probe_tier import normal_angle
 from ..schemes import scheme_named
@@ -94,7 +95,7 @@ def draw(options: FigureOptions) -> list[Path]:
     """
     from matplotlib.cm import ScalarMappable
 
-    view = TangentView.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
     figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
