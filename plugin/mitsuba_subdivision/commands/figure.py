@@ -82,7 +82,8 @@ def _figure(options: argparse.Namespace) -> None:
         given["formats"] = formats
     wanted = set(formats or ["png"])
     for name, figure in FIGURES.items():
-        if options.name == name or (options.name == "all" and wanted & set(figure.formats)):
+        takes_all = bool(wanted & set(figure.formats)) and (not options.cage or "cage" in figure.options)
+        if options.name == name or (options.name == "all" and takes_all):
             for path in figure(FigureOptions(options.output, **{"width": figure.width, **given})):
                 print_result(path)
 

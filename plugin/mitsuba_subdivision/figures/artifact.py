@@ -29,8 +29,8 @@ NEEDLE_RADIUS = 0.3
 NEEDLE_LENGTH = 0.07
 # Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
 EDGE_RADIUS = 0.8
-# Of single precision's epsilon, |c1| over what is left of a tangent where its normal is lost.
-LOST = 1 / 3
+# A tangent of this size, at a distance of 10, has lost its normal in single precision: a third of epsilon.
+LOST = 2.0**-23 / 3
 # Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
 NEGLIGIBLE = 1e-8
 
@@ -152,7 +152,7 @@ def _own_rows(path: Path, scheme: str) -> list[Row]:
     for valence, cage in around_vertices(path, 2, frame(like.surface())).items():
         # Where Stam's form has lost the normal, as above.
         subdominant = patch_of_valence(scheme_named(like.scheme), valence).basis.subdominant
-        level = np.log(LOST * np.finfo(np.float32).eps) / np.log(subdominant)
+        level = np.log(LOST) / np.log(subdominant)
         rows.append(Row(like.scheme, valence, float(f"{0.5**level:.0e}"), like.rate, cage))
     return rows
 

@@ -117,9 +117,11 @@ def draw_picture(
     """Write linear RGB pixels as a figure of one picture, with white lines at some of its columns."""
     figure, ((axis,),) = panels(options, 1, 1)
     show(axis, in_8_bits(pixels))
+    axis.set_position((0, 0, 1, 1))
+    figure.set_figheight(HEIGHT * figure.get_figwidth())
     for column in columns:
         axis.axvline(column - 0.5, color="white")
-    written = write_plot(replace(options, resolution=pixels.shape[1]), name, figure)
+    written = write_plot(replace(options, resolution=pixels.shape[1]), name, figure, layouts=0)
     return written + write_pixels(options, name, pixels, metadata)
 
 

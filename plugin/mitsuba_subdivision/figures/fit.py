@@ -221,7 +221,7 @@ def _plot_distances(axis: Axes, courses: Mapping[str, Course]) -> None:
         values = 100 * np.array(list(course.distances.values()))
         label = f"{LABELS[name]}, {course.cages[STEPS].vertex_count:,} points"
         axis.loglog(VIEWS * steps[1:], values[1:], marker=marker, color=colour, label=label)
-    _finish(axis, "distance to the target (%)")
+    _finish(axis, "distance (%)")
     _plain(axis)
 
 
@@ -233,7 +233,7 @@ def _plot_sharpness(axis: Axes, fit: CreaseFit) -> None:
         axis.axhline(truth, color=sharpness_colour(truth), linestyle=(0, (5, 3)))
     axis.set_xlim(0, renders[-1])
     axis.set_ylim(0, HIGHEST)
-    _finish(axis, "sharpness of creases")
+    _finish(axis, "sharpness")
 
 
 def _finish(axis: Axes, quantity: str) -> None:

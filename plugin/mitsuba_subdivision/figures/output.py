@@ -145,10 +145,15 @@ def rows_of(options: FigureOptions, count: int) -> tuple[int, int]:
     return (1, count) if options.width >= BETWEEN else (2, (count + 1) // 2)
 
 
-def write_plot(options: FigureOptions, name: str, figure: Figure) -> list[Path]:
+def write_plot(options: FigureOptions, name: str, figure: Figure, *, layouts: int = LAYOUTS) -> list[Path]:
     """Write a figure as PNG and as PDF, if these formats are wanted, and close it.
 
     The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
+
+    Parameters
+    ----------
+    layouts : int
+        How often the height of the figure is set to that of its contents.
 
     Returns
     -------
@@ -159,7 +164,7 @@ def write_plot(options: FigureOptions, name: str, figure: Figure) -> list[Path]:
     from matplotlib.pyplot import close
 
     # Panels of a fixed aspect leave room above and below them. A half of that to a legend is left each time.
-    for _ in range(LAYOUTS):
+    for _ in range(layouts):
         figure.draw_without_rendering()
         figure.set_size_inches(figure.get_figwidth(), figure.get_tightbbox().height + 2 * PAD)
     figure.draw_without_rendering()

@@ -16,6 +16,8 @@ from .output import FigureError
 REFINEMENTS = 2
 # Faces whose control points are farther from the vertex than this are holes, in lengths of the shortest edge there.
 FAR = 4
+# Extents of a flat cage count as this.
+SMALLEST = 1e-300
 
 
 def around_vertices(path: Path, most: int, like: tuple[NDArray[np.float64], ...]) -> dict[int, ControlCage]:
@@ -72,7 +74,7 @@ def fitted(
 ) -> ControlCage:
     """The cage, scaled into the middle of a box; ``height`` is 0 for the ground of the box, and 1 for its top."""
     least, most = cage.positions.min(axis=0), cage.positions.max(axis=0)
-    scale = ((high - low) / np.maximum(most - least, np.finfo(float).tiny)).min()
+    scale = ((high - low) / np.maximum(most - least, SMALLEST)).min()
     part = np.array([0.5, 0.5, height])
     return cage.with_positions((cage.positions - least - part * (most - least)) * scale + low + part * (high - low))
 

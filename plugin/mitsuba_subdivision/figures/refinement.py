@@ -20,7 +20,7 @@ VALENCE = 5
 # Stencils that agree to this many decimals are the same: their entries are fractions of small integers.
 DECIMALS = 9
 # The irregular child is grey, as in the figure `subdivision`; in grey prints, all four differ.
-CHILD_COLOURS = ("#8a9098", "#fcebbc", "#e39360", "#b3d3e0")
+CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
 EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
 # In points; indices are 0.7 times as large.
 LABEL_SIZE = 9
