@@ -29,7 +29,7 @@ NEEDLE_RADIUS = 0.3
 NEEDLE_LENGTH = 0.07
 # Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
 EDGE_RADIUS = 0.8
-# A tangent of this size, at a distance of 10, has lost its normal in single precision: a third of epsilon.
+# What lambda_2^n is at the sample of a cage of a user: eps |c1| / lambda_2^n is 30.
 LOST = 2.0**-23 / 3
 # Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
 NEGLIGIBLE = 1e-8

@@ -47,7 +47,7 @@ def draw(options: FigureOptions) -> list[Path]:
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
     if options.cage:
         box = cage.positions.min(axis=0), cage.positions.max(axis=0)
-        cage = fitted(read(options.cage), *box, height=0)
+        cage = fitted(read(options.cage), *box)
         if not cage.tags.edges.any():
             raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
     stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))

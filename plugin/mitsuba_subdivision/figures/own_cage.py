@@ -69,14 +69,18 @@ def frame(surface: LimitSurface, face: int = 0, corner: int = 0) -> tuple[NDArra
     return samples.p[0], np.stack([along, np.cross(normal, along), normal], axis=1), np.asarray(length)
 
 
-def fitted(
-    cage: ControlCage, low: NDArray[np.floating], high: NDArray[np.floating], height: float = 0.5
-) -> ControlCage:
-    """The cage, scaled into the middle of a box; ``height`` is 0 for the ground of the box, and 1 for its top."""
+def fitted(cage: ControlCage, low: NDArray[np.floating], high: NDArray[np.floating]) -> ControlCage:
+    """The cage, scaled into a box, in its middle and on its ground (least z)."""
     least, most = cage.positions.min(axis=0), cage.positions.max(axis=0)
     scale = ((high - low) / np.maximum(most - least, SMALLEST)).min()
-    part = np.array([0.5, 0.5, height])
+    part = np.array([0.5, 0.5, 0])
     return cage.with_positions((cage.positions - least - part * (most - least)) * scale + low + part * (high - low))
+
+
+def in_ball(cage: ControlCage, radius: float) -> ControlCage:
+    """The cage, scaled into a ball around the origin."""
+    centred = cage.positions - (cage.positions.min(axis=0) + cage.positions.max(axis=0)) / 2
+    return cage.with_positions(centred * (radius / max(np.linalg.norm(centred, axis=1).max(), SMALLEST)))
 
 
 def _isolated_fans(cage: ControlCage) -> dict[int, NDArray[np.integer]]:

@@ -15,15 +15,15 @@ from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from .figure_scenes import load_stage, make_mesh, on_white, render, staged
 from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
-from .own_cage import fitted, read
+from .own_cage import in_ball, read
 from .projection import project, visible, visible_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEVELS = 4
-# Corners of the box for cages of users.
-BOX = np.array([(-1.5, -1.5, -1.5), (1.5, 1.5, 1.5)])
+# Of the ball that fills the picture, for cages of users.
+RADIUS = 1.9
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
 # Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
 EDGE_SEGMENTS = 24
@@ -36,7 +36,7 @@ def draw(options: FigureOptions) -> list[Path]:
     stage = load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
     if options.cage:
-        cages = [fitted(read(options.cage), *BOX)]
+        cages = [in_ball(read(options.cage), RADIUS)]
     while len(cages) < LEVELS:
         cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
