@@ -238,7 +238,8 @@ from pathlib import Path
 import mitsuba_subdivision as msub
 import mitsuba as mi
 from mitsuba_subdivision.cage.named_cages import torus
-from mitsuba_subdivision.figures.output import save_png
+from mitsuba_subdivision.figures.figure_scenes import draw_picture
+from mitsuba_subdivision.figures.output import FigureOptions
 from mitsuba_subdivision.images.exr import write_exr
 from mitsuba_subdivision.whole_file import whole_file
 mi.set_variant("scalar_rgb")
@@ -250,7 +251,7 @@ def bitmap(path):
     with whole_file(path) as beside:
         mi.util.convert_to_bitmap(pixels, uint8_srgb=False).write(str(beside))
 writers = {"a.exr": lambda path: write_exr(path, pixels), "b.exr": bitmap, "b.hdr": bitmap,
-    "c.png": lambda path: save_png((255 * pixels).astype(np.uint8), path)}
+    "c.png": lambda path: draw_picture(FigureOptions(folder, formats=("png",)), "c", pixels, {})}
 writers |= {f"d.{s}": triangles.save for s in ("obj", "ply", "usda", "usdc")}
 writers |= {f"e.{s}": cage.save for s in ("obj", "ply", "usda", "usdc")}
 # As on a full disk: what goes beyond is not written.

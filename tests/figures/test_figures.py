@@ -8,8 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-# Small enough that all together take seconds; `error` plots 60-digit arithmetic and has tests of its own.
+# Small enough that all together take seconds.
 RESOLUTION, SPP, DPI = 12, 1, 20
+FIGURE_NAMES = ("subdivision", "refinement", "domains", "artifact", "error", "schemes", "creases", "shading",
+    "displacement", "zoom", "zebra", "curvature", "fit", "hero")  # fmt: skip
+# These are one picture, wider than those that share a figure, without text.
+STAND_ALONE = ("hero", "displacement")
+# The narrowest figures in millimetres, and points of their smallest text, indices and exponents included.
+COLUMN, LEAST_TEXT = 84, 6
 
 
 @pytest.fixture
@@ -25,14 +31,16 @@ def options(tmp_path):
 def coarse(monkeypatch):
     """Figures without the pixels and triangles that a printer needs: most of the time to draw one goes into these."""
     from matplotlib.figure import Figure
-    from mitsuba_subdivision.figures import creases, displacement, zebra
+    from mitsuba_subdivision.figures import creases, displacement, normal_error, output, zebra
 
     save = Figure.savefig
     monkeypatch.setattr(
         Figure, "savefig", lambda figure, path, **options: save(figure, path, **{**options, "dpi": DPI})
     )
+    monkeypatch.setitem(output.write_plot.__kwdefaults__, "layouts", 1)
     for module, names in {
         creases: {"RATE": 3},
+        normal_error: {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
         displacement: {"COLUMNS": 96, "ROWS": 96},
         zebra: {"RATE": 8, "STRIPE_PIXELS": 256},
     }.items():
@@ -58,6 +66,7 @@ def test_the_command_line_knows_every_figure():
     from mitsuba_subdivision.commands.command_line import parser
     from mitsuba_subdivision.figures import FIGURES
 
+    assert tuple(FIGURES) == FIGURE_NAMES
     for name in (*FIGURES, "all"):
         assert parser().parse_args(["figure", name]).name == name
 
@@ -77,42 +86,97 @@ def test_every_module_that_draws_is_in_the_table():
 
     modules = {path.stem for path in Path(figures.__file__).parent.glob("*.py") if "\ndef draw(" in path.read_text()}
     assert {figure.module for figure in figures.FIGURES.values()} == modules
-    assert {figure.drawn_with for figure in figures.FIGURES.values()} <= {None, *figures.FIGURES}
 
 
-FILES = {
-    "subdivision": {"subdivision.png", "subdivision.pdf", "subdivision.exr"},
-    "refinement": {"refinement.png", "refinement.pdf"},
-    "domains": {"domains.png", "domains.pdf"},
-    "schemes": {"schemes.png", "schemes.exr"},
-    "creases": {"creases.png", "creases.exr"},
-    "shading": {"shading.png", "shading.exr"},
-    "displacement": {"displacement.png", "displacement.exr"},
-    "zoom": {"zoom.png", "zoom.pdf", "zoom.exr"},
-    "zebra": {"zebra.png", "zebra.pdf", "zebra.exr"},
-    "curvature": {"curvature.png", "curvature.pdf"},
-    "fit": {"fit.png", "fit.pdf", "fit.exr"},
-    "hero": {"hero.png", "hero.exr"},
-}
 # One function writes the plots of all figures: all formats of this one are compared, of others the pixels if there are.
 WRITTEN_TWICE = "refinement"
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "few_steps")
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", FIGURE_NAMES)
 def test_a_figure_draws_without_warnings_and_twice_alike(name, options):
+    """In a column, where its PDF has text of 6 points, embedded fonts and the pixels that were rendered."""
     from mitsuba_subdivision.figures import FIGURES
 
+    figure = FIGURES[name]
+
     def drawn(formats):
-        files = FIGURES[name](options(formats=formats))
+        files = figure(options(formats=formats, width=COLUMN))
         return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
-    formats = FIGURES[name].formats
-    first = drawn(formats)
-    assert set(first) == {path.name for path in options().output.iterdir()} == FILES[name]
-    assert {path.rpartition(".")[2] for path in FILES[name]} == set(formats)
-    second = drawn(formats if name == WRITTEN_TWICE else ("exr",))
+    first = drawn(figure.formats)
+    files = {f"{figure.module}.{suffix}" for suffix in figure.formats}
+    assert set(first) == {path.name for path in options().output.iterdir()} == files
+    second = drawn(figure.formats if name == WRITTEN_TWICE else ("exr",))
     assert second.items() <= first.items()
+
+    pypdf = pytest.importorskip("pypdf")
+    page = pypdf.PdfReader(options().output / f"{figure.module}.pdf").pages[0]
+    assert float(page.mediabox.width) == pytest.approx(COLUMN / 25.4 * 72)
+    sizes = []
+    page.extract_text(visitor_text=lambda text, _cm, _tm, _font, size: sizes.append(size) if text.strip() else None)
+    assert bool(sizes) == (name not in STAND_ALONE)
+    assert min(sizes, default=LEAST_TEXT) >= LEAST_TEXT
+    for font in page["/Resources"]["/Font"].values():
+        assert "/FontFile2" in font.get("/DescendantFonts", [font])[0]["/FontDescriptor"]
+    if "exr" in figure.formats:
+        expected = round(2.25 * RESOLUTION) if name in STAND_ALONE else RESOLUTION
+        assert max(image.image.width for image in page.images) == expected
+
+
+@pytest.fixture
+def own_cage(tmp_path):
+    """A bent box with two creases, far from the origin and not of the size of any figure."""
+    from mitsuba_subdivision import ControlCage
+    from mitsuba_subdivision.cage.named_cages import cube
+
+    positions = 30 * cube().positions * [1, 0.7, 1.5] + [50, -20, 10] + np.random.default_rng(3).normal(size=(8, 3))
+    faces = cube().face_vertices.reshape(-1, 4)
+    cage = ControlCage(positions, faces, creases=[[*cube().edges[0], 2.5], [*cube().edges[1], 10]])
+    cage.save(tmp_path / "own.obj")
+    return tmp_path / "own.obj"
+
+
+def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage):
+    from mitsuba_subdivision import ControlCage, LimitSurface
+    from mitsuba_subdivision.cage.named_cages import extraordinary
+    from mitsuba_subdivision.figures.own_cage import around_vertices, frame
+
+    like = frame(LimitSurface(extraordinary(5)))
+    ((valence, cage),) = around_vertices(own_cage, 3, like).items()
+    assert valence == 3 == cage.topology.vertex_face_count[0]
+    assert cage.face_vertices.reshape(-1, 4)[:valence, 0].tolist() == [0] * valence
+    assert len(cage.holes) < cage.face_count
+    for found, expected in zip(frame(LimitSurface(cage)), like, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    # The same surface, but for where it lies: ratios of distances stay.
+    original = ControlCage.from_file(own_cage)
+    while original.face_count < cage.face_count:
+        original = original.refined()
+    spread = [np.linalg.norm(each.positions - each.positions.mean(axis=0), axis=1) for each in (original, cage)]
+    np.testing.assert_allclose(*(np.sort(each / each.max()) for each in spread), rtol=1e-9)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
+@pytest.mark.parametrize("name", ["artifact", "error", "creases", "subdivision", "curvature"])
+def test_figures_take_cages_of_users(name, options, own_cage):
+    from mitsuba_subdivision.figures import FIGURES
+
+    (path,) = FIGURES[name](options(formats=("png",), cage=own_cage))
+    first = path.read_bytes()
+    FIGURES[name](options(formats=("png",)))
+    assert path.read_bytes() != first
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_cages_that_do_not_fit_a_figure_are_told(options, tmp_path):
+    from mitsuba_subdivision.cage.named_cages import torus
+    from mitsuba_subdivision.figures import FIGURES, FigureError
+
+    torus(5, 4).save(tmp_path / "torus.obj")
+    for name, message in (("error", "no extraordinary vertex"), ("creases", "no creases")):
+        with pytest.raises(FigureError, match=f'torus.obj" has {message}'):
+            FIGURES[name](options(cage=tmp_path / "torus.obj"))
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb", "coarse")
@@ -173,7 +237,7 @@ def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_
 
 def test_each_panel_of_creases_has_tags_of_its_own():
     from mitsuba_subdivision import ControlCage
-    from mitsuba_subdivision.figures.creases import INFINITE, LABELS, TITLES, _tagged
+    from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, labels
     from mitsuba_subdivision.figures.output import scene_path
 
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
@@ -183,7 +247,7 @@ def test_each_panel_of_creases_has_tags_of_its_own():
     assert np.array_equal(infinite, np.where(own > 0, INFINITE, 0))
     # The legend tells every sharpness there is.
     assert set(own[own > 0]) == {1.2, 1.5, 2, 3, 4, 10}
-    assert list(LABELS.values()) == ["1.2\u20132", "3\u20134", "∞"]
+    assert list(labels(own).values()) == ["1.2\u20132", "3\u20134", "∞"]
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -248,7 +312,7 @@ def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
 def test_subdivision_keeps_the_number_of_extraordinary_points():
     from mitsuba_subdivision import ControlCage, LimitSurface
     from mitsuba_subdivision.figures.output import scene_path
-    from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, refined, regular_elements
+    from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, regular_elements
 
     cage = ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")
     assert set(cage.face_sizes) == {3, 4, 5, 6}
@@ -257,7 +321,7 @@ def test_subdivision_keeps_the_number_of_extraordinary_points():
         surface = LimitSurface(cage)
         assert extraordinary_count(cage.topology) == 20
         shares.append(area_share(surface, regular_elements(surface)))
-        cage = refined(cage)
+        cage = cage.refined()
     assert shares[0] == 0 < shares[1] < shares[2] < 1
     # Every irregular patch of level 2 has one extraordinary vertex: as many as the vertices have corners.
     valences = surface.cage.topology.vertex_face_count
@@ -295,18 +359,19 @@ def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG00
 
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_curvature_grows_as_the_eigenvalues_say(valence):
-    from mitsuba_subdivision.figures.curvature import growth, largest_by_level
+    from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 
-    largest = largest_by_level(valence)
+    largest = largest_by_level(bent_ball(valence), valence)
     assert (largest[-1] / largest[-5]) ** (1 / 4) == pytest.approx(growth(valence), abs=0.02)
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
+    from mitsuba_subdivision.cage.named_cages import extraordinary
     from mitsuba_subdivision.figures.figure_scenes import load_stage
     from mitsuba_subdivision.figures.normal_error import offset_cage
     from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
 
-    view = TangentView.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
     stage = load_stage("zoom", resolution=RESOLUTION)
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
         samples = _sample(view, magnification, 8)

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.figures.normal_error import LEVELS, exact_normals, normal_errors, offset_cage
 
 # First level with an error above 5 degrees, MATH of float32 and float64: theta ~ kappa eps |c1| / lambda_2^n. Another
@@ -25,7 +26,7 @@ MOVED = 2
 
 @cache
 def cage_and_normals(valence, offset):
-    cage = offset_cage(valence, offset)
+    cage = offset_cage(extraordinary(valence), offset)
     return cage, exact_normals(cage)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..figures import FIGURES, FigureOptions, require_options
+from ..figures.output import COLUMN, INCH, PAGE
 from ..messages import print_result
 from ..schemes import SCHEME_CLASSES
 from ..whole_file import require_folder, require_writable
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
+# In millimetres, of posters.
+WIDEST = 1200.0
 
 
 def add_parser(commands: Commands) -> None:
@@ -37,16 +41,22 @@ def add_parser(commands: Commands) -> None:
         metavar="DIR",
         help="folder to write to (default: %(default)s)",
     )
-    figure.add_argument(
-        "--resolution", type=positive, metavar="N", help="width of a rendered image in pixels (default: 512)"
-    )
+    figure.add_argument("--resolution", type=positive, metavar="N", help="width of a panel in pixels (default: 512)")
     figure.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
+    figure.add_argument(
+        "--width",
+        type=width,
+        metavar="LENGTH",
+        help=f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)",
+    )
     figure.add_argument(
         "--scheme",
         choices=list(SCHEME_CLASSES),
         metavar="SCHEME",
         help=f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)",
     )
+    takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
+    figure.add_argument("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
     figure.add_argument(
         "--format",
         choices=FigureOptions.formats,
@@ -60,7 +70,8 @@ def add_parser(commands: Commands) -> None:
 
 
 def _figure(options: argparse.Namespace) -> None:
-    given = {name: getattr(options, name) for name in ("resolution", "spp", "scheme") if getattr(options, name)}
+    names = ("resolution", "spp", "width", "scheme", "cage")
+    given = {name: getattr(options, name) for name in names if getattr(options, name)}
     formats = tuple(options.formats or ())
     if options.name != "all":
         require_options(options.name, given, formats)
@@ -69,14 +80,23 @@ def _figure(options: argparse.Namespace) -> None:
     set_variant(options.variant)
     if formats:
         given["formats"] = formats
-    for name in _figures_of(options):
-        for path in FIGURES[name](FigureOptions(options.output, **given)):
-            print_result(path)
+    wanted = set(formats or ["png"])
+    for name, figure in FIGURES.items():
+        takes_all = bool(wanted & set(figure.formats)) and (not options.cage or "cage" in figure.options)
+        if options.name == name or (options.name == "all" and takes_all):
+            for path in figure(FigureOptions(options.output, **{"width": figure.width, **given})):
+                print_result(path)
 
 
-def _figures_of(options: argparse.Namespace) -> list[str]:
-    """Names of the figures to draw. "all" leaves out those that another figure draws as well."""
-    if options.name != "all":
-        return [options.name]
-    formats = set(options.formats or ["png"])
-    return [name for name, figure in FIGURES.items() if not figure.drawn_with and formats & set(figure.formats)]
+def width(text: str) -> float:
+    """Parse a width in millimetres or inches; returns millimetres."""
+    number, unit = text.removesuffix("mm"), 1.0
+    if text.endswith("in"):
+        number, unit = text.removesuffix("in"), INCH
+    try:
+        length = unit * float(number)
+    except ValueError:
+        length = math.nan
+    if not COLUMN <= length <= WIDEST:
+        raise argparse.ArgumentTypeError(f'"{text}"; expected a width from {COLUMN:g}mm to {WIDEST:g}mm, or in inches')
+    return length

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..images.probe_tier import normal_angle
+from ..schemes import scheme_named
 from ..surface import LimitSurface
-from .figure_scenes import in_8_bits, load_stage, render
-from .normal_error import draw as draw_normal_error
-from .output import FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
+from .characteristic import patch_of_valence
+from .figure_scenes import in_8_bits, load_stage, render, staged
+from .output import FigureError, FigureOptions, panels, scene_path, scientific, show, write_pixels, write_plot
+from .own_cage import around_vertices, frame
 from .projection import project
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ NEEDLE_RADIUS = 0.3
 NEEDLE_LENGTH = 0.07
 # Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
 EDGE_RADIUS = 0.8
+# What lambda_2^n is at the sample of a cage of a user: eps |c1| / lambda_2^n is 30.
+LOST = 2.0**-23 / 3
 # Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
 NEGLIGIBLE = 1e-8
 
@@ -45,16 +49,20 @@ class NormalRule:
 
 @dataclass(frozen=True)
 class Row:
-    """A scene of one scheme, the ``u = v`` at which its extraordinary point is sampled, and the tessellation rate."""
+    """A scene of one scheme, the ``u = v`` at which its extraordinary point is sampled, and the tessellation rate.
+
+    A cage of a user takes the place of the scene's own.
+    """
 
     scheme: str
     valence: int
     sample_offset: float
     rate: int
+    own: ControlCage | None = None
 
     @property
     def scene(self) -> Path:
-        return scene_path(f"valence{self.valence}")
+        return scene_path(f"valence{5 if self.own else self.valence}")
 
     @property
     def cage(self) -> str:
@@ -64,7 +72,7 @@ class Row:
 
     def surface(self) -> LimitSurface:
         """The scene's surface. The extraordinary point is corner 0 of element 0, and vertex 0 of a tessellation."""
-        return LimitSurface(ControlCage.from_file(self.scene.parent / self.cage), self.scheme)
+        return LimitSurface(self.own or ControlCage.from_file(self.scene.parent / self.cage), self.scheme)
 
 
 # At |c1| = 10 and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the
@@ -79,9 +87,9 @@ ROWS = (
     Row("doo_sabin", 5, 1e-7, 4),
 )
 RULES = (
-    NormalRule("Stam's form, equation (11)", "stam", at_point=False),
-    NormalRule("stabilised form, equation (12)", "stabilized", at_point=False),
-    NormalRule("normal at the point, equation (13)", "stabilized", at_point=True),
+    NormalRule("Stam's form (11)", "stam", at_point=False),
+    NormalRule("stabilised (12)", "stabilized", at_point=False),
+    NormalRule("at the point (13)", "stabilized", at_point=True),
 )
 
 
@@ -106,46 +114,58 @@ def vertex_normal(row: Row, rule: NormalRule) -> VertexNormal:
 
 
 def draw(options: FigureOptions) -> list[Path]:
-    """Render valences 3 and 5 with vertex normals by (11), (12) and (13), and plot normal error against level.
+    """Render valences 3 and 5 with vertex normals by (11), (12) and (13).
 
     Only the arithmetic of (11) in float32 darkens the first column: scene, light, tessellation and positions are the
-    same in all columns. The plot is drawn for Catmull-Clark only.
+    same in all columns.
     """
-    plt = pyplot()
     rows = [row for row in ROWS if row.scheme == options.scheme]
-    figure, axes = plt.subplots(len(rows), len(RULES), figsize=(9.6, 7.2))
-    panels, records = [], []
+    if options.cage:
+        rows = _own_rows(options.cage, options.scheme)
+    figure, axes = panels(options, len(rows), len(RULES))
+    rendered, records = [], []
     for row, row_axes in zip(rows, axes, strict=True):
         for rule, axis in zip(RULES, row_axes, strict=True):
             vertex = vertex_normal(row, rule)
             pixels, overlay = _render(row, rule, options)
             location, error = _caption(row, rule, vertex)
             options.report(f"valence {row.valence}, {rule.title}: {location}; {error}")
-            _draw_panel(axis, pixels, overlay, f"{location.replace('c1', 'c$_1$')}\n{error}")
-            panels.append(pixels)
+            _draw_panel(axis, pixels, overlay, f"{location}\n{error}")
+            rendered.append(pixels)
             records.append({"valence": row.valence, "rule": rule.title, **vars(vertex)})
-        row_axes[0].set_ylabel(f"valence {row.valence}", fontsize=11)
+        row_axes[0].set_ylabel(f"valence {row.valence}, |c₁| = {vertex.offset:.1f}")
     for axis, rule in zip(axes[0], RULES, strict=True):
-        axis.set_title(rule.title, fontsize=10)
-    figure.tight_layout(h_pad=1.2)
+        axis.set_title(rule.title)
     name = "artifact" if options.scheme == "catmull_clark" else f"artifact_{options.scheme}"
-    written = write_plot(options, name, figure, "png", dpi=100)
-    strips = [np.concatenate(panels[i : i + len(RULES)], axis=1) for i in range(0, len(panels), len(RULES))]
+    written = write_plot(options, name, figure)
+    strips = [np.concatenate(rendered[i : i + len(RULES)], axis=1) for i in range(0, len(rendered), len(RULES))]
     metadata = {"pictures": records, "spp": options.spp, "variant": mi.variant()}
-    written += write_pixels(options, name, np.concatenate(strips), metadata)
-    return written + (draw_normal_error(options) if options.scheme == "catmull_clark" else [])
+    return written + write_pixels(options, name, np.concatenate(strips), metadata)
+
+
+def _own_rows(path: Path, scheme: str) -> list[Row]:
+    """Rows of a user's cage, moved to where the scene of valence 5 has its vertex."""
+    if scheme != "catmull_clark":
+        raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
+    like = ROWS[1]
+    rows = []
+    for valence, cage in around_vertices(path, 2, frame(like.surface())).items():
+        # Where Stam's form has lost the normal, as above.
+        subdominant = patch_of_valence(scheme_named(like.scheme), valence).basis.subdominant
+        level = np.log(LOST) / np.log(subdominant)
+        rows.append(Row(like.scheme, valence, float(f"{0.5**level:.0e}"), like.rate, cage))
+    return rows
 
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
     """Label with the sample location of the vertex and the error of its normal."""
     location = (
-        "u = v = 0" if vertex.level is None else f"u = v = {rule.sample_offset(row):.0e}, level n = {vertex.level}"
+        "u = v = 0" if vertex.level is None else f"u = v = {scientific(rule.sample_offset(row))}, n = {vertex.level}"
     )
     if vertex.error >= 0.1:
-        size = f"{vertex.error:.1f}°"
-    else:
-        size = f"{vertex.error:.0e}°" if vertex.error >= NEGLIGIBLE else f"below {NEGLIGIBLE:.0e}°"
-    return f"{location}, |c1| = {vertex.offset:.1f}", f"normal error at the vertex {size}"
+        return location, f"error {vertex.error:.1f}°"
+    is_negligible = vertex.error < NEGLIGIBLE
+    return location, f"error {'below ' * is_negligible}{scientific(max(vertex.error, NEGLIGIBLE))}°"
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,56 +186,48 @@ class Overlay:
 
 def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray[np.float32], Overlay]:
     offset, resolution = rule.sample_offset(row), options.resolution
-    scene = load_stage(
-        row.scene.stem,
-        cage=row.cage,
-        scheme=row.scheme,
-        resolution=resolution,
-        rate=row.rate,
-        evaluator=rule.evaluator,
-        sample_offset=repr(offset),
-    )
+    surface, stage = row.surface(), load_stage(row.scene.stem, resolution=resolution)
+    shape = {
+        "type": "subdivision",
+        **surface.cage.as_properties(mi),
+        "scheme": row.scheme,
+        "tessellation_rate": row.rate,
+        "evaluator": rule.evaluator,
+        "sample_offset": offset,
+        "bsdf": next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter()),
+    }
+    scene = staged(stage, [shape for shape in stage.shapes() if shape.is_emitter()], surface=mi.load_dict(shape))
     pixels = render(scene, options, f"valence {row.valence}, {rule.title}")[..., :3]
-    surface = row.surface()
     tessellation = surface.tessellate(row.rate, rule.evaluator, np.float32, offset)
     distance = np.linalg.norm(tessellation.positions - tessellation.positions[0], axis=1)
     near = np.flatnonzero(distance < NEEDLE_RADIUS)
     start = tessellation.positions[near].astype(np.float64)
     needles = np.stack([start, start + NEEDLE_LENGTH * tessellation.normals[near]], axis=1)
     sensor = scene.sensors()[0]
-    return pixels, Overlay(
-        project(sensor, needles, resolution), project(sensor, _edges(surface, tessellation.positions), resolution)
-    )
+    return pixels, Overlay(project(sensor, needles, resolution), project(sensor, _edges(surface), resolution))
 
 
-def _edges(surface: LimitSurface, corners: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Curves between the elements near the extraordinary point: ``(m, 17, 3)``.
-
-    Parameters
-    ----------
-    corners : (n, 3)
-        Limit points of the elements' corners, the extraordinary point first.
-    """
+def _edges(surface: LimitSurface) -> NDArray[np.float64]:
+    """Curves between the elements near the extraordinary point: ``(m, 17, 3)``."""
     elements = surface.patches.elements
     along = np.stack([np.linspace(0, 1, 17), np.zeros(17)], axis=1)
-    distance = np.linalg.norm(corners[elements.face_vertices] - corners[0], axis=1)
-    begins = np.flatnonzero(distance < EDGE_RADIUS)
-    element = elements.face[begins]
-    corner = begins - elements.face_offsets[element]
+    corner = np.arange(len(elements.face)) - elements.face_offsets[elements.face]
+    begin = surface.evaluate(elements.face, np.zeros((len(corner), 2)), corner).p
+    near = np.flatnonzero(np.linalg.norm(begin - begin[0], axis=1) < EDGE_RADIUS)
     # Elements that are a part of a face end in the middle of an edge.
-    samples = surface.evaluate(np.repeat(element, 17), np.tile(along, (len(element), 1)), np.repeat(corner, 17))
+    samples = surface.evaluate(
+        np.repeat(elements.face[near], 17), np.tile(along, (len(near), 1)), np.repeat(corner[near], 17)
+    )
     return samples.p.reshape(-1, 17, 3).astype(np.float64, copy=False)
 
 
 def _draw_panel(axis: Axes, pixels: NDArray[np.float32], overlay: Overlay, caption: str) -> None:
     from matplotlib.collections import LineCollection
 
-    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+    show(axis, in_8_bits(pixels), caption=caption)
     axis.set_xlim(0, pixels.shape[1])
     axis.set_ylim(pixels.shape[0], 0)
     own, *others = overlay.needles
-    axis.add_collection(LineCollection(list(overlay.edges), colors="#40362a", linewidths=0.5, alpha=0.35))
-    axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.9, capstyle="round"))
-    axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=2.2, capstyle="round"))
-    hide_frame(axis)
-    axis.set_xlabel(caption, fontsize=8.5)
+    axis.add_collection(LineCollection(list(overlay.edges), colors="#40362a", linewidths=0.3, alpha=0.4))
+    axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
+    axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=1.5, capstyle="round"))

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..variants import SceneNode
 from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
-from .output import FigureOptions, pyplot, scene_path, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .own_cage import fitted, read
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +24,7 @@ TITLES = {
     "own": ("semi-sharp", "the cage's own tags"),
     "infinite": ("infinitely sharp", "every crease"),
 }
-CAGE_TITLE = ("control cage", "sharpness of its creases")
+CAGE_TITLE = ("control cage", "")
 # Height of the images, in widths.
 HEIGHT = 1.55
 RATE = 24
@@ -38,36 +40,31 @@ MATERIAL = {
 # Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
 PALE = "#e4e4e1"
 EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
-LABELS = {1: "1.2\u20132", 3: "3\u20134", INFINITE: "∞"}
-TITLE_SIZE, TEXT_SIZE, LEGEND_SIZE = 14, 12.5, 11.5
 
 
 def draw(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
-    plt = pyplot()
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
+    if options.cage:
+        box = cage.positions.min(axis=0), cage.positions.max(axis=0)
+        cage = fitted(read(options.cage), *box)
+        if not cage.tags.edges.any():
+            raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
     stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
     scenes = {CAGE_TITLE: staged(stage, **_cage_shapes(cage))}
     for name, title in TITLES.items():
         shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": RATE}
         scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
-    figure, axes = plt.subplots(1, len(scenes), figsize=(12.2, 12.2 / len(scenes) * HEIGHT + 0.75))
-    panels = []
-    for (title, scene), axis in zip(scenes.items(), axes, strict=True):
-        options.report(", ".join(title))
-        pixels = render(scene, options, title[0])[..., :3]
-        panels.append(pixels)
-        axis.imshow(in_8_bits(pixels), interpolation="lanczos")
-        axis.set_title(title[0], fontsize=TITLE_SIZE, fontweight="bold")
-        if title != CAGE_TITLE:
-            axis.text(0.5, -0.02, title[1], fontsize=TEXT_SIZE, ha="center", va="top", transform=axis.transAxes)
-        axis.set_axis_off()
-    _draw_legend(axes[0])
-    # Matplotlib's layout leaves no room for texts outside of axes without frames.
-    figure.subplots_adjust(left=0.005, right=0.995, top=0.935, bottom=0.075, wspace=0.02)
-    written = write_plot(options, "creases", figure, "png", dpi=110)
+    figure, axes = panels(options, *rows_of(options, len(scenes)))
+    rendered = []
+    for ((headline, caption), scene), axis in zip(scenes.items(), axes.flat, strict=True):
+        options.report(f"{headline}, {caption}" if caption else headline)
+        rendered.append(render(scene, options, headline)[..., :3])
+        show(axis, in_8_bits(rendered[-1]), headline, caption)
+    _draw_legend(axes[0, 0], cage)
+    written = write_plot(options, "creases", figure)
     metadata = {"pictures": [CAGE_TITLE[0], *TITLES], "spp": options.spp}
-    return written + write_pixels(options, "creases", np.concatenate(panels, axis=1), metadata)
+    return written + write_pixels(options, "creases", np.concatenate(rendered, axis=1), metadata)
 
 
 def _tagged(cage: ControlCage, name: str) -> ControlCage:
@@ -100,21 +97,34 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
     return shapes
 
 
-def _draw_legend(axis: Axes) -> None:
+def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
+    """Ranges of the sharpness of creases by their least values in `EDGES`."""
+    ends = [*EDGES, np.inf]
+    found = {}
+    for least, end in itertools.pairwise(ends):
+        values = np.unique(sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)])
+        if len(values):
+            ends_of_range = dict.fromkeys(f"{value:g}" for value in values[[0, -1]])
+            found[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends_of_range)
+    return found
+
+
+def _draw_legend(axis: Axes, cage: ControlCage) -> None:
     """Draw the colours of sharpness below the cage."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color=EDGES[least][0], linewidth=3.5, label=text) for least, text in LABELS.items()]
+    shown = labels(cage.tags.edges)
+    handles = [Line2D([], [], color=EDGES[least][0], linewidth=2, label=label) for least, label in shown.items()]
     handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
-    axis.legend(
+    legend = axis.legend(
         handles=handles,
         loc="upper center",
         bbox_to_anchor=(0.5, 0.0),
         ncols=len(handles),
-        fontsize=LEGEND_SIZE,
-        frameon=False,
         handlelength=0.9,
         handletextpad=0.3,
         columnspacing=0.9,
         borderaxespad=0.1,
     )
+    # Captions of other panels reserve the room for it.
+    legend.set_in_layout(False)

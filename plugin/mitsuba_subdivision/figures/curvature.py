@@ -13,7 +13,8 @@ from ..cage.named_cages import extraordinary
 from ..schemes import scheme_named
 from ..surface import LimitSurface, SurfaceSamples
 from .characteristic import patch_of_valence
-from .output import FigureOptions, hide_frame, pyplot, write_plot
+from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_plot
+from .own_cage import around_vertices, frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +27,8 @@ BEND = 0.35
 RADIUS = 0.21
 # Curvature beyond LIMIT is drawn in the last colour. Colours are linear up to LINEAR, then logarithmic.
 LIMIT, LINEAR = 8.0, 1.0
+# Lines of equal curvature, up to the border between both signs.
+NEGATIVE = (-2, -0.5, 0)
 LEVELS = np.arange(0, 41)
 # Samples of each level for the plot: near the middles of the three regular children, off their diagonals.
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
@@ -62,9 +65,8 @@ def growth(valence: int) -> float:
     return float(patch.basis.moduli[3] / patch.basis.subdominant**2)
 
 
-def curvature_map(valence: int, count: int) -> CurvatureMap:
+def curvature_map(surface: LimitSurface, valence: int, count: int) -> CurvatureMap:
     """Sample the elements at the vertex, more densely towards it."""
-    surface = bent_ball(valence)
     at = surface.evaluate(0, np.zeros((1, 2)))
     # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
     along = np.concatenate([[0], np.geomspace(1e-3, 1, count)])
@@ -87,9 +89,8 @@ def _curvatures(samples: SurfaceSamples) -> tuple[NDArray[np.float64], NDArray[n
     return samples.gaussian_curvature.astype(np.float64), samples.mean_curvature.astype(np.float64)
 
 
-def largest_by_level(valence: int) -> NDArray[np.float64]:
+def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]:
     """Largest absolute principal curvature of a few samples on each level: ``(levels,)``."""
-    surface = bent_ball(valence)
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     largest = np.zeros(len(LEVELS))
     for element in range(valence):
@@ -101,48 +102,56 @@ def largest_by_level(valence: int) -> NDArray[np.float64]:
 
 def draw(options: FigureOptions) -> list[Path]:
     """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level."""
-    plt = pyplot()
     from matplotlib.colors import SymLogNorm
 
-    figure, axes = plt.subplots(3, len(VALENCES), figsize=(9.6, 8.8), layout="constrained", height_ratios=(1, 1, 0.7))
+    surfaces = {valence: bent_ball(valence) for valence in VALENCES}
+    if options.cage:
+        cages = around_vertices(options.cage, len(VALENCES), frame(bent_ball(5)))
+        surfaces = {valence: LimitSurface(cage) for valence, cage in cages.items()}
+    figure, axes = panels(options, 3, len(surfaces), sharey="row")
     norm = SymLogNorm(LINEAR, vmin=-LIMIT, vmax=LIMIT)
-    for valence, column in zip(VALENCES, axes.T, strict=True):
-        found, rate = curvature_map(valence, max(options.resolution // 4, 8)), growth(valence)
-        measured = largest_by_level(valence)
+    for (valence, surface), column in zip(surfaces.items(), axes.T, strict=True):
+        found, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
+        measured = largest_by_level(surface, valence)
         options.report(f"valence {valence}: {rate:.4f} per level; largest at level {LEVELS[-1]} {measured[-1]:.3g}")
         for axis, values in zip(column, (found.gaussian, found.mean), strict=False):
             shown = _draw_disc(axis, found, values, norm)
         plot = column[-1]
-        plot.semilogy(LEVELS, measured, "o", markersize=2.6, color="#1f6f8b", label="surface")
+        plot.semilogy(LEVELS, measured, "o", markersize=2, color=SERIES[1][0], label="surface")
         line = measured[-1] * rate ** (LEVELS - LEVELS[-1])
-        plot.semilogy(LEVELS, line, color="#c8432b", linewidth=1, label=r"$(|\lambda_4|/\lambda_2^2)^n$")
-        column[0].set_title(f"valence {valence}", fontsize=11)
-        plot.set_title(rf"$|\lambda_4|/\lambda_2^2$ = {rate:.3f} per level", fontsize=10)
-        plot.set_xlabel("level $n$")
-        plot.grid(color="0.9", linewidth=0.6)
+        plot.semilogy(LEVELS, line, color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")
+        column[0].set_title(f"valence {valence}")
+        plot.set_xlabel(f"level $n$\n|λ₄|/λ₂² = {rate:.3f}")
+        plot.grid()
         plot.set_ylim(0.3, 1e6)
-    for axis, name in zip(axes[:, 0], ("Gaussian curvature", "mean curvature"), strict=False):
-        axis.set_ylabel(name, fontsize=11)
+        plot.set_box_aspect(0.75)
+        label_powers(plot.yaxis)
+    for axis, name in zip(axes[:, 0], ("Gaussian", "mean"), strict=False):
+        axis.set_ylabel(name)
     bar = figure.colorbar(shown, ax=axes[:2], fraction=0.03, pad=0.01, extend="both", shrink=0.8)
-    ticks = [-LIMIT, -4, -2, -1, 0, 1, 2, 4, LIMIT]
+    ticks = [-LIMIT, -2, 0, 2, LIMIT]
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()
-    axes[2, 0].set_ylabel("largest principal curvature")
-    axes[2, 0].legend(frameon=False, fontsize=8, loc="upper left")
-    return write_plot(options, "curvature", figure, "png", "pdf")
+    bar.set_label("curvature")
+    axes[2, 0].set_ylabel("largest curvature")
+    figure.legend(*plot.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return write_plot(options, "curvature", figure)
 
 
 def _draw_disc(axis: Axes, found: CurvatureMap, values: NDArray[np.float64], norm: Any) -> Any:
     """Draw values of the curvature in a disc around the vertex; returns the last part drawn, for the colour bar."""
     from matplotlib.patches import Circle
 
-    disc = Circle((0, 0), RADIUS, facecolor="none", edgecolor="black", linewidth=0.8)
+    disc = Circle((0, 0), RADIUS, facecolor="none", edgecolor="black", linewidth=0.5)
     axis.add_patch(disc)
     for x, y, value in zip(found.x, found.y, values, strict=True):
         shown = axis.pcolormesh(x, y, value, norm=norm, cmap="RdBu_r", shading="gouraud", rasterized=True)
         shown.set_clip_path(disc)
-        (edge,) = axis.plot(x[0], y[0], color="black", linewidth=0.5, alpha=0.6)
+        (edge,) = axis.plot(x[0], y[0], color="black", linewidth=0.3, alpha=0.6)
         edge.set_clip_path(disc)
+        # In grey, both ends of the colours are dark: lines of negative curvature are dashed.
+        lines = axis.contour(x, y, value, levels=NEGATIVE, colors="black", linewidths=0.4)
+        lines.set_clip_path(disc)
     axis.set_aspect("equal")
     axis.set_xlim(-1.02 * RADIUS, 1.02 * RADIUS)
     axis.set_ylim(-1.02 * RADIUS, 1.02 * RADIUS)

@@ -11,16 +11,13 @@ from numpy.typing import NDArray
 from ..device_arrays import upload
 from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
+from ..tessellation import HIGHEST_RATE
 from ..variants import SceneNode
-from .figure_scenes import in_8_bits, load_stage, render, staged
-from .output import FigureOptions, save_png, scene_path, write_pixels
+from .figure_scenes import draw_picture, load_stage, picture_size, render, staged
+from .output import FigureOptions, scene_path
 
-# The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
-WIDER = 2.25
-HEIGHT = 0.625
 # How far triangles may be from the surface, in pixels; and where they are drawn.
 PIXEL_ERROR, PIXEL_ERROR_OF_LINES = 0.08, 1.5
-MAX_RATE = 256
 SCALE = 0.115
 # Where slices end, as parts of the width.
 ENDS = (0.0, 0.35, 0.64, 1.0)
@@ -39,14 +36,13 @@ LINE, LINE_IMAGE = 0.045, 256
 
 def draw(options: FigureOptions) -> list[Path]:
     """Render the three slices."""
-    width = round(WIDER * options.resolution)
-    height = round(HEIGHT * width)
+    width, height = picture_size(options)
     sensor = load_stage("displacement", width=width, height=height, columns=width).sensors()[0]
     plain = {
         "type": "subdivision",
         "filename": str(scene_path("displacement").parent / "cages" / "jar.obj"),
         **pixel_error_for(sensor, PIXEL_ERROR),
-        "max_rate": MAX_RATE,
+        "max_rate": HIGHEST_RATE,
         "bsdf": glazed({"type": "rgb", "value": GLAZE}),
     }
     heights = mi.load_dict({"type": "bitmap", "data": upload(mi.TensorXf, quilt()[..., None]), "raw": True})
@@ -65,10 +61,8 @@ def draw(options: FigureOptions) -> list[Path]:
         stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
         rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])
     pixels = np.concatenate(rendered, axis=1)
-    written = options.paths("displacement", "png")
-    for path in written:
-        save_png(_divided(in_8_bits(pixels), columns[1:-1]), path)
-    return written + write_pixels(options, "displacement", pixels, {"spp": options.spp, "pixel_error": PIXEL_ERROR})
+    metadata = {"spp": options.spp, "pixel_error": PIXEL_ERROR}
+    return draw_picture(options, "displacement", pixels, metadata, columns[1:-1])
 
 
 def quilt() -> NDArray[np.float32]:
@@ -119,11 +113,3 @@ def _lines() -> SceneNode:
     colours = part * np.array(LINES) + (1 - part) * np.array(GLAZE)
     data = upload(mi.TensorXf, colours)
     return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
-
-
-def _divided(pixels: NDArray[np.uint8], columns: list[int]) -> NDArray[np.uint8]:
-    """The picture with a line between slices."""
-    divided = pixels.copy()
-    for column in columns:
-        divided[:, column - 1 : column + 1] = 235
-    return divided

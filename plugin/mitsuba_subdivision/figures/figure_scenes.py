@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -13,10 +16,12 @@ from ..regression.rendering import render_parts
 from ..regression.scene import load_scene
 from ..srgb import decoded
 from ..variants import SceneNode
-from .output import FigureOptions, scene_path
+from .output import FigureOptions, panels, scene_path, show, write_pixels, write_plot
 
 # Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
 PART_SAMPLES = 1 << 26
+# A picture that stands alone is wider than those that share a figure, by this factor, and 8 : 5.
+WIDER, HEIGHT = 2.25, 0.625
 
 
 def load_stage(name: str, **parameters: str | float) -> mi.Scene:
@@ -56,9 +61,9 @@ def make_mesh(
     return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=normals is None)
 
 
-def staged(stage: mi.Scene, **objects: Any) -> mi.Scene:
-    """Make a scene with the camera, integrator, emitters and shapes of another, and with more objects."""
-    children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes())}
+def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects: Any) -> mi.Scene:
+    """Make a scene with the camera, integrator, emitters and all or some shapes of another, and with more objects."""
+    children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes() if shapes is None else shapes)}
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
     children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
     return mi.load_dict(
@@ -94,6 +99,30 @@ def _parts(spp: int, most: int) -> list[int]:
         parts.append(size)
         spp -= size
     return parts
+
+
+def picture_size(options: FigureOptions) -> tuple[int, int]:
+    """Width and height in pixels of a picture that stands alone."""
+    width = round(WIDER * options.resolution)
+    return width, round(HEIGHT * width)
+
+
+def draw_picture(
+    options: FigureOptions,
+    name: str,
+    pixels: NDArray[np.float32],
+    metadata: dict[str, Any],
+    columns: Sequence[float] = (),
+) -> list[Path]:
+    """Write linear RGB pixels as a figure of one picture, with white lines at some of its columns."""
+    figure, ((axis,),) = panels(options, 1, 1)
+    show(axis, in_8_bits(pixels))
+    axis.set_position((0, 0, 1, 1))
+    figure.set_figheight(HEIGHT * figure.get_figwidth())
+    for column in columns:
+        axis.axvline(column - 0.5, color="white")
+    written = write_plot(replace(options, resolution=pixels.shape[1]), name, figure, layouts=0)
+    return written + write_pixels(options, name, pixels, metadata)
 
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:

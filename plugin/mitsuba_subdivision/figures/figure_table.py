@@ -2,8 +2,8 @@
 
 A new figure is one file and one line. The file is a module of this package. Its function ``draw`` gets `FigureOptions`,
 draws the figure, and returns the files that it wrote. The line in the table `FIGURES` names the module, says what the
-figure shows, and lists the options that change it and the formats that it has. The command ``figure`` and its help read
-this table. Every figure has a file of its own, however short.
+figure shows, and lists the options that change it. The command ``figure`` and its help read this table. Every figure
+has a file of its own, however short.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from .output import FigureOptions
+from .output import COLUMN, PAGE, FigureOptions
 
 
 @dataclass(frozen=True)
@@ -27,47 +27,41 @@ class Figure:
     shows : str
         What the figure shows, for the help.
     options : tuple of str
-        Those of "resolution", "spp" and "scheme" that change the figure.
-    formats : tuple of str
-        Of "png", "pdf" and "exr".
-    catmull_clark_formats : tuple of str
-        Those of the formats that the figure has under Catmull-Clark only.
-    drawn_with : str or None
-        Another figure that draws this one as well.
+        Those of "spp", "scheme" and "cage" that change the figure; "resolution" and "width" change all.
+    width : float
+        Width on paper in millimetres, unless the options have another.
     """
 
     module: str
     shows: str
-    options: tuple[str, ...]
-    formats: tuple[str, ...]
-    catmull_clark_formats: tuple[str, ...] = ()
-    drawn_with: str | None = None
+    options: tuple[str, ...] = ()
+    width: float = PAGE
+
+    @property
+    def formats(self) -> tuple[str, ...]:
+        """Of "png", "pdf" and "exr": the last for figures that are rendered."""
+        return FigureOptions.formats if "spp" in self.options else FigureOptions.formats[:-1]
 
     def __call__(self, options: FigureOptions) -> list[Path]:
         draw: Callable[[FigureOptions], list[Path]] = importlib.import_module(f".{self.module}", __package__).draw
         return draw(options)
 
 
-_SIZE = ("resolution", "spp")
-_ALL = ("png", "pdf", "exr")
-_PLOT = ("png", "pdf")
-_RENDER = ("png", "exr")
-
 FIGURES: dict[str, Figure] = {
-    "subdivision": Figure("subdivision", "a cage and its refinements, irregular patches grey", _SIZE, _ALL),
-    "refinement": Figure("refinement", "control points of a patch before and after one refinement", (), _PLOT),
-    "domains": Figure("domains", "parameter domains of the regular patches at each level", ("scheme",), _PLOT),
-    "artifact": Figure("artifact", "normals by (11), (12) and (13), rendered", (*_SIZE, "scheme"), _ALL, ("pdf",)),
-    "error": Figure("normal_error", "normal error against level by (11), (12), (13)", (), _PLOT, drawn_with="artifact"),
-    "schemes": Figure("schemes", "one cage under the three schemes", _SIZE, _RENDER),
-    "creases": Figure("creases", "one cage with smooth, semi-sharp and sharp creases", _SIZE, _RENDER),
-    "shading": Figure("shading", "brushed metal, shaded by vertices and exactly at every hit", _SIZE, _RENDER),
-    "displacement": Figure("displacement", "a jar before and after it is displaced, and its triangles", _SIZE, _RENDER),
-    "zoom": Figure("zoom", "an extraordinary vertex, magnified up to a million times", _SIZE, _ALL),
-    "zebra": Figure("zebra", "reflection lines, with exact normals and with others", _SIZE, _ALL),
-    "curvature": Figure("curvature", "curvature around extraordinary vertices", ("resolution",), _PLOT),
-    "fit": Figure("fit", "cages fitted to pictures, and how near they come", _SIZE, _ALL),
-    "hero": Figure("hero", "a human figure and its control cage", _SIZE, _RENDER),
+    "subdivision": Figure("subdivision", "a cage and its refinements, irregular patches grey", ("spp", "cage")),
+    "refinement": Figure("refinement", "control points of a patch before and after one refinement", (), COLUMN),
+    "domains": Figure("domains", "parameter domains of the regular patches at each level", ("scheme",), COLUMN),
+    "artifact": Figure("artifact", "normals by (11), (12) and (13), rendered", ("spp", "scheme", "cage")),
+    "error": Figure("normal_error", "normal error against level by (11), (12), (13)", ("cage",)),
+    "schemes": Figure("schemes", "one cage under the three schemes", ("spp",)),
+    "creases": Figure("creases", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
+    "shading": Figure("shading", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
+    "displacement": Figure("displacement", "a jar before and after it is displaced, and its triangles", ("spp",)),
+    "zoom": Figure("zoom", "an extraordinary vertex, magnified up to a million times", ("spp",)),
+    "zebra": Figure("zebra", "reflection lines, with exact normals and with others", ("spp",)),
+    "curvature": Figure("curvature", "curvature around extraordinary vertices", ("cage",)),
+    "fit": Figure("fit", "cages fitted to pictures, and how near they come", ("spp",)),
+    "hero": Figure("hero", "a human figure and its control cage", ("spp",)),
 }
 
 
@@ -89,11 +83,9 @@ def require_options(name: str, given: dict[str, object], formats: Iterable[str])
     """
     figure = FIGURES[name]
     for option in given:
-        if option not in figure.options:
-            raise ValueError(f'--{option} has no effect on the figure "{name}"; expected no such option')
-    possible = set(figure.formats)
-    if given.get("scheme", "catmull_clark") != "catmull_clark":
-        possible -= set(figure.catmull_clark_formats)
+        if option not in (*figure.options, "resolution", "width"):
+            others = ", ".join(f'"{other}"' for other, entry in FIGURES.items() if option in entry.options)
+            raise ValueError(f'--{option} has no effect on the figure "{name}"; expected one of {others}')
     for wanted in formats:
-        if wanted not in possible:
-            raise ValueError(f'the figure "{name}" is not drawn as {wanted}; expected {" or ".join(sorted(possible))}')
+        if wanted not in figure.formats:
+            raise ValueError(f'the figure "{name}" is not drawn as {wanted}; expected {" or ".join(figure.formats)}')

@@ -18,7 +18,7 @@ from ..variants import SceneNode
 from .ball_fits import GREY, VIEWS, Course, Measurement, fit_cage, fit_mesh, target, views_of
 from .crease_fit import FIRST, HIGHEST, CreaseFit, fit_creases
 from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
-from .output import FigureError, FigureOptions, hide_frame, pyplot, write_pixels, write_plot
+from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_pixels, write_plot
 from .projection import project
 
 if TYPE_CHECKING:
@@ -42,17 +42,11 @@ RODS = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.66, 
 ROD_RADIUS = 0.009
 # Radius of a crease in the pictures of the box: at sharpness 0, and more for each 1.
 CREASE_RADIUS, CREASE_GROWTH = 0.010, 0.010
-SERIES = {"cage": "#1f6f8b", "refined": "#c8432b", "mesh": "#8a8a8a"}
 SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#e0602a", "#a3123f")
+# Of the courses.
+LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
 # Behind numbers, as dark as the backdrop.
 LABEL = "#343d46"
-TITLE_SIZE, TEXT_SIZE, TICK_SIZE = 12, 11, 9.5
-# In inches: width of the figure, gaps between pictures, and height of plots; what lies above pictures, above plots,
-# below them, to their left, and to their right.
-WIDTH, GAP, PLOT_HEIGHT = 12.8, 0.06, 2.2
-TITLES, ABOVE, BELOW, LEFT, RIGHT = 0.5, 0.25, 0.55, 0.72, 0.2
-# Pictures in the first row; pictures and plots in the last one.
-OF_BALL, OF_BOX = 6, 4
 
 # A title of two lines, and shapes to be rendered.
 Panel = tuple[str, SceneNode]
@@ -64,7 +58,6 @@ def draw(options: FigureOptions) -> list[Path]:
     """Fit the cages and the mesh, and draw the results."""
     if "_ad_" not in str(mi.variant()):
         raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
-    plt = pyplot()
     with in_order():
         shape = target()
         views = views_of(make_mesh(shape.positions, shape.triangles, GREY))
@@ -78,24 +71,20 @@ def draw(options: FigureOptions) -> list[Path]:
         courses["mesh"] = fit_mesh(views, STEPS, measure)
         options.report(f"{CREASE_STEPS} steps with creases")
         creases = fit_creases(CREASE_STEPS)
-    # Pictures of the first row are half as wide, and twice as many.
-    half = (options.resolution + 1) // 2
-    _, balls = rendered(ball_panels(shape, courses), half, BALL_VIEW, options)
-    sensor, boxes = rendered(box_panels(creases), 2 * half, BOX_VIEW, options)
-    figure = composed(plt, balls, boxes, courses, creases, sensor)
-    pixels = np.concatenate([np.concatenate([each for _, each in row], axis=1) for row in (balls, boxes)])
+    _, balls = rendered(ball_panels(shape, courses), BALL_VIEW, options)
+    sensor, boxes = rendered(box_panels(creases), BOX_VIEW, options)
+    figure = composed(options, balls, boxes, courses, creases, sensor)
+    pixels = np.concatenate([pixels for _, pixels in (*balls, *boxes)], axis=1)
     titles = [title.replace("\n", ", ") for title, _ in (*balls, *boxes)]
-    written = write_plot(options, "fit", figure, "png", "pdf", dpi=130)
+    written = write_plot(options, "fit", figure)
     return written + write_pixels(options, "fit", pixels, {"pictures": titles, "spp": options.spp})
 
 
-def rendered(
-    panels: Sequence[Panel], width: int, field_of_view: float, options: FigureOptions
-) -> tuple[Any, list[Picture]]:
+def rendered(shown: Sequence[Panel], field_of_view: float, options: FigureOptions) -> tuple[Any, list[Picture]]:
     """The camera, and renders of panels by their titles."""
-    stage = load_stage("fit", resolution=width, field_of_view=field_of_view)
+    stage = load_stage("fit", resolution=options.resolution, field_of_view=field_of_view)
     pictures = []
-    for title, shapes in panels:
+    for title, shapes in shown:
         options.report(title.replace("\n", ", "))
         pixels = render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]
         pictures.append((title, pixels))
@@ -115,22 +104,22 @@ def in_order() -> Iterator[None]:
 
 def ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
     """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
-    panels: list[Panel] = [
-        (f"target\nseen in {VIEWS} pictures", {"mesh": make_mesh(shape.positions, shape.triangles, CLAY)})
+    shown: list[Panel] = [
+        (f"target\nseen in\n{VIEWS} pictures", {"mesh": make_mesh(shape.positions, shape.triangles, CLAY)})
     ]
     cages = courses["refined"].cages
     for step in (0, *(min(cages, key=lambda each: abs(each - part * STEPS)) for part in SHOWN), STEPS):
         name = "start" if step == 0 else "result" if step == STEPS else "on the way"
-        panels.append((_title(name, step, cages[step]), with_cage(cages[step])))
+        shown.append((_title(name, step, cages[step]), with_cage(cages[step])))
     mesh = courses["mesh"].cages[STEPS]
     return [
-        *panels,
+        *shown,
         (_title("dense mesh", STEPS, mesh), {"mesh": make_mesh(mesh.positions, mesh.triangles, CLAY)}),
     ]
 
 
 def _title(name: str, step: int, cage: ControlCage) -> str:
-    return f"{name}\n{VIEWS * step} renders, {cage.vertex_count:,} points"
+    return f"{name}\n{VIEWS * step} renders,\n{cage.vertex_count:,} points"
 
 
 def with_cage(cage: ControlCage) -> SceneNode:
@@ -151,16 +140,16 @@ def _rods(cage: ControlCage) -> str:
 
 def box_panels(fit: CreaseFit) -> list[Panel]:
     """Panels of the last row: the target with its creases, the start, and the result."""
-    panels: list[Panel] = []
+    shown: list[Panel] = []
     for title, cage, sharpness in (
-        ("target\ncreases of three kinds", fit.target, fit.truth),
-        (f"start\nall creases {FIRST:g}", fit.start, fit.sharpness[0]),
+        ("target\nthree kinds\nof creases", fit.target, fit.truth),
+        (f"start\nall creases\n{FIRST:g}", fit.start, fit.sharpness[0]),
         (f"found\n{VIEWS * CREASE_STEPS:,} renders", fit.found, fit.sharpness[-1]),
     ):
         surface = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": CLAY}
         rods = creases_as_rods(cage, fit.edges, sharpness)
-        panels.append((title, {"surface": mi.load_dict(surface), **rods}))
-    return panels
+        shown.append((title, {"surface": mi.load_dict(surface), **rods}))
+    return shown
 
 
 def creases_as_rods(cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]) -> SceneNode:
@@ -190,99 +179,68 @@ def sharpness_colour(sharpness: float) -> tuple[float, float, float]:
 
 
 def composed(
-    plt: Any,
+    options: FigureOptions,
     balls: Sequence[Picture],
     boxes: Sequence[Picture],
     courses: Mapping[str, Course],
     creases: CreaseFit,
     sensor: mi.Sensor,
 ) -> Any:
-    """Three rows: pictures of the ball, plots of its fits, and the box."""
-    of_ball = (WIDTH - (OF_BALL - 1) * GAP) / OF_BALL
-    of_box = (WIDTH - LEFT - (OF_BOX - 1) * GAP - RIGHT) / OF_BOX
-    rows = np.cumsum([TITLES + of_ball, ABOVE + PLOT_HEIGHT + BELOW, TITLES + of_box + BELOW])
-    figure = plt.figure(figsize=(WIDTH, rows[-1]))
-    height = figure.get_figheight()
-
-    def axes(left: float, top: float, width: float, tall: float) -> Any:
-        return figure.add_axes((left / WIDTH, 1 - (top + tall) / height, width / WIDTH, tall / height))
-
-    top = TITLES
-    for column, (title, pixels) in enumerate(balls):
-        _show(axes(column * (of_ball + GAP), top, of_ball, of_ball), pixels, title)
-    top = rows[0] + ABOVE
-    width = WIDTH / 2 - LEFT - RIGHT
-    _plot_losses(axes(LEFT, top, width, PLOT_HEIGHT), courses)
-    _plot_distances(axes(WIDTH / 2 + LEFT, top, width, PLOT_HEIGHT), courses)
-    top = rows[1] + TITLES
-    cages = (creases.target, creases.start, creases.found)
-    sharpness = (creases.truth, creases.sharpness[0], creases.sharpness[-1])
-    for column, ((title, pixels), cage, values) in enumerate(zip(boxes, cages, sharpness, strict=True)):
-        axis = axes(column * (of_box + GAP), top, of_box, of_box)
-        _show(axis, pixels, title)
+    """Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete."""
+    is_page = options.width >= BETWEEN
+    figure, axes = panels(options, *((3, 4) if is_page else (4, 3)))
+    left = list(axes.flat)
+    of_box = [left.pop(len(balls) + 2 * is_page) for _ in boxes]
+    *of_balls, losses, distances, sharpness = left
+    for axis, (title, pixels) in zip((*of_balls, *of_box), (*balls, *boxes), strict=True):
+        show(axis, in_8_bits(pixels), *title.split("\n", 1))
+    for axis, cage, values in zip(
+        of_box,
+        (creases.target, creases.start, creases.found),
+        (creases.truth, creases.sharpness[0], creases.sharpness[-1]),
+        strict=True,
+    ):
         _label(axis, sensor, cage, creases.edges, values)
-    _plot_sharpness(axes(WIDTH - RIGHT - of_box, top, of_box, of_box), creases)
+    _plot_losses(losses, courses)
+    _plot_distances(distances, courses)
+    _plot_sharpness(sharpness, creases)
+    figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
     return figure
 
 
-def _show(axis: Axes, pixels: NDArray[np.float32], title: str) -> None:
-    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
-    first, second = title.split("\n")
-    axis.set_title(second, fontsize=TICK_SIZE, pad=4)
-    axis.annotate(
-        first,
-        (0.5, 1),
-        (0, 19),
-        xycoords="axes fraction",
-        textcoords="offset points",
-        fontsize=TITLE_SIZE,
-        fontweight="bold",
-        ha="center",
-    )
-    hide_frame(axis)
-
-
 def _plot_losses(axis: Axes, courses: Mapping[str, Course]) -> None:
-    for name, course in courses.items():
-        axis.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=SERIES[name], linewidth=1.4)
-    _finish(axis, "renders", "loss (thousandths)")
+    for (colour, _), course in zip(SERIES, courses.values(), strict=True):
+        axis.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=colour)
+    _finish(axis, "loss (thousandths)")
     _plain(axis)
 
 
 def _plot_distances(axis: Axes, courses: Mapping[str, Course]) -> None:
-    sizes = {name: course.cages[STEPS].vertex_count for name, course in courses.items()}
-    labels = {
-        "cage": f"cage, {sizes['cage']} control points",
-        "refined": f"coarse to fine, {sizes['cage']}, then {sizes['refined']}",
-        "mesh": f"dense mesh, {sizes['mesh']:,} vertices",
-    }
-    for name, course in courses.items():
+    for (colour, marker), (name, course) in zip(SERIES, courses.items(), strict=True):
         steps = np.array(list(course.distances))
         values = 100 * np.array(list(course.distances.values()))
-        axis.loglog(
-            VIEWS * steps[1:], values[1:], "o-", color=SERIES[name], linewidth=1.4, markersize=3.2, label=labels[name]
-        )
-    _finish(axis, "renders", "distance to the target (%)")
+        label = f"{LABELS[name]}, {course.cages[STEPS].vertex_count:,} points"
+        axis.loglog(VIEWS * steps[1:], values[1:], marker=marker, color=colour, label=label)
+    _finish(axis, "distance (%)")
     _plain(axis)
-    axis.legend(fontsize=TICK_SIZE, frameon=False, loc="lower left")
 
 
 def _plot_sharpness(axis: Axes, fit: CreaseFit) -> None:
     renders = VIEWS * np.arange(len(fit.sharpness))
     for values, truth in zip(fit.sharpness.T, fit.truth, strict=True):
-        axis.plot(renders, values, color=sharpness_colour(truth), linewidth=1.1)
+        axis.plot(renders, values, color=sharpness_colour(truth), linewidth=0.6)
     for truth in np.unique(fit.truth):
-        axis.axhline(truth, color=sharpness_colour(truth), linewidth=1.2, linestyle=(0, (5, 3)))
+        axis.axhline(truth, color=sharpness_colour(truth), linestyle=(0, (5, 3)))
     axis.set_xlim(0, renders[-1])
     axis.set_ylim(0, HIGHEST)
-    _finish(axis, "renders", "sharpness of each crease")
+    _finish(axis, "sharpness")
 
 
-def _finish(axis: Axes, x: str, y: str) -> None:
-    axis.set_xlabel(x, fontsize=TEXT_SIZE)
-    axis.set_ylabel(y, fontsize=TEXT_SIZE)
-    axis.tick_params(labelsize=TICK_SIZE)
-    axis.grid(color="0.9", linewidth=0.6)
+def _finish(axis: Axes, quantity: str) -> None:
+    axis.set_title(quantity)
+    axis.set_xlabel("renders")
+    axis.set_box_aspect(1)
+    axis.grid()
     axis.set_axisbelow(True)
 
 
@@ -314,10 +272,9 @@ def _label(
             y,
             f"{sharpness[edge]:.1f}",
             color="white",
-            fontsize=TICK_SIZE,
             ha="center",
             va="center",
-            bbox={"boxstyle": "round,pad=0.22", "facecolor": LABEL, "edgecolor": "none"},
+            bbox={"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"},
         )
 
 

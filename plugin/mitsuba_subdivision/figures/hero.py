@@ -4,22 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .figure_scenes import in_8_bits, load_stage, render
-from .output import FigureOptions, save_png, write_pixels
-
-# The image stands alone: it is wider than images that share a figure, by this factor, and 8 : 5.
-WIDER = 2.25
-HEIGHT = 0.625
+from .figure_scenes import draw_picture, load_stage, picture_size, render
+from .output import FigureOptions
 
 
 def draw(options: FigureOptions) -> list[Path]:
     """Render the scene `human`: the limit surface of a human figure beside its cage."""
-    width = round(WIDER * options.resolution)
-    scene = load_stage("human", width=width, height=round(HEIGHT * width))
+    width, height = picture_size(options)
+    scene = load_stage("human", width=width, height=height)
     options.report("mannequin")
     pixels = render(scene, options, "mannequin")[..., :3]
-    written = options.paths("hero", "png")
-    for path in written:
-        save_png(in_8_bits(pixels), path)
-    metadata = {"spp": options.spp, "cage": "human.obj, (c) 2010 Tobias Rittig"}
-    return written + write_pixels(options, "hero", pixels, metadata)
+    return draw_picture(options, "hero", pixels, {"spp": options.spp, "cage": "human.obj, (c) 2010 Tobias Rittig"})

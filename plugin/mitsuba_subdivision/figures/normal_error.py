@@ -17,7 +17,8 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
 from ..schemes import scheme_named
 from ..surface import LimitSurface
-from .output import FigureError, FigureOptions, pyplot, write_plot
+from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_plot
+from .own_cage import around_vertices, frame
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +32,8 @@ DIRECTIONS = np.array([(1.0, 0.25), (0.75, 0.75), (0.25, 0.75), (1.0, 0.5)])
 DIGITS = 60
 EQUATIONS: dict[Evaluator, str] = {"stam": "(11) Stam", "stabilized": "(12) stabilised", "limit": "(13) limit"}
 PRECISIONS = {np.float32: "-", np.float64: "--"}
-COLOURS = {"stam": "#c8432b", "stabilized": "#1f6f8b", "limit": "#8a8a8a"}
+# Between the markers of a line, in levels.
+MARKED = 10
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -39,47 +41,45 @@ def draw(options: FigureOptions) -> list[Path]:
 
     The exact normals come from powers of the subdivision matrix in 60-digit arithmetic.
     """
-    plt = pyplot()
-    figure, axes = plt.subplots(len(VALENCES), len(OFFSETS), figsize=(10, 5.6), sharex=True, sharey=True)
-    for row, valence in zip(axes, VALENCES, strict=True):
+    cages = {valence: extraordinary(valence) for valence in VALENCES}
+    if options.cage:
+        cages = around_vertices(options.cage, len(VALENCES), frame(LimitSurface(extraordinary(5))))
+    figure, axes = panels(options, len(cages), len(OFFSETS), sharex=True, sharey=True)
+    for row, (valence, cage) in zip(axes, cages.items(), strict=True):
         for axis, offset in zip(row, OFFSETS, strict=True):
-            _draw_panel(axis, offset_cage(valence, offset))
-            axis.set_title(f"valence {valence},  $|c_1|$ = {offset}")
+            _draw_panel(axis, offset_cage(cage, offset))
+        row[0].set_ylabel(f"valence {valence}\nerror (degrees)")
+    for axis, offset in zip(axes[0], OFFSETS, strict=True):
+        axis.set_title(f"|c₁| = {offset}")
     for axis in axes[-1]:
         axis.set_xlabel("level $n$")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("normal error (degrees)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=len(EQUATIONS), frameon=False)
-    figure.tight_layout(rect=(0, 0.09, 1, 1))
-    return write_plot(options, "normal_error", figure, "png", "pdf")
+    figure.legend(handles, labels, loc="outside lower center", ncols=3 if options.width > BETWEEN else 2)
+    return write_plot(options, "normal_error", figure)
 
 
 def _draw_panel(axis: Axes, cage: ControlCage) -> None:
     exact = exact_normals(cage)
-    for evaluator, label in EQUATIONS.items():
+    for i, (evaluator, label) in enumerate(EQUATIONS.items()):
+        colour, marker = SERIES[i]
         for dtype, style in PRECISIONS.items():
-            error = normal_errors(cage, exact, evaluator, dtype)
-            axis.semilogy(
-                LEVELS,
-                np.maximum(error, 1e-15),
-                style,
-                color=COLOURS[evaluator],
-                linewidth=1.3,
-                label=f"{label}, {dtype.__name__}",
-            )
+            error = np.maximum(normal_errors(cage, exact, evaluator, dtype), 1e-15)
+            marked = (MARKED * i // len(EQUATIONS), MARKED)
+            look = {"color": colour, "marker": marker, "markevery": marked, "mfc": colour if style == "-" else "white"}
+            axis.semilogy(LEVELS, error, style, **look, label=f"{label}, {dtype.__name__}")
+    axis.set_box_aspect(1)
     axis.set_ylim(1e-15, 1e3)
     axis.set_xlim(LEVELS[0], LEVELS[-1])
-    axis.set_yticks(10.0 ** np.arange(-15, 4, 3))
-    axis.grid(color="0.9", linewidth=0.6)
+    axis.set_yticks(10.0 ** np.arange(-15, 4, 6))
+    label_powers(axis.yaxis)
+    axis.grid()
 
 
-def offset_cage(valence: int, offset: float) -> ControlCage:
-    """The cage `extraordinary`, moved so that the limit point of vertex 0 has this distance from the origin.
+def offset_cage(cage: ControlCage, offset: float) -> ControlCage:
+    """A cage, moved so that the limit point of vertex 0 has this distance from the origin.
 
     Its coordinates are rounded to float32, so that every evaluator gets the same numbers.
     """
-    cage = extraordinary(valence)
     limit = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
     # A direction that favours no axis, and is neither normal nor tangent to the surface.
     direction = np.array([0.48, 0.6, 0.64])

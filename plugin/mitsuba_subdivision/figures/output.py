@@ -18,6 +18,41 @@ from ..whole_file import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+
+# Widths of a page and of one of its two columns in millimetres. Panels get fewer columns below BETWEEN.
+PAGE, COLUMN, BETWEEN, INCH = 178.0, 84.0, 120.0, 25.4
+# Room around a figure in inches, and how often it is laid out to leave no more than this.
+PAD, LAYOUTS = 0.02, 8
+# Sizes of text in points at a column and at a page: exponents and indices are characters of the same size.
+TEXT_SIZES = (6.0, 7.0)
+# Colours and markers of series, which differ in grey and for colour-blind readers.
+SERIES = (("#c8432b", "s"), ("#12395c", "o"), ("#d9a53f", "^"))
+STYLE: dict[Any, Any] = {
+    "pdf.fonttype": 42,
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": "medium",
+    "axes.titleweight": "bold",
+    "axes.titlepad": 3,
+    "axes.labelsize": "medium",
+    "axes.labelpad": 2,
+    "axes.linewidth": 0.5,
+    "xtick.labelsize": "medium",
+    "ytick.labelsize": "medium",
+    "legend.fontsize": "medium",
+    "legend.frameon": False,
+    "grid.color": "0.88",
+    "grid.linewidth": 0.4,
+    "lines.linewidth": 1,
+    "lines.markersize": 3,
+    "figure.constrained_layout.w_pad": 0.015,
+    "figure.constrained_layout.h_pad": 0.025,
+    "figure.constrained_layout.wspace": 0.01,
+    "figure.constrained_layout.hspace": 0.01,
+}
+_EXPONENTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class FigureError(RuntimeError):
@@ -37,13 +72,17 @@ class FigureOptions:
     output : Path
         Folder to write to; created if it is missing.
     resolution : int
-        Width of a rendered image in pixels.
+        Width of a panel in pixels. Pictures are rendered at this width; PDF files hold their pixels as they are.
     spp : int
         Samples per pixel of a rendered image.
+    width : float
+        Width of the figure on paper in millimetres.
     formats : tuple of str
         Which of "png", "pdf" and "exr" to write, if the figure has them.
     scheme : str
         Subdivision scheme, for the figures that show one scheme of several.
+    cage : Path or None
+        File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one.
     report : callable
         Is called with a line of text for each step.
     progress : callable
@@ -53,8 +92,10 @@ class FigureOptions:
     output: Path
     resolution: int = 512
     spp: int = 256
+    width: float = PAGE
     formats: tuple[str, ...] = ("png", "pdf", "exr")
     scheme: str = "catmull_clark"
+    cage: Path | None = None
     report: Callable[[str], None] = field(default=_to_terminal)
     progress: Callable[[str, int, int], None] = field(default=draw_bar)
 
@@ -69,8 +110,13 @@ def scene_path(name: str) -> Path:
     return Path(example_file(f"{name}.xml"))
 
 
-def pyplot() -> Any:
-    """Matplotlib's pyplot, set up for the figures.
+def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
+    """Make axes in rows and columns over the width of the figure; their heights follow when it is written.
+
+    Parameters
+    ----------
+    **more
+        For `matplotlib.pyplot.subplots`.
 
     Raises
     ------
@@ -84,32 +130,51 @@ def pyplot() -> Any:
     matplotlib.use("Agg")
     # Fixed dates and identifiers in files, so that the same command twice gives the same file.
     os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
-    matplotlib.rcParams.update(
-        {"svg.hashsalt": "mitsuba-subdivision", "font.size": 9, "mathtext.fontset": "dejavusans", "pdf.fonttype": 42}
-    )
+    matplotlib.rcParams.update({**STYLE, "font.size": TEXT_SIZES[options.width >= BETWEEN]})
     from matplotlib import pyplot
 
-    return pyplot
+    width = options.width / INCH
+    # As high as rows of panels that are twice as high as wide.
+    size = (width, 1 + 2 * rows * width / columns)
+    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="compressed", squeeze=False, **more)
+    return figure, axes
 
 
-def write_plot(options: FigureOptions, name: str, figure: Any, *formats: str, dpi: int = 160) -> list[Path]:
-    """Write a matplotlib figure in those of the formats that are wanted, and close it.
+def rows_of(options: FigureOptions, count: int) -> tuple[int, int]:
+    """Rows and columns of a series of panels: one row on a page, two in a column."""
+    return (1, count) if options.width >= BETWEEN else (2, (count + 1) // 2)
+
+
+def write_plot(options: FigureOptions, name: str, figure: Figure, *, layouts: int = LAYOUTS) -> list[Path]:
+    """Write a figure as PNG and as PDF, if these formats are wanted, and close it.
+
+    The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
 
     Parameters
     ----------
-    dpi : int
-        Pixels per inch. Lower values keep the files of figures with much detail small.
+    layouts : int
+        How often the height of the figure is set to that of its contents.
 
     Returns
     -------
     list of Path
         The files written, each of which appears whole or not at all.
     """
+    from matplotlib.image import AxesImage
     from matplotlib.pyplot import close
 
-    paths = options.paths(name, *formats)
+    # Panels of a fixed aspect leave room above and below them. A half of that to a legend is left each time.
+    for _ in range(layouts):
+        figure.draw_without_rendering()
+        figure.set_size_inches(figure.get_figwidth(), figure.get_tightbbox().height + 2 * PAD)
+    figure.draw_without_rendering()
+    dpi = options.resolution / (figure.axes[0].get_window_extent().width / figure.dpi)
+    paths = options.paths(name, "png", "pdf")
     for path in paths:
-        more = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
+        more: dict[str, Any] = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
+        if path.suffix == ".pdf":
+            for image in figure.findobj(AxesImage):
+                image.set_interpolation("none")
         with whole_file(path) as beside:
             figure.savefig(beside, dpi=dpi, **more)
     close(figure)
@@ -129,12 +194,24 @@ def write_pixels(
     return paths
 
 
-def save_png(pixels: NDArray[np.uint8], path: Path) -> None:
-    """Write 8-bit RGB pixels as PNG; the file appears whole or not at all."""
-    from matplotlib.image import imsave
+def show(axis: Axes, pixels: NDArray[np.uint8], title: str = "", caption: str = "") -> None:
+    """Draw a picture in a panel, with a title above and a caption below it."""
+    axis.imshow(pixels, interpolation="lanczos")
+    axis.set_title(title)
+    axis.set_xlabel(caption)
+    hide_frame(axis)
 
-    with whole_file(path) as beside:
-        imsave(beside, pixels, pil_kwargs={"optimize": True})
+
+def scientific(value: float) -> str:
+    """One digit and a power of ten: "2·10⁻⁴"."""
+    digit, power = f"{value:.0e}".split("e")
+    exponent = f"10{str(int(power)).translate(_EXPONENTS)}"
+    return digit if int(power) == 0 else exponent if digit == "1" else f"{digit}·{exponent}"
+
+
+def label_powers(axis: Axis) -> None:
+    """Label a logarithmic axis by powers of ten in text of one size."""
+    axis.set_major_formatter(lambda value, _: scientific(value) if value != 1 else "1")
 
 
 def hide_frame(axis: Axes) -> None:

@@ -14,14 +14,16 @@ from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from .characteristic import CharacteristicMap, outline, patch_of_valence
 from .domains import sub_domain
-from .output import FigureOptions, pyplot, write_plot
+from .output import FigureOptions, hide_frame, panels, write_plot
 
 VALENCE = 5
 # Stencils that agree to this many decimals are the same: their entries are fractions of small integers.
 DECIMALS = 9
-# The irregular child is grey, as in the figure `subdivision`.
-CHILD_COLOURS = ("#c4c8cd", "#f5d49b", "#eda07f", "#a9cdd0")
+# The irregular child is grey, as in the figure `subdivision`; in grey prints, all four differ.
+CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
 EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
+# In points; indices are 0.7 times as large.
+LABEL_SIZE = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,33 +76,33 @@ def draw(options: FigureOptions) -> list[Path]:
     The points lie where the characteristic map puts them. The refined points come from the evaluator's subdivision
     matrices.
     """
-    plt = pyplot()
     from matplotlib.collections import LineCollection
 
     step = RefinementStep.at_valence(VALENCE)
     domain = step.characteristic.patch.scheme.domain
     options.report(f"valence {VALENCE}: {len(step.old)} control points, {len(step.new)} after one refinement")
-    figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.9), layout="constrained")
-    for axis in axes:
-        axis.add_collection(LineCollection(list(step.old_edges), colors=EDGE, linewidths=1.3, zorder=1))
-        axis.plot(*step.old.T, "o", color="black", markersize=9.5, zorder=4)
+    figure, ((before, after),) = panels(options, 1, 2)
+    for axis in (before, after):
+        axis.add_collection(LineCollection(list(step.old_edges), colors=EDGE, linewidths=0.6, zorder=1))
+        axis.plot(*step.old.T, "o", color="black", markersize=4, zorder=4)
         axis.set_aspect("equal")
-        axis.set_axis_off()
-    before, after = axes
+        hide_frame(axis)
+    style = {"edgecolor": "#30363c", "linewidth": 0.7, "zorder": 2}
+    label = {"fontsize": LABEL_SIZE, "ha": "center", "va": "center", "zorder": 6}
     whole = step.characteristic(outline(domain.corners))
-    before.fill(*whole.T, facecolor=CHILD_COLOURS[0], edgecolor="#30363c", linewidth=1.6, alpha=0.85, zorder=2)
-    before.text(*whole.mean(axis=0), r"$\Omega$", fontsize=18, ha="center", va="center", zorder=6)
+    before.fill(*whole.T, facecolor=CHILD_COLOURS[0], **style)
+    before.text(*whole.mean(axis=0), r"$\Omega$", **label)
     for k, colour in enumerate(CHILD_COLOURS):
         child = step.characteristic(outline(sub_domain(domain, 0, k)))
-        after.fill(*child.T, facecolor=colour, edgecolor="#30363c", linewidth=1.3, alpha=0.85, zorder=2)
-        after.text(*child.mean(axis=0), rf"$\Omega_{k}$", fontsize=13, ha="center", va="center", zorder=6)
-    after.add_collection(LineCollection(list(step.new_edges), colors=NEW_EDGE, linewidths=0.9, zorder=3))
-    after.plot(*step.new.T, "o", mfc="white", mec="black", mew=1.2, markersize=6.5, zorder=5)
-    before.set_title(f"a patch of valence {VALENCE}: $K$ = {len(step.old)} control points", fontsize=11)
-    after.set_title(f"one refinement: $M$ = {len(step.new)} new control points", fontsize=11)
-    # Matplotlib's layout leaves no room for titles above axes without frames.
-    figure.get_layout_engine().set(rect=(0, 0, 1, 0.97))
-    return write_plot(options, "refinement", figure, "png", "pdf")
+        after.fill(*child.T, facecolor=colour, **style)
+        after.text(*child.mean(axis=0), rf"$\Omega_{k}$", **label)
+    after.add_collection(LineCollection(list(step.new_edges), colors=NEW_EDGE, linewidths=0.5, zorder=3))
+    after.plot(*step.new.T, "o", mfc="white", mec="black", mew=0.6, markersize=3, zorder=5)
+    before.set_title(f"a patch of valence {VALENCE}")
+    after.set_title("one refinement")
+    before.set_xlabel(f"$K$ = {len(step.old)} control points")
+    after.set_xlabel(f"$M$ = {len(step.new)} new control points")
+    return write_plot(options, "refinement", figure)
 
 
 def _edges(topology: Topology) -> NDArray[np.int64]:

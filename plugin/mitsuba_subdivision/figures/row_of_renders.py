@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from .figure_scenes import in_8_bits, load_stage, render
-from .output import FigureOptions, pyplot, write_pixels, write_plot
+from .output import FigureOptions, panels, show, write_pixels, write_plot
 
 
 def draw_row(
-    options: FigureOptions, name: str, panels: Mapping[str, Mapping[str, Any]], metadata: dict[str, Any]
+    options: FigureOptions, name: str, cases: Mapping[str, Mapping[str, Any]], metadata: dict[str, Any]
 ) -> list[Path]:
     """Render a scene once for each panel.
 
@@ -22,23 +22,18 @@ def draw_row(
     options : FigureOptions
     name : str
         Of the scene and of the figure.
-    panels : mapping of str to mapping
-        By their titles, the parameters of the scene.
+    cases : mapping of str to mapping
+        By the title of each panel, the parameters of the scene; a second line of the title stands below the panel.
     metadata : dict
         For the figure's pixels, besides the samples.
     """
-    plt = pyplot()
-    figure, axes = plt.subplots(1, len(panels), figsize=(9.6, 3.45))
+    figure, axes = panels(options, 1, len(cases))
     rendered = []
-    for (title, parameters), axis in zip(panels.items(), axes, strict=True):
-        options.report(title)
+    for (title, parameters), axis in zip(cases.items(), axes.flat, strict=True):
+        name_of_part, _, caption = title.partition("\n")
+        options.report(title.replace("\n", ", "))
         scene = load_stage(name, **parameters, resolution=options.resolution)
-        pixels = render(scene, options, title)[..., :3]
-        rendered.append(pixels)
-        axis.imshow(in_8_bits(pixels), interpolation="lanczos")
-        axis.set_title(title, fontsize=10)
-        axis.set_axis_off()
-    # Matplotlib's layout leaves no room for titles above axes without frames.
-    figure.tight_layout(pad=0.4, rect=(0, 0, 1, 0.94))
-    written = write_plot(options, name, figure, "png", dpi=130)
-    return written + write_pixels(options, name, np.concatenate(rendered, axis=1), {**metadata, "spp": options.spp})
+        rendered.append(render(scene, options, name_of_part)[..., :3])
+        show(axis, in_8_bits(rendered[-1]), name_of_part, caption)
+    pixels = np.concatenate(rendered, axis=1)
+    return write_plot(options, name, figure) + write_pixels(options, name, pixels, {**metadata, "spp": options.spp})

@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..evaluation.patch_pieces import lattice_stencils
 from ..mesh.connectivity import Topology
-from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .figure_scenes import load_stage, make_mesh, on_white, render, staged
-from .output import FigureError, FigureOptions, hide_frame, pyplot, scene_path, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .own_cage import in_ball, read
 from .projection import project, visible, visible_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LEVELS = 4
+# Of the ball that fills the picture, for cages of users.
+RADIUS = 1.9
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
 # Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
 EDGE_SEGMENTS = 24
@@ -31,18 +33,21 @@ RATE = 6
 
 def draw(options: FigureOptions) -> list[Path]:
     """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
-    plt = pyplot()
     stage = load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
+    if options.cage:
+        cages = [in_ball(read(options.cage), RADIUS)]
     while len(cages) < LEVELS:
-        cages.append(refined(cages[-1]))
+        cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
     if len(counts) != 1:
         raise FigureError(
             f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}; expected as many at each"
         )
-    figure, axes = plt.subplots(1, LEVELS + 1, figsize=(12.8, 2.5), layout="constrained")
-    panels = []
+    figure, axes = panels(options, *rows_of(options, LEVELS + 1))
+    for axis in axes.flat[LEVELS + 1 :]:
+        axis.set_axis_off()
+    axes, rendered = axes.flat[: LEVELS + 1], []
     for level, (cage, axis) in enumerate(zip(cages, axes, strict=False)):
         surface = LimitSurface(cage)
         regular = regular_elements(surface)
@@ -55,12 +60,12 @@ def draw(options: FigureOptions) -> list[Path]:
             pixels,
             _edges(cage, EDGE_SEGMENTS >> level),
             _extraordinary_points(cage),
-            1.0 - 0.22 * level,
+            0.55 - 0.12 * level,
             options.resolution,
         )
-        axis.set_title(f"level {level}", fontsize=11)
-        axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular", fontsize=10)
-        panels.append(pixels)
+        axis.set_title(f"level {level}")
+        axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
+        rendered.append(pixels)
     options.report("limit surface")
     limit = LimitSurface(cages[-1])
     pixels, scene = _render_limit(stage, limit, options)
@@ -70,27 +75,20 @@ def draw(options: FigureOptions) -> list[Path]:
         pixels,
         _isolines(limit, EDGE_SEGMENTS >> (LEVELS - 1)),
         _limit_points(limit),
-        0.28,
+        0.17,
         options.resolution,
     )
-    axes[-1].set_title("limit surface", fontsize=11)
-    axes[-1].set_xlabel(f"regular but for {counts.pop()} points", fontsize=10)
-    panels.append(pixels)
-    written = write_plot(options, "subdivision", figure, "png", "pdf")
+    axes[-1].set_title("limit surface")
+    axes[-1].set_xlabel(f"regular but for {counts.pop()} points")
+    rendered.append(pixels)
+    written = write_plot(options, "subdivision", figure)
     metadata = {"levels": LEVELS, "spp": options.spp}
-    return written + write_pixels(options, "subdivision", np.concatenate(panels, axis=1)[..., :3], metadata)
-
-
-def refined(cage: ControlCage) -> ControlCage:
-    """The cage after one Catmull-Clark refinement, which has the same limit surface."""
-    refinement = scheme_named("catmull_clark").refine(cage.topology)
-    topology = refinement.topology
-    return ControlCage.from_arrays(refinement.apply(cage.positions), topology.face_sizes, topology.face_vertices)
+    return written + write_pixels(options, "subdivision", np.concatenate(rendered, axis=1)[..., :3], metadata)
 
 
 def extraordinary_count(topology: Topology) -> int:
-    """Number of vertices of valence other than 4, and of faces other than quads. A refinement keeps this number."""
-    return int((topology.vertex_face_count != 4).sum() + (topology.face_sizes != 4).sum())
+    """Number of inner vertices of valence other than 4, and of faces but quads. A refinement keeps this number."""
+    return int(_is_extraordinary(topology).sum() + (topology.face_sizes != 4).sum())
 
 
 def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
@@ -168,15 +166,20 @@ def _isolines(surface: LimitSurface, segments: int) -> NDArray[np.float64]:
     return found.p.reshape(-1, segments + 1, 3).astype(np.float64, copy=False)
 
 
+def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
+    """``(n_v,)`` whether a vertex inside has another valence than 4."""
+    return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
+
+
 def _extraordinary_points(cage: ControlCage) -> NDArray[np.float64]:
     t = cage.topology
     centres = np.add.reduceat(cage.positions[t.face_vertices], t.face_offsets[:-1]) / t.face_sizes[:, None]
-    return np.concatenate([cage.positions[t.vertex_face_count != 4], centres[t.face_sizes != 4]])
+    return np.concatenate([cage.positions[_is_extraordinary(t)], centres[t.face_sizes != 4]])
 
 
 def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
     t = surface.cage.topology
-    half_edge = t.vertex_half_edge[t.vertex_face_count != 4]
+    half_edge = t.vertex_half_edge[_is_extraordinary(t)]
     face = t.face[half_edge]
     return surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face]).p.astype(
         np.float64, copy=False
@@ -195,13 +198,12 @@ def _draw(
     """Draw a rendered image, and the lines and points on its surface that the camera sees."""
     from matplotlib.collections import LineCollection
 
-    axis.imshow(on_white(pixels), interpolation="lanczos")
+    show(axis, on_white(pixels))
     axis.add_collection(
         LineCollection(visible_runs(scene, lines, resolution), colors="#14181c", linewidths=width, capstyle="round")
     )
     seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
-    axis.plot(*seen.T, "o", color="#d1432b", markersize=2.6, markeredgewidth=0)
+    axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
     # The part of the square image that the surface fills.
     axis.set_xlim(0, resolution)
     axis.set_ylim(0.84 * resolution, 0.13 * resolution)
-    hide_frame(axis)

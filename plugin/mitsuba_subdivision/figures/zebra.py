@@ -18,10 +18,9 @@ from ..images.probe_tier import normal_angle
 from ..regression.rendering import render_pixels
 from ..surface import LimitSurface
 from .figure_scenes import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
-from .output import FigureOptions, pyplot, write_pixels, write_plot
+from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
-from .subdivision import refined
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,7 +47,6 @@ MIRROR = {"type": "conductor", "material": "none"}
 # Colours in sRGB: of bands in the wrong place, and of the rings around the corner.
 WRONG = np.array([240, 90, 30])
 RING = "#0a84c6"
-TITLE_SIZE, TEXT_SIZE = 14, 12.5
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -58,7 +56,6 @@ def draw(options: FigureOptions) -> list[Path]:
     OpenSubdiv's surface with its own normals and the mesh of Blender's modifier, both as fine as the exact surface. The
     row below shows the angles between their normals and the exact ones.
     """
-    plt = pyplot()
     stage = load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
     surface = LimitSurface(cube())
     shapes, titles = _shapes(surface.cage)
@@ -77,31 +74,20 @@ def draw(options: FigureOptions) -> list[Path]:
     }
     largest = max(float(angle.max()) for angle in angles.values())
     for name, angle in angles.items():
-        options.report(f"{', '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
+        options.report(f"{' '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
     tip = surface.evaluate(CORNER_FACE, np.zeros((1, 2)), CORNER).p
 
-    figure, axes = plt.subplots(
-        2, len(shapes), figsize=(3.1 * len(shapes) + 0.7, 7.2), layout="constrained", squeeze=False
-    )
-    figure.get_layout_engine().set(w_pad=0.04, h_pad=0.04, hspace=0.02, wspace=0)
+    figure, axes = panels(options, 2, len(shapes))
     for axis, name in zip(axes[0], shapes, strict=True):
-        _draw_bands(axis, pixels[name], pixels["exact"] if name != "exact" else None)
-        who, how = titles[name]
-        axis.set_title(who, fontsize=TITLE_SIZE, fontweight="bold", pad=24)
-        axis.text(0.5, 1.03, how, fontsize=TEXT_SIZE, ha="center", transform=axis.transAxes)
+        _draw_bands(axis, pixels[name], pixels["exact"], *titles[name])
     shown = _draw_angles(axes[1, 1:], angles, largest)
     _draw_overview(axes[1, 0], options, shapes["exact"])
-    bar = figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22)
-    bar.set_label("degrees", fontsize=TEXT_SIZE)
-    bar.ax.tick_params(labelsize=TEXT_SIZE)
+    figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22, label="degrees")
     corner = project(stage.sensors()[0], tip, options.resolution)[0]
-    for axis in axes.flat:
-        axis.set_xticks([])
-        axis.set_yticks([])
     for axis in (*axes[0], *axes[1, 1:]):
-        axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor="white", markeredgewidth=4)
-        axis.plot(*corner, "o", markersize=11, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=2)
-    written = write_plot(options, "zebra", figure, "png", "pdf", dpi=110)
+        axis.plot(*corner, "o", markersize=5, markerfacecolor="none", markeredgecolor="white", markeredgewidth=2)
+        axis.plot(*corner, "o", markersize=5, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=1)
+    written = write_plot(options, "zebra", figure)
     strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
     metadata = {"pictures": titles, "level": LEVEL, "rate": RATE, "stripes": STRIPES, "spp": options.spp}
     return written + write_pixels(options, "zebra", strip, metadata)
@@ -111,34 +97,34 @@ def _shapes(cage: ControlCage) -> tuple[dict[str, Any], dict[str, tuple[str, str
     """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
     exact = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": MIRROR})
     shapes = {"exact": exact, "mesh": _refined_mesh(cage)}
-    titles = {"exact": ("This package", "exact normals"), "mesh": ("Refined mesh", f"level {LEVEL}, averaged normals")}
+    titles = {
+        "exact": ("This package", "exact\nnormals"),
+        "mesh": ("Refined mesh", f"level {LEVEL},\naveraged normals"),
+    }
     if program := osd_peer():
         shapes["opensubdiv"] = _opensubdiv_mesh(program, cage)
-        titles["opensubdiv"] = ("OpenSubdiv", f"default level {OPENSUBDIV_LEVEL}, own normals")
+        titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
     if program := blender():
         found = blender_mesh(program, cage, FINE_LEVEL)
         shapes["blender"] = make_mesh(found.positions, split_quads(found.quads), MIRROR, normals=found.normals)
-        titles["blender"] = (f"Blender {found.version}", f"level {FINE_LEVEL}, averaged normals")
+        titles["blender"] = (f"Blender {found.version}", f"level {FINE_LEVEL},\naveraged normals")
     return shapes, titles
 
 
-def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float32] | None) -> None:
-    """Draw a rendered image, with colour where its bands differ from those of the exact surface, if that is given."""
-    if exact is None:
-        axis.imshow(on_white(pixels), interpolation="lanczos")
-        axis.set_xlabel("reference", fontsize=TEXT_SIZE)
-        return
+def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float32], title: str, caption: str) -> None:
+    """Draw a rendered image, with colour where its bands differ from those of the exact surface."""
     wrong = np.clip(np.abs(pixels - exact)[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
     marked = (1 - wrong) * on_white(pixels) + wrong * WRONG
-    axis.imshow(marked.round().astype(np.uint8), interpolation="lanczos")
-    axis.set_xlabel(f"{100 * wrong.mean():.1f} % in the wrong band", fontsize=TEXT_SIZE)
+    share = "reference" if pixels is exact else f"{100 * wrong.mean():.1f} % wrong"
+    show(axis, marked.round().astype(np.uint8), title, f"{caption}\n{share}")
 
 
 def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]], largest: float) -> Any:
     """Draw maps of angles in degrees, in one scale of colours; returns the last."""
     for axis, angle in zip(axes, angles.values(), strict=True):
         shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest or 1, interpolation="nearest")
-        axis.set_xlabel(f"normals off by up to {angle.max():.1f}°", fontsize=TEXT_SIZE)
+        axis.set_xlabel(f"up to {angle.max():.1f}°")
+        hide_frame(axis)
     return shown
 
 
@@ -148,20 +134,17 @@ def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
 
     stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
     scene = staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
-    axis.imshow(on_white(render(scene, options, "whole surface")), interpolation="lanczos")
+    show(axis, on_white(render(scene, options, "whole surface")), caption="whole surface")
     half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * options.resolution / 2
     middle = options.resolution / 2
     frame = (middle - half, middle - half), 2 * half, 2 * half
-    axis.add_patch(Rectangle(*frame, facecolor="none", edgecolor=RING, linewidth=2.5))
-    axis.set_xlabel("the cube and the close-up", fontsize=TEXT_SIZE)
-    for spine in axis.spines.values():
-        spine.set_visible(False)
+    axis.add_patch(Rectangle(*frame, facecolor="none", edgecolor=RING, linewidth=1))
 
 
 def _refined_mesh(cage: ControlCage) -> mi.Mesh:
     """The cage refined `LEVEL` times, as triangles; Mitsuba averages their normals at the vertices."""
     for _ in range(LEVEL):
-        cage = refined(cage)
+        cage = cage.refined()
     return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)), MIRROR)
 
 

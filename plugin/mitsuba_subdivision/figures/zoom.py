@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
+from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
 from ..images.probe_tier import normal_angle
 from ..schemes import scheme_named
@@ -23,7 +24,7 @@ from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .figure_scenes import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
 from .normal_error import EQUATIONS, offset_cage
-from .output import FigureError, FigureOptions, pyplot, write_pixels, write_plot
+from .output import FigureError, FigureOptions, label_powers, panels, scientific, write_pixels, write_plot
 from .peers import osd_peer, osd_samples
 from .projection import project
 
@@ -39,7 +40,7 @@ OPENSUBDIV: Literal["opensubdiv"] = "opensubdiv"
 OPENSUBDIV_LEVEL = 10
 LABELS: dict[str, str] = {
     **{str(evaluator): EQUATIONS[evaluator] for evaluator in EVALUATORS},
-    OPENSUBDIV: f"OpenSubdiv, level {OPENSUBDIV_LEVEL}",
+    OPENSUBDIV: f"OpenSubdiv\nlevel {OPENSUBDIV_LEVEL}",
 }
 # Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
 HALF_WIDTH = 0.19
@@ -47,7 +48,6 @@ BAR = 0.1
 # Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
 COLOURS = "YlOrRd"
-TITLE_SIZE, TEXT_SIZE = 14, 12.5
 LINE_POINTS = 33
 
 
@@ -93,17 +93,13 @@ def draw(options: FigureOptions) -> list[Path]:
     from float64: this far from the origin, float32 cannot tell the points of the last panels apart. OpenSubdiv's
     normals come from its patch tables (Far), where its program is found.
     """
-    plt = pyplot()
     from matplotlib.cm import ScalarMappable
 
-    view = TangentView.of(offset_cage(VALENCE, OFFSET))
+    view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
-    figure, axes = plt.subplots(
-        len(rows), len(MAGNIFICATIONS), figsize=(12.2, 3.05 * len(rows) + 0.3), layout="constrained", squeeze=False
-    )
-    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, hspace=0.02, wspace=0)
-    panels, records = [], []
+    figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
+    rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         extent = parameter_extent(magnification)
         samples = _sample(view, magnification, max(options.resolution // 2, 8))
@@ -111,27 +107,24 @@ def draw(options: FigureOptions) -> list[Path]:
         lines = project(stage.sensors()[0], _level_lines(view, magnification), options.resolution)
         for evaluator, axis in zip(rows, column, strict=True):
             found = _magnified(stage, view, samples, evaluator)
-            name = f"{LABELS[evaluator]}, x {magnification}"
+            name = f"{LABELS[evaluator]}, x {magnification}".replace("\n", ", ")
             options.report(f"{name}: median normal error {found.median:.1e} degrees")
             pixels = render(found.scene, options, name)
             _draw_halves(axis, pixels, found.errors.ravel()[nearest], lines)
-            # A text, not a label of the axis: matplotlib would hang a label from the top of its exponents.
-            text = _median(found.median)
-            axis.text(0.5, -0.075, text, fontsize=TEXT_SIZE, ha="center", va="baseline", transform=axis.transAxes)
+            axis.set_xlabel(_degrees(found.median))
             _draw_bar(axis, magnification, options.resolution)
-            panels.append(pixels)
+            rendered.append(pixels)
             records.append({"evaluator": evaluator, "magnification": magnification, "error": found.median})
-        title = f"$\\times$ ${_power(magnification)}$,  $u, v < {_power(extent)}$"
-        column[0].set_title(title, fontsize=TITLE_SIZE)
+        column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(extent)}")
     for axis, evaluator in zip(axes[:, 0], rows, strict=True):
-        axis.set_ylabel(LABELS[evaluator], fontsize=TITLE_SIZE, fontweight="bold")
+        axis.set_ylabel(LABELS[evaluator])
     bar = figure.colorbar(
         ScalarMappable(_error_scale(), COLOURS), ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both"
     )
-    bar.set_label("right halves: error of the normal in degrees, float32", fontsize=TEXT_SIZE)
-    bar.ax.tick_params(labelsize=TEXT_SIZE)
-    written = write_plot(options, "zoom", figure, "png", "pdf", dpi=110)
-    strips = [np.concatenate(panels[i :: len(rows)], axis=1) for i in range(len(rows))]
+    bar.set_label("error of the normal in degrees; medians below panels")
+    label_powers(bar.ax.yaxis)
+    written = write_plot(options, "zoom", figure)
+    strips = [np.concatenate(rendered[i :: len(rows)], axis=1) for i in range(len(rows))]
     metadata = {"pictures": records, "offset": OFFSET, "spp": options.spp}
     return written + write_pixels(options, "zoom", np.concatenate(strips), metadata)
 
@@ -258,42 +251,25 @@ def _draw_halves(
     axis.imshow(in_8_bits(pixels), interpolation="lanczos")
     right = (width // 2, width, height, 0)
     axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=_error_scale(), interpolation="nearest", extent=right)
-    axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.6, alpha=0.5))
-    axis.axvline(width / 2, color="white", linewidth=1.5)
+    axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.3, alpha=0.6))
+    axis.axvline(width / 2, color="white")
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
     axis.set_xticks([])
     axis.set_yticks([])
 
 
-def _median(error: float) -> str:
-    if error < LEAST_ERROR:
-        return f"median error below ${_power(LEAST_ERROR)}$°"
-    return f"median error {_degrees(error)}"
-
-
 def _draw_bar(axis: Axes, magnification: float, resolution: int) -> None:
     """Draw a scale bar: a length on the surface, whose cage has the radius 1."""
-    from matplotlib.patches import Rectangle
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ignore[import-untyped]
 
     length = BAR / HALF_WIDTH / 2 * resolution
-    left, bottom = 0.05 * resolution, 0.945 * resolution
-    pad = 0.025 * resolution
-    box = (left - pad, bottom - 3.2 * pad), length + 2 * pad, 4.2 * pad
-    axis.add_patch(Rectangle(*box, facecolor="white", alpha=0.85, linewidth=0))
-    axis.plot([left, left + length], [bottom, bottom], color="black", linewidth=2, solid_capstyle="butt")
-    axis.text(left + length / 2, bottom - 0.6 * pad, f"${_power(BAR / magnification)}$", ha="center", fontsize=11)
+    bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
+    bar.patch.set(alpha=0.85, linewidth=0)
+    axis.add_artist(bar)
 
 
 def _degrees(error: float) -> str:
-    if error < 0.01:
-        return f"${_power(error)}$°"
-    return f"{error:.1g}°" if error < 1 else f"{error:.0f}°"
-
-
-def _power(value: float) -> str:
-    """A number with one digit and a power of ten, as a formula for matplotlib."""
-    digit, power = f"{value:.0e}".split("e")
-    if int(power) == 0:
-        return digit
-    return rf"10^{{{int(power)}}}" if digit == "1" else rf"{digit} \times 10^{{{int(power)}}}"
+    if error < LEAST_ERROR:
+        return f"< {scientific(LEAST_ERROR)}°"
+    return f"{scientific(error)}°" if error < 0.01 else f"{error:.1g}°" if error < 1 else f"{error:.0f}°"
