@@ -91,6 +91,45 @@ def test_false_alarms_are_as_rare_as_alpha_says(reference):
     assert 30 < failed < 120
 
 
+@pytest.mark.parametrize("rate", [2e-5, 2e-4, 2e-3, 2e-2])
+def test_rare_events_are_no_alarm(rate):
+    """From events that the reference has hardly seen to those of which every tile has some in each batch.
+
+    At alpha = 0.01, three failures of 40 have a probability below 1 %.
+    """
+    reference = random_image(np.random.default_rng(2), 256, "reference", rate=rate)
+    tests = (random_image(np.random.default_rng(seed), 4, rate=rate) for seed in range(40))
+    assert sum(compare(reference, test, ["tile"]).status is Status.FAIL for test in tests) < 3
+
+
+def test_changes_are_seen_beside_rare_events():
+    """A change of 10 % in a tile, where one event is 20 times the mean of a batch."""
+    mean = truth()
+    mean[8:24, 8:24] *= 1.1
+    reference = random_image(np.random.default_rng(2), 256, "reference", rate=2e-4)
+    tests = (random_image(np.random.default_rng(seed), 4, mean=mean, rate=2e-4) for seed in range(5))
+    assert {compare(reference, test, ["tile"]).status for test in tests} == {Status.FAIL}
+
+
+def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference, np_rng):
+    """Unless the probe differs."""
+    test = random_image(np_rng, mean=1.5 * truth(), paired=reference.paired)
+    found = compare(reference, test)
+    assert statuses(found) == {"probe": "pass", "paired": "pass", "tile": "pass"}
+    assert "same bits" in found.tier("tile").lines[0]
+    probe = replace(test.probe, normal=-test.probe.normal)
+    assert statuses(compare(reference, replace(test, probe=probe))) == {
+        "probe": "fail",
+        "paired": "pass",
+        "tile": "fail",
+    }
+    assert statuses(compare(reference, test, ["paired", "tile"]))["tile"] == "fail"
+
+
+def test_one_batch_has_no_variance(reference, np_rng):
+    assert "the test has one batch" in compare(reference, random_image(np_rng, 1)).tier("tile").lines[0]
+
+
 @pytest.mark.parametrize(
     ("side", "factor"), [(4, 1.4), (8, 1.2), (16, 1.08), (SIZE, 1.03)], ids=["4", "8", "16", "whole"]
 )

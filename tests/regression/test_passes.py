@@ -32,8 +32,10 @@ def test_shares_have_every_batch_once():
             assert [b for share in shares for b in share] == list(range(batches))
 
 
-@pytest.mark.parametrize(("spp", "batches", "batch"), [(256, 4, 64), (100, 2, 50), (1, 2, 1), (200, 4, 64)])
-def test_samples_come_in_whole_batches_of_which_there_are_two(spp, batches, batch):
+@pytest.mark.parametrize(
+    ("spp", "batches", "batch"), [(256, 4, 64), (100, 4, 25), (1, 4, 1), (200, 4, 50), (300, 5, 64)]
+)
+def test_samples_come_in_whole_batches_of_which_there_are_four(spp, batches, batch):
     found = Sampling.of_spp(spp)
     assert (found.batches, found.batch) == (batches, batch)
 

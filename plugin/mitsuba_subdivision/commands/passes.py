@@ -106,7 +106,7 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
 
     from ..images.image import save_image
     from ..regression.cluster import render_on_cluster
-    from ..regression.passes import BATCH, Sampling, merge_passes, render_pass
+    from ..regression.passes import BATCH, LEAST_BATCHES, Sampling, merge_passes, render_pass
     from ..regression.reference import REFERENCE_SPP, as_reference
     from ..regression.scene import BOX, load_scene
 
@@ -121,7 +121,7 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
     tolerances = Tolerances().with_values(dict(options.tolerances))
     number, count = options.share or (1, options.passes or 1)
-    batch = options.batch or min(BATCH, max(1, spp // max(2, count)))
+    batch = options.batch or min(BATCH, max(1, spp // max(LEAST_BATCHES, count)))
     if is_model:
         from ..studio.studio_entries import sampler
 

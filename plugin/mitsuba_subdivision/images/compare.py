@@ -35,6 +35,7 @@ def compare(
 
     An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
     where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
+    Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
 
     Parameters
     ----------
@@ -71,6 +72,7 @@ def compare(
 
     results = [run(name) for name in tiers or [name for name, tier in TIERS.items() if tier.by_default]]
     _add_deciding_tiers(results, run, tiers)
+    _excuse_noise(results)
     return Comparison(
         reference,
         test,
@@ -131,6 +133,16 @@ def _add_deciding_tiers(
         cannot_run = result.status is Status.SKIPPED and not (result is paired and is_replaced)
         if cannot_run and result.name in (chosen or ()):
             raise ImageError(f'tier "{result.name}" cannot run: {result.lines[0]}')
+
+
+def _excuse_noise(results: list[TierResult]) -> None:
+    """Let the tile tier pass where the paired tier and the probe prove that nothing changed."""
+    named = {result.name: result for result in results}
+    tile, paired, probe = (named.get(name) for name in (TILE, PAIRED, PROBE))
+    same_bits = paired and paired.numbers.get("changed_pixels") == 0
+    if tile and tile.status is Status.FAIL and same_bits and probe and probe.status is Status.PASS:
+        tile.status, tile.worst = Status.PASS, None
+        tile.lines = ["chance: the same samples give the same bits, and the probe passes", *tile.lines]
 
 
 def _relative_error(reference: Image, test: Image) -> str:

@@ -1,4 +1,11 @@
-"""The tile tier: whether noise alone explains the difference, in tiles of several sizes at once."""
+"""The tile tier: whether noise alone explains the difference, in tiles of several sizes at once.
+
+A tile's difference is the sum of many small contributions, and of a few large ones where bright paths are rare. The
+small ones are normally distributed, with the variance that the reference measures. The large ones are rare events,
+whose number is Poisson distributed: a single one in the test may lie many standard errors from the mean. What tells
+them is the variance between the test's batches: k events that the reference expects l times raise the variance
+k / l times, but a change of the scene raises it little. `_z_scores` has the formulas.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from .estimate import Estimate
 from .image import Image
 from .panel import Panel
 from .png import colours
@@ -20,6 +28,11 @@ NAME = "tile"
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
 # Samples that a reference should have for each of the test's, so that its own noise hardly counts.
 REFERENCE_SAMPLES = 16
+
+# Events of a kind that a reference may miss by chance: it misses three expected ones in 5 % of all cases.
+MISSED_EVENTS = 3.0
+# Below it, the deviance is that of the normal distribution to one part in 10^5.
+_SMALL_EXCESS = 1e-5
 
 # The colours of the report's panels reach at least this far.
 _LEAST_Z, _LEAST_EVIDENCE = 5.0, 10.0
@@ -39,7 +52,7 @@ class FailingTile:
 
 @dataclass(frozen=True, eq=False)
 class _TileTests:
-    """The z-tests of square tiles of one size, in each channel; tiles at the right and lower border may be smaller.
+    """The tests of square tiles of one size, in each channel; tiles at the right and lower border may be smaller.
 
     Attributes
     ----------
@@ -96,11 +109,10 @@ class _TileTests:
 
 
 def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
-    """Test each tile for whether noise alone explains its difference: two-sided z-tests, at several scales.
+    """Test each tile for whether noise alone explains its difference: two-sided tests, at several scales.
 
-    The variance of both images is taken from the reference. With few samples, the test's own variance is often zero at
-    pixels that rare events reach. Single precision adds a bias: the standard error has a floor for that. Šidák's
-    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
+    Single precision adds a bias: the standard error has a floor for that. Šidák's correction covers the tiles and
+    channels of a scale, Bonferroni's the scales and the scenes of a suite.
 
     Parameters
     ----------
@@ -110,21 +122,22 @@ def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: i
     expected, found = reference.estimate, test.estimate
     if expected is None or found is None:
         return skipped_without(NAME, expected, found, "channels variance.R, .G, .B and N")
-    if expected.batches < 2:
-        return skipped(NAME, "the reference has one batch only, which gives no variance")
-    difference = found.mean - expected.mean
-    variance = expected.variance * (1 / found.count + 1 / expected.count)[..., None]
+    for estimate, role in ((expected, "reference"), (found, "test")):
+        if estimate.batches < 2:
+            return skipped(NAME, f"the {role} has one batch only, which gives no variance")
+    height, width, _ = expected.mean.shape
     alpha = tolerances.alpha / (len(SCALES) * suite_size)
-    scales = {
-        side: _test_tiles(difference, variance, expected.mean, side or max(difference.shape[:2]), alpha, tolerances)
-        for side in SCALES
-    }
+    scales = {}
+    for scale in SCALES:
+        side = scale or max(height, width)
+        z = _z_scores(expected, found, side, tolerances)
+        limit = float(-np.expm1(np.log1p(-alpha) / z.size))
+        scales[scale] = _TileTests((height, width), side, z, 2 * norm.sf(np.abs(z)), limit)
     failing = [tile for scale in scales.values() for tile in scale.failing()]
     numbers = {str(side or "whole"): scale.numbers() for side, scale in scales.items()}
     clearest_scale = min((scale for side, scale in scales.items() if side), key=lambda scale: scale.strength)
 
-    pixel_floor = tolerances.floor_relative * np.abs(expected.mean) + tolerances.floor_absolute
-    pixel_z = difference / np.sqrt(variance + pixel_floor**2)
+    pixel_z = _z_scores(expected, found, 1, tolerances)
     strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
     spp, reference_spp = (int(np.median(estimate.count)) for estimate in (found, expected))
     samples = f"{spp} samples per pixel against {reference_spp}"
@@ -160,29 +173,32 @@ def compare(reference: Image, test: Image, tolerances: Tolerances, suite_size: i
     return result
 
 
-def _test_tiles(
-    difference: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    expected: NDArray[np.float64],
-    side: int,
-    alpha: float,
-    tolerances: Tolerances,
-) -> _TileTests:
-    """Test the tiles of one size.
+def _z_scores(reference: Estimate, test: Estimate, side: int, tolerances: Tolerances) -> NDArray[np.float64]:
+    """z-scores ``(rows, columns, 3)`` of the tiles of one size, reduced where rare events may explain the difference.
 
-    Parameters
-    ----------
-    difference, variance, expected : (height, width, 3)
-        Difference of the means and its variance, and the mean of the reference.
-    alpha : float
-        Probability that any tile fails without a change.
+    Let D be the difference of a tile's means, V its variance by the reference, and E what the variance of the test's
+    own mean has in excess of that. If both come of events of one size, that size is M = E / |D|, in units of D: the
+    reference expects V / M^2 of them and the test has D / M more. The deviance of the Poisson distribution then gives
+
+        z = D / sqrt(V) * sqrt(2 ((1 + u) log(1 + u) - u)) / u,    u = E / V,
+
+    which is D / sqrt(V) without an excess. The reference may have missed some: V gets `MISSED_EVENTS` of this size for
+    all its samples.
     """
-    height, width, _ = difference.shape
-    area = _tile_sums(np.ones((height, width, 1)), side)
-    floor = tolerances.floor_relative * np.abs(_tile_sums(expected, side) / area) + tolerances.floor_absolute
-    z = _tile_sums(difference, side) / area / np.sqrt(_tile_sums(variance, side) / area**2 + floor**2)
-    limit = -np.expm1(np.log1p(-alpha) / z.size)
-    return _TileTests((height, width), side, z, 2 * norm.sf(np.abs(z)), float(limit))
+    area = _tile_sums(np.ones((*test.count.shape, 1)), side)
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _tile_sums(values, side) / area
+
+    count, reference_count = test.count[..., None], reference.count[..., None]
+    difference = mean(test.mean - reference.mean)
+    floor = tolerances.floor_relative * np.abs(mean(reference.mean)) + tolerances.floor_absolute
+    variance = mean(reference.variance * (1 / count + 1 / reference_count)) / area + floor**2
+    excess = np.maximum(mean((test.variance - reference.variance) / count) / area, 0)
+    size = excess / np.where(difference == 0, np.inf, np.abs(difference))
+    variance += MISSED_EVENTS * mean(count / reference_count) * size**2
+    u = np.maximum(excess / variance, _SMALL_EXCESS)
+    return difference / np.sqrt(variance) * np.sqrt(2 * ((1 + u) * np.log1p(u) - u)) / u
 
 
 def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:

@@ -51,8 +51,7 @@ def render_like(reference: Image, source: SceneSource, spp: int = TEST_SPP, atte
     """
     sampling = sampling_of(reference)
     loaded = load_scene(source, reference.metadata.get("parameters"), reference.metadata.get("filter"))
-    batches = max(1, -(-spp // sampling.batch))
-    test = render_pass(loaded, Sampling(batches, sampling.batch, sampling.seed + SEED_STEP * (attempt + 1)))
+    test = render_pass(loaded, Sampling.of_spp(spp, sampling.batch, sampling.seed + SEED_STEP * (attempt + 1)))
     if attempt or reference.paired is None:
         return test
     pair = render_pass(loaded, Sampling(1, sampling.batch, sampling.seed))
@@ -79,7 +78,7 @@ def compare_scene(
     tiers, tolerances, suite_size
         As in `mitsuba_subdivision.images.compare.compare`.
     spp : int
-        Samples per pixel of the test, rounded up to whole batches of the reference's size.
+        Samples per pixel of the test, rounded up to whole batches, of the reference's size or less.
     """
     test = render_like(reference, source, spp)
     found = compare(reference, test, tiers, tolerances, suite_size)

@@ -22,6 +22,8 @@ from .scene import LoadedScene
 
 # Samples per pixel of a batch, which is rendered at once with a seed of its own.
 BATCH = 64
+# Fewer batches than these measure the variance badly.
+LEAST_BATCHES = 4
 # Entries of the metadata that all passes of an image share.
 _SHARED = ("variant", "filter", "size", "files", "parameters")
 
@@ -45,9 +47,9 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches: at least two, since one has no variance."""
-        batch = min(batch, max(1, spp // 2))
-        return cls(max(2, -(-spp // batch)), batch, seed)
+        """At least ``spp`` samples in whole batches, of which there are at least `LEAST_BATCHES`."""
+        batch = min(batch, max(1, spp // LEAST_BATCHES))
+        return cls(max(LEAST_BATCHES, -(-spp // batch)), batch, seed)
 
     @property
     def spp(self) -> int:
