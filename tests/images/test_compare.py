@@ -229,7 +229,7 @@ def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, ro
     pair = (broken, random_image(np_rng)) if role == "reference" else (reference, broken)
     found = compare(*pair)
     assert statuses(found) == {"finite": "fail"}
-    assert f"channel G of the {role} is {value} at x = 5, y = 3" in str(found)
+    assert found.tier("finite").lines == [f"the {role} is not: G = {value} at x = 5, y = 3"]
     assert (found.worst.x, found.worst.y) == (5, 3)
 
 

@@ -84,7 +84,7 @@ def channels(**changes):
 
 UNUSABLE = {
     "is not a file": lambda path: None,  # noqa: ARG005
-    "not a readable OpenEXR file": lambda path: path.write_bytes(b"P6 4 2 255 "),
+    "not an OpenEXR file": lambda path: path.write_bytes(b"P6 4 2 255 "),
     "has 2 parts": write_parts,
     "no channels R, G, B; found Y": lambda path: write_channels(path, {"Y": PIXELS[..., 0]}),
     "no channel G": lambda path: write_channels(path, channels(G=None)),

@@ -64,6 +64,13 @@ def positive(text: str) -> int:
     return number
 
 
+def seed(text: str) -> int:
+    """Parse a seed, an integer of 32 bits."""
+    if not (text.isdecimal() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
+    return int(text)
+
+
 def rate(text: str) -> int:
     """Parse a tessellation rate."""
     number = positive(text)

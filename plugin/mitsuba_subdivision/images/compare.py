@@ -92,14 +92,11 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 
 def _not_finite(reference: Image, test: Image) -> TierResult | None:
     """Name the pixels that are not finite, None if there are none. No tier would see all of them."""
-    lines, broken_pixels = [], []
     for image, role in ((test, "test"), (reference, "reference")):
-        for broken in image.broken_channels():
-            lines.append(f"channel {broken.channel} of the {role} is {broken}")
-            broken_pixels.append((broken.y, broken.x))
-    if not lines:
-        return None
-    return TierResult(FINITE, Status.FAIL, lines, {"channels": len(lines)}, broken_pixels[0])
+        broken = image.not_finite()
+        if broken:
+            return TierResult(FINITE, Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
+    return None
 
 
 def _add_deciding_tiers(

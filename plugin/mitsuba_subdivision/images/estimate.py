@@ -42,7 +42,8 @@ class Estimate:
 
     def stored(self) -> Estimate:
         """The estimate as it would come back from a file, rounded to single precision."""
-        mean, variance = (values.astype(np.float32).astype(np.float64) for values in (self.mean, self.variance))
+        with np.errstate(over="ignore"):
+            mean, variance = (values.astype(np.float32).astype(np.float64) for values in (self.mean, self.variance))
         return Estimate(mean, variance, self.count, self.batches)
 
 
@@ -69,10 +70,12 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
             raise ImageError(f"images of {sizes} pixels cannot be combined; expected one size")
         count = total.count + estimate.count
         share = (estimate.count / count)[..., None]
-        step = estimate.mean - total.mean
-        squares = squares + own + step**2 * share * total.count[..., None]
         batches = total.batches + estimate.batches
-        total = Estimate(total.mean + step * share, squares / (batches - 1), count, batches)
+        # What is not finite is told of the image.
+        with np.errstate(invalid="ignore", over="ignore"):
+            step = estimate.mean - total.mean
+            squares = squares + own + step**2 * share * total.count[..., None]
+            total = Estimate(total.mean + step * share, squares / (batches - 1), count, batches)
     if total is None:
         raise ImageError("there is nothing to combine")
     return total

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import threading
@@ -20,6 +21,8 @@ from . import ImageError
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
 
 Channels = dict[str, NDArray]
+
+_MAGIC = b"\x76\x2f\x31\x01"
 
 _quieting = threading.Lock()
 
@@ -61,7 +64,8 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     Raises
     ------
     ImageError
-        If there is no such file, it is not an OpenEXR file, or it has several parts, deep pixels or broken metadata.
+        If there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep pixels or broken
+        metadata.
     """
     path = Path(path)
     if not path.is_file():
@@ -69,16 +73,21 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     try:
         with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = len(file.parts)
+            if not parts:
+                raise RuntimeError("its pixels cannot be read")
             if parts != 1:
                 raise ImageError(
                     f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part'
                 )
             header = dict(file.header())
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, OSError) as error:
-        if isinstance(error, ImageError):
-            raise
-        raise ImageError(f'image "{path}" is not a readable OpenEXR file: {error}') from None
+    except ImageError:
+        raise
+    except (RuntimeError, ValueError, OSError):
+        with path.open("rb") as start:
+            is_exr = start.read(len(_MAGIC)) == _MAGIC
+        problem = "is truncated, or damaged" if is_exr else "is not an OpenEXR file"
+        raise ImageError(f'image "{path}" {problem}') from None
     if any(values.dtype == object or values.ndim != 2 for values in channels.values()):
         raise ImageError(f'image "{path}" has deep or subsampled channels; expected one value per pixel')
     return channels, _metadata(path, header)
@@ -95,8 +104,9 @@ def _write(path: Path, channels: Mapping[str, NDArray], metadata: dict | None) -
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Close standard error while OpenEXR reads: of a damaged file, it writes a line for each row before it raises."""
+    """Close standard output and error while OpenEXR reads: of a damaged file, it writes a line for each row."""
     with _quieting, contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
         try:
             kept = os.dup(2)
         except OSError:

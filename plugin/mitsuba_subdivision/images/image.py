@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,24 +18,6 @@ from .probe_aovs import Probe
 SCHEMA = 1
 
 _RGB = ("R", "G", "B")
-
-
-@dataclass(frozen=True)
-class BrokenChannel:
-    """A channel with values that are not finite: its name, the first such pixel and its value, and how many there are.
-
-    Written as text: ``nan at x = 5, y = 3, and 2 more pixels``.
-    """
-
-    channel: str
-    y: int
-    x: int
-    value: float
-    count: int
-
-    def __str__(self) -> str:
-        more = f", and {self.count - 1} more pixels" if self.count > 1 else ""
-        return f"{self.value} at x = {self.x}, y = {self.y}{more}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +62,17 @@ class Image:
             found |= self.probe.channels()
         return found
 
-    def broken_channels(self) -> Iterator[BrokenChannel]:
-        """Channels with values that are not finite."""
-        for name, values in self.channels().items():
-            bad = np.argwhere(~np.isfinite(values))
-            if len(bad):
-                y, x = (int(i) for i in bad[0])
-                yield BrokenChannel(name, y, x, float(values[y, x]), len(bad))
+    def not_finite(self) -> tuple[str, tuple[int, int]] | None:
+        """Values that are not finite, in words, and row and column of the first; None if there are none."""
+        broken = {name: values for name, values in self.channels().items() if not np.isfinite(values).all()}
+        if not broken:
+            return None
+        bad = np.argwhere(np.any([~np.isfinite(values) for values in broken.values()], axis=0))
+        y, x = (int(i) for i in bad[0])
+        first = next(name for name, values in broken.items() if not np.isfinite(values[y, x]))
+        more = f" and at {len(bad) - 1} more pixels" if len(bad) > 1 else ""
+        others = f"; channels {', '.join(broken)}" if len(broken) > 1 else ""
+        return f"{first} = {broken[first][y, x]} at x = {x}, y = {y}{more}{others}", (y, x)
 
 
 def save_image(path: str | Path, image: Image) -> None:
@@ -126,15 +111,16 @@ def load_image(path: str | Path) -> Image:
 
 
 def require_finite(image: Image) -> None:
-    """Refuse an image with values that are not finite, which merging would spread.
+    """Refuse an image with values that are not finite, which merging would spread, and no tier can compare.
 
     Raises
     ------
     ImageError
         If there are any; the message names the first.
     """
-    for broken in image.broken_channels():
-        raise ImageError(f'channel {broken.channel} of image "{image.name}" is {broken}')
+    broken = image.not_finite()
+    if broken:
+        raise ImageError(f'image "{image.name}" is not finite: {broken[0]}')
 
 
 def _estimate(

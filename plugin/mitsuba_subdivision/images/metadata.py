@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -45,6 +46,10 @@ def _is_sampling(value: Any) -> bool:
         and _is_integer(value.get("seed"))
         and _is_integer(value.get("batch"), 1)
         and _are_ranges(value.get("batches"))
+        # Older files lack these.
+        and _is_integer(value.get("total", 1), value["batches"][-1][1] if "total" in value else 1)
+        and _is_integer(value.get("passes", 1), 1)
+        and value.get("passes", 1) <= value.get("total", math.inf)
     )
 
 

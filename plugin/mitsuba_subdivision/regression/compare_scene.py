@@ -17,12 +17,14 @@ from ..llvm import best_variant
 from .environment import variant_problem
 from .passes import Sampling, render_pass
 from .probe_render import probe_scene
-from .reference import TEST_SPP, sampling_of
+from .reference import TEST_SPP, UnusableReference, sampling_of
 from .scene import SceneSource, load_scene
 
-# The seeds of a test are this far from the reference's, so that the samples differ; those of the second attempt are as
-# far from the first.
+# The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
+# attempts are as far from each other.
 SEED_STEP = 2**20
+# Seeds of Mitsuba have 32 bits.
+_SEEDS = 2**32
 # Samples of the second attempt, in samples of the first.
 RETRY_FACTOR = 4
 
@@ -33,7 +35,9 @@ def variant_for(reference: Image) -> str:
     return best_variant() if variant_problem(wanted) else wanted
 
 
-def render_like(reference: Image, source: SceneSource, spp: int = TEST_SPP, attempt: int = 0) -> Image:
+def render_like(
+    reference: Image, source: SceneSource, spp: int = TEST_SPP, seed: int = 0, *, second_attempt: bool = False
+) -> Image:
     """Render a scene in the current variant with the settings of a reference.
 
     The samples are independent of the reference's. The first attempt also has the geometry probe, and repeats the first
@@ -41,18 +45,22 @@ def render_like(reference: Image, source: SceneSource, spp: int = TEST_SPP, atte
 
     Parameters
     ----------
-    attempt : int
-        Counts from 0; each attempt has other samples.
+    seed : int
+        From 0 on. Each has other samples, as has the second attempt with each.
 
     Raises
     ------
-    RegressionError
-        If the reference does not say how it was rendered.
+    UnusableReference
+        If the reference does not say how it was rendered, or has another size.
     """
     sampling = sampling_of(reference)
     loaded = load_scene(source, reference.metadata.get("parameters"), reference.metadata.get("filter"))
-    test = render_pass(loaded, Sampling.of_spp(spp, sampling.batch, sampling.seed + SEED_STEP * (attempt + 1)))
-    if attempt or reference.paired is None:
+    if loaded.size != reference.size:
+        sizes = ["{} x {}".format(*size) for size in (loaded.size, reference.size)]
+        raise UnusableReference(f'the scene has {sizes[0]} pixels, the reference "{reference.name}" has {sizes[1]}')
+    first_seed = (sampling.seed + SEED_STEP * (2 * seed + 1 + second_attempt)) % _SEEDS
+    test = render_pass(loaded, Sampling.of_spp(spp, sampling.batch, first_seed))
+    if second_attempt or reference.paired is None:
         return test
     pair = render_pass(loaded, Sampling(1, sampling.batch, sampling.seed))
     metadata = {**test.metadata, "paired": {"seed": sampling.seed, "spp": sampling.batch}}
@@ -67,6 +75,7 @@ def compare_scene(
     spp: int = TEST_SPP,
     tolerances: Tolerances | None = None,
     suite_size: int = 1,
+    seed: int = 0,
 ) -> Comparison:
     """Render a scene as its reference was, in the current variant, and compare the two.
 
@@ -79,13 +88,15 @@ def compare_scene(
         As in `mitsuba_subdivision.images.compare.compare`.
     spp : int
         Samples per pixel of the test, rounded up to whole batches, of the reference's size or less.
+    seed : int
+        As in `render_like`.
     """
-    test = render_like(reference, source, spp)
+    test = render_like(reference, source, spp, seed)
     found = compare(reference, test, tiers, tolerances, suite_size)
     failed = [tier for tier in found.tiers if tier.status is Status.FAIL]
     if [tier.name for tier in failed] != [TILE] or test.estimate is None:
         return found
-    again = render_like(reference, source, RETRY_FACTOR * int(test.estimate.count.max()), attempt=1)
+    again = render_like(reference, source, RETRY_FACTOR * int(test.estimate.count.max()), seed, second_attempt=True)
     test = replace(test, pixels=again.pixels, estimate=again.estimate, metadata={**test.metadata, "attempt": 2})
     found = compare(reference, test, tiers, tolerances, suite_size)
     found.notes.append(

@@ -6,7 +6,6 @@ for it.
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from typing import Any
 import pytest
 
 from ..images.comparison import Comparison
-from ..images.image import load_image, save_image
+from ..images.image import save_image
 from ..images.report import write_report
 from ..images.tier import Status
 from ..images.tolerances import Tolerances
@@ -27,7 +26,7 @@ from . import RegressionError
 from .compare_scene import compare_scene, variant_for
 from .environment import variant_problem
 from .passes import BATCH, Sampling
-from .reference import REFERENCE_SPP, TEST_SPP, command, render_reference
+from .reference import REFERENCE_SPP, TEST_SPP, UnusableReference, load_reference, render_reference
 from .scene import SceneSource
 
 
@@ -75,6 +74,7 @@ class RenderRegression:
         batch: int = BATCH,
         tiers: Sequence[str] | None = None,
         tolerances: Mapping[str, float] | None = None,
+        seed: int = 0,
     ) -> Comparison | None:
         """Render a scene, and fail the pytest test if the render differs from the scene's reference.
 
@@ -94,6 +94,8 @@ class RenderRegression:
             Some of "probe", "paired", "tile" and "flip"; by default the first three.
         tolerances : dict, optional
             Fields of `Tolerances` to use instead of those stored with the reference. A new reference stores them.
+        seed : int
+            From 0 on: each has other samples for the tile tier.
 
         Returns
         -------
@@ -113,34 +115,46 @@ class RenderRegression:
         if self.settings.update == "all":
             write()
             return None
-        if not path.is_file():
-            if self.settings.update == "no":
-                sampling = Sampling.of_spp(reference_spp, batch)
-                pytest.fail(self._missing(scene, path, given, variant, sampling, limits), False)
-            write()
-            pytest.fail(f'wrote the missing reference "{path}"; look at it, and run the test again', False)
-
-        reference = load_image(path)
-        if reference.metadata.get("parameters", {}) != given:
-            stored = reference.metadata.get("parameters")
-            problem = f'the reference "{path}" was made with the scene parameters {stored}; this test has {given}'
-            if self.settings.update == "no":
-                pytest.fail(f"{problem}; write it again with\n  {self._update_command()}", False)
-            write()
-            pytest.fail(f"{problem}; wrote it again", False)
-        stored = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
-        with variant_set(_usable(variant) if variant else variant_for(reference)):
-            found = compare_scene(
-                reference, scene, tiers, max(1, round(spp * self.settings.spp_scale)), stored, self._suite_size()
+        try:
+            found = self._compare(
+                scene, path, given, variant, tiers, round(spp * self.settings.spp_scale), tolerances, seed
             )
-        self.node.add_report_section("call", "render difference", str(found))
+        except UnusableReference as problem:
+            if self.settings.update == "no":
+                pytest.fail(f"{problem}; make it with: pytest {shlex.quote(self.node.nodeid)} --render-update", False)
+            write()
+            pytest.fail(f"{problem}; wrote it; look at it, and run the test again", False)
         report = self._report(found, path.stem)
-        if found.status is Status.FAIL:
-            if self.settings.update != "no":
-                write()
-                report += f'\nwrote the reference "{path}" again'
-            pytest.fail(f"{found}{report}", False)
-        return found
+        if found.status is not Status.FAIL:
+            self.node.add_report_section("call", "render difference", str(found))
+            return found
+        if self.settings.update != "no":
+            write()
+            report += f'\nwrote the reference "{path}" again'
+        pytest.fail(f"{found}{report}", False)
+
+    def _compare(
+        self,
+        scene: SceneSource,
+        path: Path,
+        parameters: dict[str, str],
+        variant: str | None,
+        tiers: Sequence[str] | None,
+        spp: int,
+        tolerances: Mapping[str, float] | None,
+        seed: int,
+    ) -> Comparison:
+        reference = load_reference(path)
+        stored = reference.metadata.get("parameters", {})
+        if stored != parameters:
+            raise UnusableReference(
+                f'the reference "{path}" was made with the scene parameters {stored}; this test has {parameters}'
+            )
+        limits = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
+        # All scenes with a reference share the probability of a false alarm, whichever tests are run.
+        suite_size = max(1, len(list(self.settings.references.glob("*.exr"))))
+        with variant_set(_usable(variant) if variant else variant_for(reference)):
+            return compare_scene(reference, scene, tiers, max(1, spp), limits, suite_size, seed)
 
     def _report(self, found: Comparison, name: str) -> str:
         """Write a report if the settings request one; returns a line with its path."""
@@ -148,32 +162,13 @@ class RenderRegression:
         if wanted == "none" or (wanted == "failures" and found.status is not Status.FAIL):
             return ""
         folder = self.settings.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
-        page = write_report(folder, found, f"{name}: {self.node.nodeid}")
-        save_image(folder / "test.exr", found.test)
+        try:
+            page = write_report(folder, found, f"{name}: {self.node.nodeid}")
+            save_image(folder / "test.exr", found.test)
+        except OSError as error:
+            return f"\n  no report: {error}"
         self.reported = True
         return f"\n  report: {page}"
-
-    def _suite_size(self) -> int:
-        """Scenes that share the probability of a false alarm: all with a reference, whichever tests are run."""
-        return max(1, len(list(self.settings.references.glob("*.exr"))))
-
-    def _update_command(self) -> str:
-        return f"pytest {shlex.quote(self.node.nodeid)} --render-update"
-
-    def _missing(
-        self,
-        scene: SceneSource,
-        path: Path,
-        parameters: dict[str, str],
-        variant: str | None,
-        sampling: Sampling,
-        tolerances: Tolerances,
-    ) -> str:
-        lines = [f'there is no reference "{path}", as is expected of a new test. Make it with', self._update_command()]
-        if isinstance(scene, (str, Path)):
-            files = os.path.relpath(scene), os.path.relpath(path)
-            lines += ["or with", command(*files, parameters, variant or best_variant(), sampling, tolerances)]
-        return "\n  ".join(lines)
 
 
 def _usable(variant: str) -> str:

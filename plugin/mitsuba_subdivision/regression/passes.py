@@ -97,7 +97,13 @@ def render_pass(
     with timed("Rendering") as at:
         estimate = combine(batches()).stored()
     metadata = describe(loaded) | {
-        "sampling": {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
+        "sampling": {
+            "seed": sampling.seed,
+            "batch": sampling.batch,
+            "batches": [[share.start, share.stop]],
+            "total": sampling.batches,
+            "passes": count,
+        }
     }
     paired, probe = None, None
     if with_probe and share.start == 0 and first is not None:
@@ -141,6 +147,15 @@ def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
     return Image(name, estimate.mean, estimate, paired.paired if paired else None, probe, metadata)
 
 
+def missing_passes(image: Image) -> list[int]:
+    """Numbers of the passes that a merged image lacks, whole or in part."""
+    record = image.metadata["sampling"]
+    present = {index for start, stop in record["batches"] for index in range(start, stop)}
+    total, passes = record.get("total", max(present) + 1), record.get("passes", 1)
+    sampling = Sampling(total, record["batch"], record["seed"])
+    return [i for i in range(1, passes + 1) if not present.issuperset(sampling.share(i, passes))]
+
+
 def describe(loaded: LoadedScene) -> dict[str, Any]:
     """Metadata of a render in the current variant, except for its samples."""
     return {
@@ -174,7 +189,7 @@ def _estimate_of_pass(image: Image) -> Estimate:
 
 def _require_same_image(first: Image, other: Image) -> None:
     pairs = [(key, first.metadata.get(key), other.metadata.get(key)) for key in _SHARED]
-    pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch")]
+    pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch", "total")]
     for key, a, b in pairs:
         if a != b:
             difference = f"{key} is {a} and {b}"

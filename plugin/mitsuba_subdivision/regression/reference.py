@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..images import ImageError
 from ..images.flip_tier import flip_exposures
-from ..images.image import Image
+from ..images.image import Image, load_image, require_finite
 from ..images.tolerances import Tolerances
 from ..messages import PROGRAM
 from . import RegressionError
@@ -50,7 +51,14 @@ def as_reference(
     sampling: Sampling,
     tolerances: Tolerances | None = None,
 ) -> Image:
-    """Make a reference of an image: its metadata get tolerances, exposures for FLIP, and the command that makes it."""
+    """Make a reference of an image: its metadata get tolerances, exposures for FLIP, and the command that makes it.
+
+    Raises
+    ------
+    ImageError
+        If the image is not finite.
+    """
+    require_finite(image)
     found = image.metadata
     metadata = {
         **found,
@@ -84,17 +92,39 @@ def command(
     return shlex.join(words)
 
 
+class UnusableReference(RegressionError):
+    """A reference is missing, cannot be read, or is of another scene: it has to be made again."""
+
+
+def load_reference(path: Path) -> Image:
+    """Read a reference.
+
+    Raises
+    ------
+    UnusableReference
+        If it is missing, damaged, or no reference.
+    """
+    if not path.is_file():
+        raise UnusableReference(f'there is no reference "{path}"')
+    try:
+        reference = load_image(path)
+    except ImageError as error:
+        raise UnusableReference(str(error)) from None
+    sampling_of(reference)
+    return reference
+
+
 def sampling_of(reference: Image) -> Sampling:
     """Sampling of a reference.
 
     Raises
     ------
-    RegressionError
+    UnusableReference
         If the reference does not record it.
     """
     found = reference.metadata.get("sampling")
     if reference.estimate is None or not isinstance(found, dict):
-        raise RegressionError(
+        raise UnusableReference(
             f'"{reference.name}" does not say how it was rendered; expected a reference, as '
             f'"{PROGRAM} render SCENE -o REFERENCE.exr --reference" writes'
         )
