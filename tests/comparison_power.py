@@ -23,11 +23,11 @@ import mitsuba_subdivision  # noqa: F401
 # isort: split
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision.images.compare import compare
-from mitsuba_subdivision.images.image import Image, load_image, save_image
-from mitsuba_subdivision.images.tier import Status
+from mitsuba_subdivision.regression.compare import compare
+from mitsuba_subdivision.regression.image import Image, load_image, save_image
 from mitsuba_subdivision.regression.passes import Sampling, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
+from mitsuba_subdivision.regression.tiers import Status
 from regression.defects import stam
 from scipy.stats import norm
 

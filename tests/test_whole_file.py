@@ -239,7 +239,7 @@ import mitsuba_subdivision as msub
 import mitsuba as mi
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.figures.output import save_png
-from mitsuba_subdivision.images.exr import write_exr
+from mitsuba_subdivision.regression.image import write_exr
 from mitsuba_subdivision.whole_file import whole_file
 mi.set_variant("scalar_rgb")
 folder = Path(sys.argv[1])

@@ -7,8 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.images.exr import read_channels, write_channels, write_exr
-from mitsuba_subdivision.images.image import load_image
+from mitsuba_subdivision.regression.image import load_image, read_channels, write_channels, write_exr
 from regression.defects import SCENES
 
 SCENE = str(SCENES / "valence3.xml")
@@ -57,10 +56,10 @@ def test_json_on_standard_output_or_in_a_file(folder, capsys, tmp_path):
 
 
 def test_a_warning_has_a_status_of_its_own(folder, tmp_path, monkeypatch):
-    from mitsuba_subdivision.regression import environment
+    from mitsuba_subdivision.regression import scene
 
     # The scene has changed, and so has the machine: the tile tier cannot tell, at this tolerance.
-    monkeypatch.setattr(environment, "_processor", lambda: "another")
+    monkeypatch.setattr(scene, "_processor", lambda: "another")
     changed = (SCENES / "valence3.xml").read_text().replace('value="0.72, 0.66', 'value="0.7201, 0.66')
     changed = changed.replace("cages/valence3.obj", str(SCENES / "cages/valence3.obj"))
     (tmp_path / "scene.xml").write_text(changed)

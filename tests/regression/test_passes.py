@@ -5,8 +5,8 @@ import itertools
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.images.image import load_image, save_image
 from mitsuba_subdivision.regression import RegressionError
+from mitsuba_subdivision.regression.image import load_image, save_image
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
@@ -84,7 +84,7 @@ def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
             merge_passes([first, wrong])
     with pytest.raises(RegressionError, match="no passes"):
         merge_passes([])
-    from mitsuba_subdivision.images.exr import write_exr
+    from mitsuba_subdivision.regression.image import write_exr
 
     write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
     with pytest.raises(RegressionError, match="is no pass"):

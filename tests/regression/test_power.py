@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import mitsuba as mi
 import pytest
-from mitsuba_subdivision.images.compare import compare
-from mitsuba_subdivision.images.image import load_image
-from mitsuba_subdivision.images.tier import Status
-from mitsuba_subdivision.images.tolerances import Tolerances
-from mitsuba_subdivision.regression.compare_scene import compare_scene, render_like
+from mitsuba_subdivision.regression.compare import compare
+from mitsuba_subdivision.regression.image import load_image
+from mitsuba_subdivision.regression.references import compare_scene, render_like
+from mitsuba_subdivision.regression.tiers import Status, Tolerances
 from regression.defects import DEFECTS, RESOLUTION, SCENES, scene_of
 
 REFERENCES = SCENES.parent / "renders" / "references"

@@ -6,12 +6,12 @@ import subprocess
 import sys
 
 import flip_evaluator  # noqa: F401
+import matplotlib.pyplot  # noqa: F401
 import mitsuba as mi
-import mitsuba_subdivision.images.report
-import mitsuba_subdivision.regression.fixture  # noqa: F401
 import numpy.fft  # noqa: F401
+import PIL.PngImagePlugin  # noqa: F401
 import pytest
-from mitsuba_subdivision.images.image import load_image
+from mitsuba_subdivision.regression.image import load_image
 
 pytest_plugins = ["pytester"]
 

@@ -4,8 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.regression import rendering
-from mitsuba_subdivision.regression.rendering import LEAST_PART_SPP, PART_SAMPLES, parts_of, render_image
-from mitsuba_subdivision.regression.scene import load_scene
+from mitsuba_subdivision.regression.scene import LEAST_PART_SPP, PART_SAMPLES, load_scene, parts_of, render_image
 from regression.defects import SCENES
 
 SIZE = 8

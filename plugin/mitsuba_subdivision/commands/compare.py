@@ -8,9 +8,8 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..images.tiers import TIERS
-from ..images.tolerances import Tolerances
 from ..messages import PROGRAM, print_remark, print_result
+from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..whole_file import require_folder, require_writable, whole_file
 from .arguments import positive, seed
 from .parser import table
@@ -25,12 +24,11 @@ UNUSABLE = 3
 
 def add_parser(commands: Commands) -> None:
     """Add the commands to the program."""
-    by_default = ", ".join(name for name, tier in TIERS.items() if tier.by_default)
     compare = commands.add_parser(
         "compare",
         help="compare two images, or a scene with its reference",
         description="Compare an image with a reference, or render a scene as its reference was rendered and compare "
-        "the two.\n\n" + table("tiers", {name: tier.compares for name, tier in TIERS.items()}),
+        "the two.\n\n" + table("tiers", TIERS),
         epilog=f"{TOLERANCES}\n\nExit status: 0 pass, 1 warning, 2 fail, 3 unusable input or output.",
     )
     compare.add_argument("reference", type=Path, metavar="REFERENCE", help="OpenEXR file")
@@ -38,8 +36,8 @@ def add_parser(commands: Commands) -> None:
     compare.add_argument(
         "--tiers",
         metavar="TIERS",
-        help=f"tiers to compare by, separated by commas (default: {by_default}, as far as the images allow; flip if no "
-        "other can compare their pixels)",
+        help=f"tiers to compare by, separated by commas (default: {', '.join(DEFAULT_TIERS)}, as far as the images "
+        "allow; flip if no other can compare their pixels)",
     )
     compare.add_argument("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
     compare.add_argument("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
@@ -60,10 +58,10 @@ def add_parser(commands: Commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from ..images import ImageError
-    from ..images.compare import compare
-    from ..images.image import load_image
-    from ..images.report import write_report
+    from ..regression import ImageError
+    from ..regression.compare import compare
+    from ..regression.image import load_image
+    from ..regression.report import write_report
 
     renders = options.test.suffix.lower() == ".xml"
     given = "--spp" if options.spp else "--seed" if options.seed is not None else None
@@ -83,8 +81,7 @@ def _compare(options: argparse.Namespace) -> int:
         require_folder(options.html)
         require_writable(options.html / "index.html")
     if test is None:
-        from ..regression.compare_scene import compare_scene, variant_for
-        from ..regression.reference import TEST_SPP
+        from ..regression.references import TEST_SPP, compare_scene, variant_for
         from ..variants import variant_set
 
         with variant_set(variant_for(reference)):
@@ -107,8 +104,8 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _merge(options: argparse.Namespace) -> None:
-    from ..images import ImageError
-    from ..images.image import load_image, require_finite, save_image
+    from ..regression import ImageError
+    from ..regression.image import load_image, require_finite, save_image
     from ..regression.passes import merge_passes, missing_passes
 
     if options.output.suffix.lower() != ".exr":

@@ -300,7 +300,7 @@ def _write_frames(options: argparse.Namespace) -> None:
 def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
     import mitsuba as mi
 
-    from ..images.exr import METADATA_ATTRIBUTE
+    from ..regression.image import METADATA_ATTRIBUTE
 
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")

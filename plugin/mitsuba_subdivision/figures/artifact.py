@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..images.probe_tier import normal_angle
+from ..regression.probe import normal_angle
 from ..surface import LimitSurface
 from .figure_scenes import in_8_bits, load_stage, render
 from .normal_error import draw as draw_normal_error

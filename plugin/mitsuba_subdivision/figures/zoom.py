@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
 from ..evaluation.equations import Evaluator
-from ..images.probe_tier import normal_angle
+from ..regression.probe import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence

@@ -1,9 +1,8 @@
 """Images made of random numbers instead of renders."""
 
 import numpy as np
-from mitsuba_subdivision.images.estimate import Estimate, combine
-from mitsuba_subdivision.images.image import Image
-from mitsuba_subdivision.images.probe_aovs import Probe
+from mitsuba_subdivision.regression.image import Estimate, Image, combine
+from mitsuba_subdivision.regression.probe import Probe
 
 SIZE = 32
 # Standard deviation of a sample, in parts of its mean.
