@@ -162,7 +162,9 @@ def valence5(albedo: float = 1.0, shift: float = 0.0) -> mi.Scene:
     parameters[name] *= albedo
     parameters.update()
     camera = mi.traverse(loaded.sensors()[0])
-    camera["to_world"] = camera["to_world"] @ mi.Transform4f().rotate([0, 1, 0], -shift * camera["x_fov"][0] / SIZE)
+    camera["to_world"] = camera["to_world"] @ mi.Transform4f().rotate(
+        [0, 1, 0], -shift * float(np.ravel(camera["x_fov"])[0]) / SIZE
+    )
     camera.update()
     return loaded
 

@@ -423,8 +423,9 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         (
             (
                 "regression/report.py",
-                'json.dumps({"title": title, **comparison.as_dict()}, indent=1) + "\\n")',
-                'json.dumps({"title": title, **comparison.as_dict()}, indent= 2) + "\\n")',
+                '_write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()}, indent=1) + "\\n")',
+                '_write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()},'
+                ' indent= 2) + "\\n")',
             ),
         ),
     ),
