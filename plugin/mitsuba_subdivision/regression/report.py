@@ -102,7 +102,7 @@ def _panels(comparison: Comparison) -> bytes:
     maps = {"relative": relative_difference(a, b), **_maps(comparison)} if finite else {}
     count = 2 + len(maps)
     rows, columns = -(-count // COLUMNS), min(COLUMNS, count)
-    height = PANEL_INCHES * (a.shape[0] / a.shape[1] + 0.5)
+    height = PANEL_INCHES * (a.shape[0] / a.shape[1] + 0.33)
     figure = Figure((columns * PANEL_INCHES, rows * height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel in axes:
@@ -139,6 +139,7 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
     import matplotlib
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.patches import Rectangle
+    from matplotlib.ticker import MaxNLocator
 
     title, caption, colours, least, percentile = _MAPS[name]
     if name == "angle":
@@ -149,8 +150,12 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
         norm = Normalize(-reach if colours == _SIGNED else 0, reach)
     colour_map = matplotlib.colormaps[colours].with_extremes(bad="0.55")
     picture = panel.imshow(np.ma.masked_invalid(values), colour_map, norm, interpolation="nearest")
-    bar = panel.figure.colorbar(picture, ax=panel, location="bottom", shrink=0.9, aspect=30, pad=0.02)
+    bar = panel.figure.colorbar(
+        picture, ax=panel, location="bottom", shrink=0.9, aspect=30, pad=0.02, panchor=(0.5, 1.0)
+    )
     bar.ax.tick_params(labelsize=7.5)
+    if name != "angle":
+        bar.locator = MaxNLocator(5)
     tile = comparison.tier("tile")
     for place in tile.numbers["failing"] if tile and name in ("z", "evidence") else ():
         corner = place["x"] - 0.5, place["y"] - 0.5
