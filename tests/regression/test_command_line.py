@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 
 import mitsuba as mi
 import numpy as np
@@ -45,6 +46,14 @@ def test_another_image_fails_and_says_where(folder, capsys, tmp_path):
     assert "worst pixel (probe)" in said
     assert "(u, v) = (" in said
     assert (tmp_path / "report" / "index.html").is_file()
+
+
+def test_a_report_that_cannot_be_written_does_not_hide_the_result(folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert compare(folder, "reference.exr", "stam.exr", "--html", str(tmp_path / "report")) == 3
+    printed, told = capsys.readouterr()
+    assert printed.startswith("FAIL: ")
+    assert "reports need matplotlib" in told
 
 
 def test_json_on_standard_output_or_in_a_file(folder, capsys, tmp_path):

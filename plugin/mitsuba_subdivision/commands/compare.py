@@ -94,8 +94,9 @@ def _compare(options: argparse.Namespace) -> int:
     if options.json and options.json != "-":
         with whole_file(Path(options.json)) as beside:
             beside.write_text(f"{text}\n", encoding="utf-8")
-    page = write_report(options.html, found) if options.html else None
+    # The result first, which a report that cannot be written does not hide.
     print_result(text if options.json == "-" else found)
+    page = write_report(options.html, found) if options.html else None
     if page and options.json == "-":
         print_remark(f"report: {page}")
     elif page:
