@@ -74,27 +74,18 @@ def render_regression(request: pytest.FixtureRequest) -> Iterator[RenderRegressi
     If there is no reference, the test fails and says how to make one. For all arguments, see
     `mitsuba_subdivision.regression.fixture.RenderRegression`.
     """
-    from mitsuba_subdivision.regression.fixture import FixtureSettings, RenderRegression
+    from mitsuba_subdivision.regression.fixture import RenderRegression
 
-    config = request.config
-    results = config.getoption("--render-results")
-    settings = FixtureSettings(
-        references=config.rootpath / config.getini("render_references"),
-        results=Path(results).absolute() if results else config.rootpath / config.getini("render_results"),
-        update=config.getoption("render_update"),
-        spp_scale=config.getoption("--render-spp-scale"),
-        reports=config.getoption("--render-report"),
-    )
-    fixture = RenderRegression(settings, request.node)
+    fixture = RenderRegression(request.config, request.node)
     yield fixture
     if fixture.reported:
-        config.stash[_REPORTED] = settings.results
+        request.config.stash[_REPORTED] = fixture.results
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write a page with links to all reports."""
     results = session.config.stash.get(_REPORTED, None)
     if results:
-        from mitsuba_subdivision.images.report import write_index
+        from mitsuba_subdivision.regression.report import write_index
 
         write_index(results)

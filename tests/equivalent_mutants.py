@@ -129,9 +129,9 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, -1.0), 0)",
             ),
             (
-                "images/compare.py",
-                "paired, is_replaced = found.get(PAIRED), False",
-                "paired, is_replaced = found.get(PAIRED), True",
+                "regression/compare.py",
+                'paired, is_replaced = results.get("paired"), False',
+                'paired, is_replaced = results.get("paired"), True',
             ),
             ("schemes/scheme.py", "regular_border_faces: int = 0", "regular_border_faces: int = -1"),
             (
@@ -202,7 +202,7 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "point, edge = point - edge, scheme.edge_turn @ edge",
             ),
             (
-                "images/paired_tier.py",
+                "regression/radiance_tiers.py",
                 'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
                 " int(difference[..., 0].size)}",
                 'numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels":'
@@ -382,14 +382,12 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
                 "_MOST_SHOWN, _MOST_SEARCHED = 200, 9999",
             ),
             (
-                "images/flip_tier.py",
-                'return {"start": round(start, 3), "stop": round(stop, 3),'
-                ' "count": max(2, int(np.ceil(stop - start)))}',
-                'return {"start": round(start, 3), "stop": round(stop, 4),'
-                ' "count": max(2, int(np.ceil(stop - start)))}',
+                "regression/radiance_tiers.py",
+                "return round(start, 3), round(stop, 3), max(2, int(np.ceil(stop - start)))",
+                "return round(start, 3), round(stop, 4), max(2, int(np.ceil(stop - start)))",
             ),
-            ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 61"),
-            ("images/metadata.py", "_LONGEST = 60", "_LONGEST = 59"),
+            ("regression/image.py", "_LONGEST = 60", "_LONGEST = 61"),
+            ("regression/image.py", "_LONGEST = 60", "_LONGEST = 59"),
             (
                 "files/usd_stage.py",
                 "files = _listed(sorted({Path(each).name for each in documents}), 3)",
@@ -422,9 +420,10 @@ EQUIVALENT: tuple[tuple[str, tuple[tuple[str, str, str], ...]], ...] = (
         "the spaces of a file that programs read",
         (
             (
-                "images/report.py",
-                '_write_text(folder / NUMBERS, json.dumps(numbers, indent=1) + "\\n")',
-                '_write_text(folder / NUMBERS, json.dumps(numbers, indent= 2) + "\\n")',
+                "regression/report.py",
+                '_write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()}, indent=1) + "\\n")',
+                '_write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()},'
+                ' indent= 2) + "\\n")',
             ),
         ),
     ),

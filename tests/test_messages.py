@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.images.exr import write_exr
 from mitsuba_subdivision.messages import print_error
+from mitsuba_subdivision.regression.image import write_exr
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
     <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>

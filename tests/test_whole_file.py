@@ -240,7 +240,7 @@ import mitsuba as mi
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.figures.figure_scenes import draw_picture
 from mitsuba_subdivision.figures.output import FigureOptions
-from mitsuba_subdivision.images.exr import write_exr
+from mitsuba_subdivision.regression.image import write_exr
 from mitsuba_subdivision.whole_file import whole_file
 mi.set_variant("scalar_rgb")
 folder = Path(sys.argv[1])

@@ -34,7 +34,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.rules import RULES
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
-from mitsuba_subdivision.images.tiers import TIERS
+from mitsuba_subdivision.regression.tiers import TIERS
 from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 
 if sys.version_info >= (3, 11):

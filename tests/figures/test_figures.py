@@ -224,7 +224,7 @@ def test_numbers_stand_on_edges_that_the_camera_sees():
 def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_path):
     from mitsuba_subdivision.figures import FIGURES
     from mitsuba_subdivision.figures.peers import VARIABLE
-    from mitsuba_subdivision.images.exr import read_channels
+    from mitsuba_subdivision.regression.image import read_channels
 
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))

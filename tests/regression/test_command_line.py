@@ -2,13 +2,13 @@
 
 import json
 import re
+import sys
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.images.exr import read_channels, write_channels, write_exr
-from mitsuba_subdivision.images.image import load_image
+from mitsuba_subdivision.regression.image import load_image, read_channels, write_channels, write_exr
 from regression.defects import SCENES
 
 SCENE = str(SCENES / "valence3.xml")
@@ -48,6 +48,14 @@ def test_another_image_fails_and_says_where(folder, capsys, tmp_path):
     assert (tmp_path / "report" / "index.html").is_file()
 
 
+def test_a_report_that_cannot_be_written_does_not_hide_the_result(folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert compare(folder, "reference.exr", "stam.exr", "--html", str(tmp_path / "report")) == 3
+    printed, told = capsys.readouterr()
+    assert printed.startswith("FAIL: ")
+    assert "reports need matplotlib" in told
+
+
 def test_json_on_standard_output_or_in_a_file(folder, capsys, tmp_path):
     assert compare(folder, "reference.exr", "reference.exr", "--json", "-") == 0
     printed = json.loads(capsys.readouterr().out)
@@ -57,10 +65,10 @@ def test_json_on_standard_output_or_in_a_file(folder, capsys, tmp_path):
 
 
 def test_a_warning_has_a_status_of_its_own(folder, tmp_path, monkeypatch):
-    from mitsuba_subdivision.regression import environment
+    from mitsuba_subdivision.regression import scene
 
     # The scene has changed, and so has the machine: the tile tier cannot tell, at this tolerance.
-    monkeypatch.setattr(environment, "_processor", lambda: "another")
+    monkeypatch.setattr(scene, "_processor", lambda: "another")
     changed = (SCENES / "valence3.xml").read_text().replace('value="0.72, 0.66', 'value="0.7201, 0.66')
     changed = changed.replace("cages/valence3.obj", str(SCENES / "cages/valence3.obj"))
     (tmp_path / "scene.xml").write_text(changed)
@@ -77,7 +85,9 @@ def test_any_two_images(folder):
     ("words", "message"),
     [
         (["reference.exr", "missing.exr"], "is not a file"),
-        (["reference.exr", "text.exr"], "not a readable OpenEXR file"),
+        (["reference.exr", "text.exr"], "not an OpenEXR file"),
+        (["missing.exr", SCENE], "missing.exr --reference"),
+        (["reference.exr", "plain.exr", "--seed", "0"], "--seed is for a scene"),
         (["reference.exr", "small.exr"], "expected the same size"),
         (["reference.exr", "plain.exr", "--tiers", "probe"], 'tier "probe" cannot run'),
         (["reference.exr", "plain.exr", "--tiers", "probe,x"], 'unknown tier "x"'),
@@ -189,9 +199,27 @@ def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
 def test_a_missing_pass_is_told(passes, capsys, tmp_path):
     output = str(tmp_path / "merged.exr")
     assert main(["merge", str(passes / "1.exr"), str(passes / "3.exr"), "-o", output]) == 0
-    assert capsys.readouterr().err == "mitsuba-subdivision: warning: no pass has the batches from 2 to 4\n"
+    assert capsys.readouterr().err == "mitsuba-subdivision: warning: of 3 passes, these are missing: 2\n"
     assert main(["merge", str(passes / "2.exr"), "-o", output]) == 0
-    assert capsys.readouterr().err == "mitsuba-subdivision: warning: no pass has the batches from 0 to 1\n"
+    assert capsys.readouterr().err == "mitsuba-subdivision: warning: of 3 passes, these are missing: 1, 3\n"
+
+
+def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeypatch):
+    pixels = np.ones((16, 16, 3), np.float32)
+    pixels[3, 5, 1] = np.nan
+    monkeypatch.setattr("mitsuba_subdivision.regression.passes.render_pixels", lambda *_: pixels)
+    assert main(["render", SCENE, "-o", str(tmp_path / "reference.exr"), "--reference", "--spp", "16", *SMALL]) == 1
+    assert "is not finite: G = nan at x = 5, y = 3; channels G, variance.G" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_seed_has_other_samples(folder, tmp_path):
+    samples = []
+    for seed in ([], ["--seed", "0"], ["--seed", "1"]):
+        report = str(tmp_path / "found.json")
+        assert compare(folder, "reference.exr", SCENE, "--spp", "16", "--tiers", "tile", "--json", report, *seed) == 0
+        samples.append(json.loads((tmp_path / "found.json").read_text())["relmse"])
+    assert samples[0] == samples[1] != samples[2]
 
 
 def test_merged_passes_need_room_for_their_variance(passes, capsys, tmp_path):
@@ -234,8 +262,8 @@ SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
         (without("variance.G"), "has no channel variance.G"),
         (without("N"), "no channel N"),
         (without("variance"), "is no pass: it has no variance"),
-        (with_pixel("G", np.nan), "channel G of image .* is nan at x = 4, y = 3"),
-        (with_pixel("variance.R", np.inf), "channel variance.R of image .* is inf at x = 4, y = 3"),
+        (with_pixel("G", np.nan), "is not finite: G = nan at x = 4, y = 3"),
+        (with_pixel("variance.R", np.inf), "is not finite: variance.R = inf at x = 4, y = 3"),
         (with_pixel("variance.R", -1), "has a variance of -1; expected at least 0"),
         (with_pixel("N", 0), "has pixels without samples"),
         (lambda c, m: ({**c, "N": c["N"] + np.float32(0.5)}, m), "channel N of image .* has numbers of type float32"),
@@ -247,6 +275,8 @@ SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
         (with_metadata(sampling={**SAMPLING, "batches": [1, 2]}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "batches": [[2, 5], [6]]}), "expected a seed, the samples of a batch"),
         (with_metadata(sampling={**SAMPLING, "seed": "0"}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "total": 4}), "expected a seed, the samples of a batch"),
+        (with_metadata(sampling={**SAMPLING, "total": 8, "passes": 9}), "expected a seed, the samples of a batch"),
         (with_metadata(paired={"seed": 0}), "expected a seed and samples per pixel"),
         (with_metadata(paired={"spp": 4}), "expected a seed and samples per pixel"),
         (with_metadata(files=[1]), r"files is \[1\]; expected checksums by name"),
@@ -271,6 +301,7 @@ def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rn
     damaged += [whole[:length] for length in (1, 4, 100, len(whole) // 2, len(whole) - 1)]
     for data in damaged:
         path.write_bytes(data)
+        problem = "is truncated, or damaged" if data[:4] == whole[:4] else "is not an OpenEXR file"
         for words in (
             ["merge", str(passes / "1.exr"), str(path), "-o", str(tmp_path / "merged.exr")],
             ["compare", str(folder / "reference.exr"), str(path)],
@@ -278,8 +309,10 @@ def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rn
         ):
             assert main(words) == 3, words
             # Of the process, not of Python alone: OpenEXR writes there itself.
-            (told,) = capfd.readouterr().err.splitlines()
-            assert "damaged.exr" in told
+            printed, told = capfd.readouterr()
+            assert printed == ""
+            assert told.endswith(f'damaged.exr" {problem}\n')
+            assert told.count("\n") == 1
     for _ in range(20):
         flipped = np.frombuffer(whole, dtype=np.uint8).copy()
         flipped[np_rng.integers(0, len(whole), 4)] = np_rng.integers(0, 256, 4)

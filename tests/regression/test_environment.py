@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mitsuba_subdivision.regression import environment
+from mitsuba_subdivision.regression import scene
 
 EPYC = """processor\t: 0
 vendor_id\t: AuthenticAMD
@@ -25,23 +25,23 @@ processor\t: 1
 
 
 def test_processors_of_one_name_are_told_apart():
-    assert environment._first_of(EPYC.format(family=26, model=2)) == "AMD EPYC, cpu family 26, model 2"
-    assert environment._first_of(EPYC.format(family=25, model=1)) == "AMD EPYC, cpu family 25, model 1"
+    assert scene._first_of(EPYC.format(family=26, model=2)) == "AMD EPYC, cpu family 26, model 2"
+    assert scene._first_of(EPYC.format(family=25, model=1)) == "AMD EPYC, cpu family 25, model 1"
 
 
 def test_processors_without_a_name_have_numbers():
-    assert environment._first_of(ARM) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
+    assert scene._first_of(ARM) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
 
 
 def test_a_list_of_another_form_gives_nothing():
-    assert environment._first_of("") == ""
-    assert environment._first_of("no colon\n") == ""
+    assert scene._first_of("") == ""
+    assert scene._first_of("no colon\n") == ""
 
 
 def test_this_processor_has_a_name():
-    found = environment.environment("scalar_rgb")["processor"]
+    found = scene.environment("scalar_rgb")["processor"]
     information = Path("/proc/cpuinfo")
     if information.is_file():
-        assert found == environment._first_of(information.read_text(encoding="utf-8", errors="replace"))
+        assert found == scene._first_of(information.read_text(encoding="utf-8", errors="replace"))
     else:
         assert found

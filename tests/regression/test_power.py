@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import mitsuba as mi
 import pytest
-from mitsuba_subdivision.images.compare import compare
-from mitsuba_subdivision.images.image import load_image
-from mitsuba_subdivision.images.tier import Status
-from mitsuba_subdivision.images.tolerances import Tolerances
-from mitsuba_subdivision.regression.compare_scene import compare_scene, render_like
+from mitsuba_subdivision.regression.compare import compare
+from mitsuba_subdivision.regression.image import load_image
+from mitsuba_subdivision.regression.references import compare_scene, render_like
+from mitsuba_subdivision.regression.tiers import Status, Tolerances
 from regression.defects import DEFECTS, RESOLUTION, SCENES, scene_of
 
 REFERENCES = SCENES.parent / "renders" / "references"
@@ -56,7 +55,7 @@ def test_defects_are_caught(reference, valence, name):
 @pytest.mark.parametrize("valence", [3], indirect=True)
 def test_unchanged_seeds_raise_no_alarm(reference, valence):
     scene = scene_of(valence)
-    found = [compare(reference, render_like(reference, scene, attempt=seed), ["tile"]) for seed in range(SEEDS)]
+    found = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in range(SEEDS)]
     assert [str(each) for each in found if each.status is not Status.PASS] == []
 
 
@@ -65,7 +64,7 @@ def test_the_tile_tier_is_sure_of_one_per_cent(reference, valence):
     """At the usual 256 samples."""
     scene = DEFECTS["albedo + 1 %"](valence)
     seeds = range(SEEDS_OF_ONE_PER_CENT)
-    found = [compare(reference, render_like(reference, scene, attempt=seed), ["tile"]) for seed in seeds]
+    found = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in seeds]
     assert {each.status for each in found} == {Status.FAIL}
 
 

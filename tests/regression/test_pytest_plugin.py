@@ -1,15 +1,17 @@
 """The pytest plugin, in projects of its own."""
 
 import json
+import os
 import subprocess
 import sys
 
 import flip_evaluator  # noqa: F401
+import matplotlib.pyplot  # noqa: F401
 import mitsuba as mi
-import mitsuba_subdivision.images.report
-import mitsuba_subdivision.regression.fixture  # noqa: F401
 import numpy.fft  # noqa: F401
+import PIL.PngImagePlugin  # noqa: F401
 import pytest
+from mitsuba_subdivision.regression.image import load_image
 
 pytest_plugins = ["pytester"]
 
@@ -63,19 +65,85 @@ def reference(project):
 def test_a_missing_reference_fails_and_says_how_to_make_it(project):
     result = project.runpytest()
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*there is no reference*ball.exr*", "*pytest *::test_ball --render-update*"])
-    # A set: where the variable CI is set, pytest repeats the message in its summary.
-    (line,) = {line.strip() for line in result.outlines if "mitsuba-subdivision render" in line}
+    result.stdout.fnmatch_lines(["there is no reference*ball.exr*make it with: pytest *::test_ball --render-update"])
     assert not reference(project).exists()
-    # The command does what it says.
-    words = line.split()[line.split().index("mitsuba-subdivision") + 1 :]
-    subprocess.run([sys.executable, "-m", "mitsuba_subdivision", *words], cwd=project.path, check=True, timeout=60)
-    written = reference(project).read_bytes()
-    project.runpytest().assert_outcomes(passed=1)
-    # And so does the option: with the same bytes.
-    reference(project).unlink()
     project.runpytest("--render-update").assert_outcomes(failed=1)
-    assert reference(project).read_bytes() == written
+    project.runpytest().assert_outcomes(passed=1)
+
+
+def test_the_command_of_a_reference_gives_the_same_bytes(with_reference):
+    written = reference(with_reference).read_bytes()
+    words = load_image(reference(with_reference)).metadata["command"].split()[1:]
+    folder = reference(with_reference).parent
+    subprocess.run([sys.executable, "-m", "mitsuba_subdivision", *words], cwd=folder, check=True, timeout=60)
+    assert reference(with_reference).read_bytes() == written
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda project: truncate(reference(project)), "*ball.exr* is truncated, or damaged; make it with: pytest *"),
+        (lambda project: project.makefile(".xml", ball=SCENE.replace('"16"', '"12"')), "*12 x 12 pixels*16 x 16;*"),
+    ],
+    ids=["truncated", "size"],
+)
+def test_update_writes_references_that_cannot_be_used(with_reference, damage, problem):
+    damage(with_reference)
+    result = with_reference.runpytest()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines([problem])
+    with_reference.runpytest("--render-update").assert_outcomes(failed=1)
+    with_reference.runpytest().assert_outcomes(passed=1)
+
+
+def test_a_failure_is_printed_once_and_a_folder_that_is_protected_does_not_hide_it(with_reference):
+    make_brighter(with_reference)
+    (with_reference.path / "failures").write_text("a file")
+    result = with_reference.runpytest()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*no report: *failures*"])
+    # Where the variable CI is set, pytest repeats the message in its summary.
+    lines = [line for line in result.outlines if "same samples, but" in line and not line.startswith("FAILED")]
+    assert len(lines) == 1 + ("CI" in os.environ)
+
+
+def test_values_that_are_not_finite_are_one_line(with_reference):
+    with_reference.makepyfile(
+        TEST.replace(
+            "(render_regression):",
+            """(render_regression, monkeypatch):
+    from mitsuba_subdivision.regression import passes
+    render = passes.render_pixels
+
+    def broken(*given):
+        pixels = render(*given)
+        pixels[3:5, 5] = float("nan")
+        pixels[4, 6, 1] = float("inf")
+        return pixels
+
+    monkeypatch.setattr(passes, "render_pixels", broken)""",
+        )
+    )
+    result = with_reference.runpytest("-W", "error")
+    result.assert_outcomes(failed=1)
+    (line,) = {line for line in result.outlines if " finite " in line}
+    assert line.split("the test is not: ")[1].startswith(
+        "R = nan at x = 5, y = 3 and at 2 more pixels; channels R, G, B, "
+    )
+
+
+def test_each_seed_has_other_samples(with_reference):
+    with_reference.makepyfile(
+        TEST.replace("render_regression(", "found = [render_regression(")
+        .replace("\n\n", "")
+        .replace('"scalar_rgb")', '"scalar_rgb", seed=seed) for seed in (0, 0, 1)]\n')
+        + "    a, b, c = (each.numbers['relmse'] for each in found)\n    assert a == b != c\n"
+    )
+    with_reference.runpytest().assert_outcomes(passed=1)
 
 
 def test_update_writes_what_differs_and_fails(with_reference):

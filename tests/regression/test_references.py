@@ -1,9 +1,9 @@
 """The scenes against their references, and the references themselves."""
 
 import pytest
-from mitsuba_subdivision.images.image import load_image, save_image
+from mitsuba_subdivision.regression.image import load_image, save_image
 from mitsuba_subdivision.regression.passes import Sampling
-from mitsuba_subdivision.regression.reference import render_reference
+from mitsuba_subdivision.regression.references import render_reference
 from mitsuba_subdivision.variants import variant_set
 from regression.defects import RESOLUTION, SCENES
 

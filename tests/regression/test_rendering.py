@@ -3,9 +3,8 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.regression import rendering
-from mitsuba_subdivision.regression.rendering import LEAST_PART_SPP, PART_SAMPLES, parts_of, render_image
-from mitsuba_subdivision.regression.scene import load_scene
+from mitsuba_subdivision.regression import scene as scenes
+from mitsuba_subdivision.regression.scene import LEAST_PART_SPP, PART_SAMPLES, load_scene, parts_of, render_image
 from regression.defects import SCENES
 
 SIZE = 8
@@ -33,7 +32,7 @@ def test_small_images_are_one_render_of_mitsuba(loaded):
 
 
 def test_images_in_parts_are_means_of_other_samples(loaded, monkeypatch):
-    monkeypatch.setattr(rendering, "PART_SAMPLES", LEAST_PART_SPP * SIZE**2)
+    monkeypatch.setattr(scenes, "PART_SAMPLES", LEAST_PART_SPP * SIZE**2)
     monkeypatch.setattr(mi, "render", counted := _Counted(mi.render))
     first, again, other = (render_image(loaded, 2 * LEAST_PART_SPP + 1, seed) for seed in (0, 0, 1))
     assert counted.calls == [(0, 16), (1, 17), (0, 16), (1, 17), (2, 16), (3, 17)]
@@ -45,7 +44,7 @@ def test_images_in_parts_are_means_of_other_samples(loaded, monkeypatch):
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_samplers_that_spread_samples_over_the_whole_keep_it(monkeypatch):
-    monkeypatch.setattr(rendering, "PART_SAMPLES", 1)
+    monkeypatch.setattr(scenes, "PART_SAMPLES", 1)
     loaded = load_scene(SCENES / "human.xml", None, "box")
     monkeypatch.setattr(mi, "render", counted := _Counted(lambda *_, **__: np.zeros((1, 1, 3))))
     render_image(loaded, 64)

@@ -8,9 +8,8 @@ import pytest
 from mitsuba_subdivision import render_denoised, studio_scene
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.images.image import load_image
-from mitsuba_subdivision.regression.rendering import render_pixels
-from mitsuba_subdivision.regression.scene import BOX, load_scene
+from mitsuba_subdivision.regression.image import load_image
+from mitsuba_subdivision.regression.scene import BOX, load_scene, render_pixels
 
 SIZE = (48, 36)
 # Of the error by as many samples, at most: measured 0.34.

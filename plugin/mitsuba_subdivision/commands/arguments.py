@@ -30,13 +30,9 @@ def set_variant(name: str | None) -> None:
     RegressionError
         If the variant cannot run here.
     """
-    from ..regression import RegressionError
-    from ..regression.environment import variant_problem
+    from ..regression.scene import require_variant
 
-    problem = variant_problem(name) if name else None
-    if problem:
-        raise RegressionError(problem)
-    variants.set_variant(name or best_variant())
+    variants.set_variant(require_variant(name) if name else best_variant())
 
 
 def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:
@@ -62,6 +58,13 @@ def positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number}; expected 1 or more")
     return number
+
+
+def seed(text: str) -> int:
+    """Parse a seed, an integer of 32 bits."""
+    if not (text.isdecimal() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
+    return int(text)
 
 
 def rate(text: str) -> int:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-from itertools import pairwise
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..images.tiers import TIERS
-from ..images.tolerances import Tolerances
-from ..messages import print_remark, print_result
+from ..messages import PROGRAM, print_remark, print_result
+from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..whole_file import require_folder, require_writable, whole_file
-from .arguments import positive
+from .arguments import positive, seed
 from .parser import table
 from .passes import TOLERANCES, add_tolerances
 
@@ -25,12 +24,11 @@ UNUSABLE = 3
 
 def add_parser(commands: Commands) -> None:
     """Add the commands to the program."""
-    by_default = ", ".join(name for name, tier in TIERS.items() if tier.by_default)
     compare = commands.add_parser(
         "compare",
         help="compare two images, or a scene with its reference",
         description="Compare an image with a reference, or render a scene as its reference was rendered and compare "
-        "the two.\n\n" + table("tiers", {name: tier.compares for name, tier in TIERS.items()}),
+        "the two.\n\n" + table("tiers", TIERS),
         epilog=f"{TOLERANCES}\n\nExit status: 0 pass, 1 warning, 2 fail, 3 unusable input or output.",
     )
     compare.add_argument("reference", type=Path, metavar="REFERENCE", help="OpenEXR file")
@@ -38,10 +36,11 @@ def add_parser(commands: Commands) -> None:
     compare.add_argument(
         "--tiers",
         metavar="TIERS",
-        help=f"tiers to compare by, separated by commas (default: {by_default}, as far as the images allow; flip if no "
-        "other can compare their pixels)",
+        help=f"tiers to compare by, separated by commas (default: {', '.join(DEFAULT_TIERS)}, as far as the images "
+        "allow; flip if no other can compare their pixels)",
     )
     compare.add_argument("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
+    compare.add_argument("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
     add_tolerances(compare, "tolerance to use instead of the reference's; can be repeated")
     compare.add_argument("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
     compare.add_argument("--html", type=Path, metavar="DIR", help="folder to write a report to")
@@ -59,14 +58,18 @@ def add_parser(commands: Commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from ..images import ImageError
-    from ..images.compare import compare
-    from ..images.image import load_image
-    from ..images.report import write_report
+    from ..regression import ImageError
+    from ..regression.compare import compare
+    from ..regression.image import load_image
+    from ..regression.report import write_report
 
     renders = options.test.suffix.lower() == ".xml"
-    if options.spp and not renders:
-        raise ImageError(f'--spp is for a scene; "{options.test}" is rendered already')
+    given = "--spp" if options.spp else "--seed" if options.seed is not None else None
+    if given and not renders:
+        raise ImageError(f'{given} is for a scene; "{options.test}" is rendered already')
+    if not options.reference.is_file():
+        making = f"{PROGRAM} render SCENE -o {shlex.quote(str(options.reference))} --reference"
+        raise ImageError(f'there is no reference "{options.reference}"; make it with: {making}')
     reference = load_image(options.reference)
     stored = Tolerances().with_values(reference.metadata.get("tolerances", {}))
     tolerances = stored.with_values(dict(options.tolerances))
@@ -78,20 +81,22 @@ def _compare(options: argparse.Namespace) -> int:
         require_folder(options.html)
         require_writable(options.html / "index.html")
     if test is None:
-        from ..regression.compare_scene import compare_scene, variant_for
-        from ..regression.reference import TEST_SPP
+        from ..regression.references import TEST_SPP, compare_scene, variant_for
         from ..variants import variant_set
 
         with variant_set(variant_for(reference)):
-            found = compare_scene(reference, options.test, tiers, options.spp or TEST_SPP, tolerances)
+            found = compare_scene(
+                reference, options.test, tiers, options.spp or TEST_SPP, tolerances, seed=options.seed or 0
+            )
     else:
         found = compare(reference, test, tiers, tolerances)
     text = json.dumps(found.as_dict(), indent=1)
     if options.json and options.json != "-":
         with whole_file(Path(options.json)) as beside:
             beside.write_text(f"{text}\n", encoding="utf-8")
-    page = write_report(options.html, found) if options.html else None
+    # The result first, which a report that cannot be written does not hide.
     print_result(text if options.json == "-" else found)
+    page = write_report(options.html, found) if options.html else None
     if page and options.json == "-":
         print_remark(f"report: {page}")
     elif page:
@@ -100,9 +105,9 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _merge(options: argparse.Namespace) -> None:
-    from ..images import ImageError
-    from ..images.image import load_image, require_finite, save_image
-    from ..regression.passes import merge_passes
+    from ..regression import ImageError
+    from ..regression.image import load_image, require_finite, save_image
+    from ..regression.passes import merge_passes, missing_passes
 
     if options.output.suffix.lower() != ".exr":
         raise ImageError(f'output "{options.output}"; expected a name ending in .exr')
@@ -112,8 +117,9 @@ def _merge(options: argparse.Namespace) -> None:
     merged = merge_passes(passes, str(options.output))
     require_writable(options.output, options.passes)
     save_image(options.output, merged)
-    first, *others = merged.metadata["sampling"]["batches"]
-    gaps = [*([[0, first[0]]] if first[0] else []), *([a[1], b[0]] for a, b in pairwise([first, *others]))]
-    for start, stop in gaps:
-        print_remark(f"warning: no pass has the batches from {start} to {stop - 1}")
+    missing = missing_passes(merged)
+    if missing:
+        numbers = ", ".join(map(str, missing))
+        count = merged.metadata["sampling"].get("passes", 1)
+        print_remark(f"warning: of {count} passes, these are missing: {numbers}")
     print_result(options.output)

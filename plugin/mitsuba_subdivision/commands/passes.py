@@ -7,8 +7,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from ..images.tolerances import Tolerances
 from ..messages import print_result
+from ..regression.tiers import Tolerances
 from ..whole_file import require_writable
 from .arguments import positive
 from .pictures import threads
@@ -104,10 +104,9 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     """
     import mitsuba as mi
 
-    from ..images.image import save_image
-    from ..regression.cluster import render_on_cluster
-    from ..regression.passes import BATCH, Sampling, merge_passes, render_pass
-    from ..regression.reference import REFERENCE_SPP, as_reference
+    from ..regression.image import save_image
+    from ..regression.passes import BATCH, LEAST_BATCHES, Sampling, merge_passes, render_on_cluster, render_pass
+    from ..regression.references import REFERENCE_SPP, as_reference
     from ..regression.scene import BOX, load_scene
 
     filter_name = BOX if options.reference else options.filter
@@ -121,7 +120,7 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
     tolerances = Tolerances().with_values(dict(options.tolerances))
     number, count = options.share or (1, options.passes or 1)
-    batch = options.batch or min(BATCH, max(1, spp // max(2, count)))
+    batch = options.batch or min(BATCH, max(1, spp // max(LEAST_BATCHES, count)))
     if is_model:
         from ..studio.studio_entries import sampler
 

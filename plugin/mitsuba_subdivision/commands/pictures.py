@@ -32,7 +32,7 @@ def render_picture(
     options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None
 ) -> NDArray[np.float32]:
     """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
-    from ..regression.rendering import render_image
+    from ..regression.scene import render_image
 
     count = options.shutter or 1
     total: Any = 0.0
@@ -90,7 +90,7 @@ def threads(count: int | None) -> Iterator[None]:
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
     import mitsuba as mi
 
-    from ..regression.cluster import cluster, results
+    from ..regression.passes import cluster, results
 
     # The command's own number: files may change until the next one.
     command = pickle.dumps(as_data(options) | {"command": uuid4().hex})

@@ -16,7 +16,7 @@ from ..messages import print_remark, print_result
 from ..shapes.parameter_table import SHADINGS
 from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
-from .arguments import add_cage_options, add_variant, finite, positive, set_variant
+from .arguments import add_cage_options, add_variant, finite, positive, seed, set_variant
 from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes
 from .pictures import as_data, load_still, pictures, render_picture
 
@@ -70,7 +70,7 @@ def add_parser(commands: Commands) -> None:
     render.add_argument(
         "--spp", type=positive, metavar="N", help="samples per pixel (default: the scene's; models: 64)"
     )
-    render.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
+    render.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
     render.add_argument(
         "-D",
         "--define",
@@ -300,7 +300,7 @@ def _write_frames(options: argparse.Namespace) -> None:
 def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
     import mitsuba as mi
 
-    from ..images.exr import METADATA_ATTRIBUTE
+    from ..regression.image import METADATA_ATTRIBUTE
 
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
@@ -308,12 +308,6 @@ def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: 
         if options.denoise:
             bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
         bitmap.write(str(beside))
-
-
-def _seed(text: str) -> int:
-    if not (text.isdecimal() and int(text) < 2**32):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
-    return int(text)
 
 
 def _index(text: str) -> int:

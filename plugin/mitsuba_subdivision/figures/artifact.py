@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..images.probe_tier import normal_angle
+from ..regression.probe import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mitsuba_mesh import mitsuba_mesh
-from ..regression.rendering import render_parts
-from ..regression.scene import load_scene
+from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded
 from ..variants import SceneNode
 from .output import FigureOptions, panels, scene_path, show, write_pixels, write_plot

@@ -12,9 +12,9 @@ from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
 from ..evaluation.patch_pieces import irregular_structure
-from ..images.probe_tier import normal_angle
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
+from ..regression.probe import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_plot

@@ -186,7 +186,7 @@ def write_pixels(
 ) -> list[Path]:
     """Write linear RGB pixels as OpenEXR, if that format is wanted; returns the file written, if any."""
     # Imported here, as the command line imports this module for every command.
-    from ..images.exr import write_exr
+    from ..regression.image import write_exr
 
     paths = options.paths(name, "exr")
     for path in paths:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
-from ..images.probe_tier import normal_angle
-from ..regression.rendering import render_pixels
+from ..regression.probe import normal_angle
+from ..regression.scene import render_pixels
 from ..surface import LimitSurface
 from .figure_scenes import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot

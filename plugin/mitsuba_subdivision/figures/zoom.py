@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
-from ..images.probe_tier import normal_angle
+from ..regression.probe import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence

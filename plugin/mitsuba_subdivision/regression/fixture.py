@@ -6,60 +6,47 @@ for it.
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ..images.comparison import Comparison
-from ..images.image import load_image, save_image
-from ..images.report import write_report
-from ..images.tier import Status
-from ..images.tolerances import Tolerances
 from ..llvm import best_variant
 from ..variants import variant_set
-from . import RegressionError
-from .compare_scene import compare_scene, variant_for
-from .environment import variant_problem
+from . import ImageError, RegressionError
+from .compare import Comparison
+from .image import save_image
 from .passes import BATCH, Sampling
-from .reference import REFERENCE_SPP, TEST_SPP, command, render_reference
-from .scene import SceneSource
-
-
-@dataclass(frozen=True)
-class FixtureSettings:
-    """Settings from the command line of pytest and from its configuration file.
-
-    Attributes
-    ----------
-    references, results : Path
-        Folder of the references, and folder for the renders and reports of failed comparisons.
-    update : str
-        "no" writes no reference. "failing" writes references that are missing or do not match, and fails their tests.
-        "all" writes every reference.
-    spp_scale : float
-        Factor on the samples per pixel of tests; references keep theirs.
-    reports : str
-        Which comparisons get a report: "failures", "all" or "none".
-    """
-
-    references: Path
-    results: Path
-    update: str = "no"
-    spp_scale: float = 1.0
-    reports: str = "failures"
+from .references import (
+    REFERENCE_SPP,
+    TEST_SPP,
+    UnusableReference,
+    compare_scene,
+    load_reference,
+    render_reference,
+    variant_for,
+)
+from .report import write_report
+from .scene import SceneSource, require_variant
+from .tiers import Status, Tolerances
 
 
 class RenderRegression:
-    """The fixture's value: a function of a scene, which compares the scene with its reference."""
+    """The fixture's value: a function of a scene, which compares the scene with its reference.
 
-    def __init__(self, settings: FixtureSettings, node: Any) -> None:
-        self.settings = settings
+    The settings are those of the command line of pytest and of its configuration file.
+    """
+
+    def __init__(self, config: pytest.Config, node: Any) -> None:
+        results = config.getoption("--render-results")
+        self.references = config.rootpath / config.getini("render_references")
+        self.results = Path(results).absolute() if results else config.rootpath / config.getini("render_results")
+        self.update = config.getoption("render_update")
+        self.spp_scale = config.getoption("--render-spp-scale")
+        self.reports = config.getoption("--render-report")
         self.node = node
         self.reported = False
 
@@ -75,6 +62,7 @@ class RenderRegression:
         batch: int = BATCH,
         tiers: Sequence[str] | None = None,
         tolerances: Mapping[str, float] | None = None,
+        seed: int = 0,
     ) -> Comparison | None:
         """Render a scene, and fail the pytest test if the render differs from the scene's reference.
 
@@ -94,6 +82,8 @@ class RenderRegression:
             Some of "probe", "paired", "tile" and "flip"; by default the first three.
         tolerances : dict, optional
             Fields of `Tolerances` to use instead of those stored with the reference. A new reference stores them.
+        seed : int
+            From 0 on: each has other samples for the tile tier.
 
         Returns
         -------
@@ -102,85 +92,57 @@ class RenderRegression:
         """
         __tracebackhide__ = True
         given = {key: str(value) for key, value in (parameters or {}).items()}
-        path = self.settings.references / f"{_name(scene, name)}.exr"
-        limits = Tolerances().with_values(tolerances or {})
+        path = self.references / f"{_name(scene, name)}.exr"
+        new_limits = Tolerances().with_values(tolerances or {})
 
         def write() -> None:
-            with variant_set(_usable(variant or best_variant())):
+            with variant_set(require_variant(variant or best_variant())):
                 sampling = Sampling.of_spp(reference_spp, batch)
-                save_image(path, render_reference(scene, path, given, sampling, limits))
+                save_image(path, render_reference(scene, path, given, sampling, new_limits))
 
-        if self.settings.update == "all":
+        if self.update == "all":
             write()
             return None
-        if not path.is_file():
-            if self.settings.update == "no":
-                sampling = Sampling.of_spp(reference_spp, batch)
-                pytest.fail(self._missing(scene, path, given, variant, sampling, limits), False)
+        try:
+            reference = load_reference(path)
+            stored = reference.metadata.get("parameters", {})
+            if stored != given:
+                raise UnusableReference(
+                    f'the reference "{path}" was made with the scene parameters {stored}; this test has {given}'
+                )
+            limits = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
+            # All scenes with a reference share the probability of a false alarm, whichever tests are run.
+            suite_size = max(1, len(list(self.references.glob("*.exr"))))
+            spp = max(1, round(spp * self.spp_scale))
+            with variant_set(require_variant(variant) if variant else variant_for(reference)):
+                found = compare_scene(reference, scene, tiers, spp, limits, suite_size, seed)
+        except UnusableReference as problem:
+            if self.update == "no":
+                pytest.fail(f"{problem}; make it with: pytest {shlex.quote(self.node.nodeid)} --render-update", False)
             write()
-            pytest.fail(f'wrote the missing reference "{path}"; look at it, and run the test again', False)
-
-        reference = load_image(path)
-        if reference.metadata.get("parameters", {}) != given:
-            stored = reference.metadata.get("parameters")
-            problem = f'the reference "{path}" was made with the scene parameters {stored}; this test has {given}'
-            if self.settings.update == "no":
-                pytest.fail(f"{problem}; write it again with\n  {self._update_command()}", False)
-            write()
-            pytest.fail(f"{problem}; wrote it again", False)
-        stored = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
-        with variant_set(_usable(variant) if variant else variant_for(reference)):
-            found = compare_scene(
-                reference, scene, tiers, max(1, round(spp * self.settings.spp_scale)), stored, self._suite_size()
-            )
-        self.node.add_report_section("call", "render difference", str(found))
+            pytest.fail(f"{problem}; wrote it; look at it, and run the test again", False)
         report = self._report(found, path.stem)
-        if found.status is Status.FAIL:
-            if self.settings.update != "no":
-                write()
-                report += f'\nwrote the reference "{path}" again'
-            pytest.fail(f"{found}{report}", False)
-        return found
+        if found.status is not Status.FAIL:
+            self.node.add_report_section("call", "render difference", str(found))
+            return found
+        if self.update != "no":
+            write()
+            report += f'\nwrote the reference "{path}" again'
+        pytest.fail(f"{found}{report}", False)
 
     def _report(self, found: Comparison, name: str) -> str:
         """Write a report if the settings request one; returns a line with its path."""
-        wanted = self.settings.reports
+        wanted = self.reports
         if wanted == "none" or (wanted == "failures" and found.status is not Status.FAIL):
             return ""
-        folder = self.settings.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
-        page = write_report(folder, found, f"{name}: {self.node.nodeid}")
-        save_image(folder / "test.exr", found.test)
+        folder = self.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
+        try:
+            page = write_report(folder, found, f"{name}: {self.node.nodeid}")
+            save_image(folder / "test.exr", found.test)
+        except (OSError, ImageError) as error:
+            return f"\n  no report: {error}"
         self.reported = True
         return f"\n  report: {page}"
-
-    def _suite_size(self) -> int:
-        """Scenes that share the probability of a false alarm: all with a reference, whichever tests are run."""
-        return max(1, len(list(self.settings.references.glob("*.exr"))))
-
-    def _update_command(self) -> str:
-        return f"pytest {shlex.quote(self.node.nodeid)} --render-update"
-
-    def _missing(
-        self,
-        scene: SceneSource,
-        path: Path,
-        parameters: dict[str, str],
-        variant: str | None,
-        sampling: Sampling,
-        tolerances: Tolerances,
-    ) -> str:
-        lines = [f'there is no reference "{path}", as is expected of a new test. Make it with', self._update_command()]
-        if isinstance(scene, (str, Path)):
-            files = os.path.relpath(scene), os.path.relpath(path)
-            lines += ["or with", command(*files, parameters, variant or best_variant(), sampling, tolerances)]
-        return "\n  ".join(lines)
-
-
-def _usable(variant: str) -> str:
-    problem = variant_problem(variant)
-    if problem:
-        raise RegressionError(problem)
-    return variant
 
 
 def _name(scene: SceneSource, name: str | None) -> str:

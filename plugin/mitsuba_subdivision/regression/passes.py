@@ -1,43 +1,41 @@
-"""Rendering by passes: each renders a share of an image's batches, on any machine, and all are merged."""
+"""Rendering by passes: each renders a share of an image's batches, here or on a Dask cluster, and all are merged."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..images.estimate import Estimate, combine
-from ..images.image import Image
 from ..progress import timed
+from ..variants import set_variant
 from . import RegressionError
-from .environment import environment
-from .probe_render import probe_scene
-from .rendering import render_pixels
-from .scene import LoadedScene
+from .image import Estimate, Image, combine
+from .probe import NOTHING, Probe
+from .scene import SEEDS, LoadedScene, environment, render_pixels
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Samples per pixel of a batch, which is rendered at once with a seed of its own.
 BATCH = 64
+# Fewer batches than these measure the variance badly.
+LEAST_BATCHES = 4
 # Entries of the metadata that all passes of an image share.
 _SHARED = ("variant", "filter", "size", "files", "parameters")
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Which samples make an image.
-
-    Attributes
-    ----------
-    batches : int
-        Number of batches; batch b has the seed ``seed + b``.
-    batch : int
-        Samples per pixel of each batch.
-    seed : int
-    """
+    """Which samples make an image: batches of ``batch`` samples per pixel; batch b has the seed ``seed + b``."""
 
     batches: int
     batch: int = BATCH
@@ -45,9 +43,9 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches: at least two, since one has no variance."""
-        batch = min(batch, max(1, spp // 2))
-        return cls(max(2, -(-spp // batch)), batch, seed)
+        """At least ``spp`` samples in whole batches, of which there are at least `LEAST_BATCHES`."""
+        batch = min(batch, max(1, spp // LEAST_BATCHES))
+        return cls(max(LEAST_BATCHES, -(-spp // batch)), batch, seed)
 
     @property
     def spp(self) -> int:
@@ -73,13 +71,7 @@ class Sampling:
 def render_pass(
     loaded: LoadedScene, sampling: Sampling, number: int = 1, count: int = 1, *, with_probe: bool = False
 ) -> Image:
-    """Render the batches of one pass.
-
-    Parameters
-    ----------
-    with_probe : bool
-        Whether the first pass also has the data of a reference: the first batch alone, and the geometry probe.
-    """
+    """Render the batches of one pass; the first also with the first batch alone and the probe, if ``with_probe``."""
     share = sampling.share(number, count)
     first: NDArray[np.float32] | None = None
 
@@ -87,29 +79,25 @@ def render_pass(
         nonlocal first
         for index in share:
             at(f"batch {index + 1} of {sampling.batches}")
-            pixels = _render_batch(loaded, sampling.seed + index, sampling.batch)
+            pixels = render_pixels(loaded.scene, (sampling.seed + index) % SEEDS, sampling.batch)
+            if pixels.ndim != 3 or pixels.shape[2] < 3:
+                film = f"the film has the shape {pixels.shape}"
+                raise RegressionError(f'{film}; expected R, G, B: pixel_format "rgb" or "rgba"')
+            pixels = pixels[..., :3]
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
 
     # Rounded as in a file, so that it does not matter whether a pass was written and read again.
     with timed("Rendering") as at:
         estimate = combine(batches()).stored()
-    metadata = describe(loaded) | {
-        "sampling": {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
-    }
+    record = {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
+    metadata = {**describe(loaded), "sampling": {**record, "total": sampling.batches, "passes": count}}
     paired, probe = None, None
     if with_probe and share.start == 0 and first is not None:
         paired, probe = first.astype(np.float32).astype(np.float64), probe_scene(loaded)
         metadata["paired"] = {"seed": sampling.seed, "spp": sampling.batch}
-    name = str(loaded.path or "scene")
-    return Image(
-        name if count == 1 else f"{name}, pass {number} of {count}",
-        estimate.mean,
-        estimate,
-        paired,
-        probe,
-        metadata,
-    )
+    name = str(loaded.path or "scene") + (f", pass {number} of {count}" if count > 1 else "")
+    return Image(name, estimate.mean, estimate, paired, probe, metadata)
 
 
 def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
@@ -139,29 +127,27 @@ def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
     return Image(name, estimate.mean, estimate, paired.paired if paired else None, probe, metadata)
 
 
+def missing_passes(image: Image) -> list[int]:
+    """Numbers of the passes that a merged image lacks, whole or in part."""
+    record = image.metadata["sampling"]
+    present = {index for start, stop in record["batches"] for index in range(start, stop)}
+    total, passes = record.get("total", max(present) + 1), record.get("passes", 1)
+    sampling = Sampling(total, record["batch"], record["seed"])
+    return [i for i in range(1, passes + 1) if not present.issuperset(sampling.share(i, passes))]
+
+
 def describe(loaded: LoadedScene) -> dict[str, Any]:
     """Metadata of a render in the current variant, except for its samples."""
     return {
         "version": __version__,
         "variant": mi.variant(),
         "environment": environment(str(mi.variant())),
-        "integrator": _class_name(loaded.scene.integrator()),
+        "integrator": str(loaded.scene.integrator()).partition("[")[0],
         "filter": loaded.filter,
         "size": list(loaded.size),
         "files": loaded.files,
         "parameters": loaded.parameters,
     }
-
-
-def _class_name(plugin: mi.Object) -> str:
-    return str(plugin).partition("[")[0]
-
-
-def _render_batch(loaded: LoadedScene, seed: int, spp: int) -> NDArray[np.float32]:
-    pixels = render_pixels(loaded.scene, seed, spp)
-    if pixels.ndim != 3 or pixels.shape[2] < 3:
-        raise RegressionError(f'the film has the shape {pixels.shape}; expected R, G, B: pixel_format "rgb" or "rgba"')
-    return pixels[..., :3]
 
 
 def _estimate_of_pass(image: Image) -> Estimate:
@@ -172,7 +158,7 @@ def _estimate_of_pass(image: Image) -> Estimate:
 
 def _require_same_image(first: Image, other: Image) -> None:
     pairs = [(key, first.metadata.get(key), other.metadata.get(key)) for key in _SHARED]
-    pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch")]
+    pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch", "total")]
     for key, a, b in pairs:
         if a != b:
             difference = f"{key} is {a} and {b}"
@@ -198,3 +184,150 @@ def _joined(ordered: Sequence[Image]) -> list[list[int]]:
         else:
             joined.append([start, stop])
     return joined
+
+
+# Mesh attribute of the shape `subdivision`: the face of the cage that each triangle belongs to.
+ELEMENT_ATTRIBUTE = "face_element"
+
+
+def probe_scene(loaded: LoadedScene) -> Probe:
+    """Position, normal, uv, shape, triangle and face at the first hits of the rays through the centres of pixels."""
+    trace = _trace_arrays if dr.is_jit_v(mi.Float) else _trace_one_by_one
+    width, height = loaded.size
+    position, normal, uv, triangle, shape = trace(loaded, width, height)
+    hit = shape != NOTHING
+    for values in (position, normal, uv):
+        values[~hit] = 0
+    triangle[~hit] = NOTHING
+    p, n, parameters = (values.reshape(height, width, -1).astype(np.float32) for values in (position, normal, uv))
+    element = _elements(loaded.scene, shape, triangle)
+    size = (height, width)
+    return Probe(p, n, parameters, shape.reshape(size), triangle.reshape(size), element.reshape(size))
+
+
+def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
+    """Position, normal, parameters, triangle and shape that each ray hits, in a variant of arrays."""
+    pixel = dr.arange(mi.UInt32, width * height)
+    x, y = mi.Float(pixel % width), mi.Float(pixel // width)
+    film_position = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
+    # Any, as a number is taken for an array.
+    sensor: Any = loaded.sensor
+    # The middle of the lens and of the spectrum, when the shutter opens: a probe takes no random samples.
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, mi.Point2f(0.5))
+    found = loaded.scene.ray_intersect(ray)
+    # Any, as the stubs have no type for an array of shapes.
+    shapes: Any = found.shape, loaded.scene.shapes_dr()
+    identity, order = (np.array(dr.reinterpret_array(mi.UInt32, each)) for each in shapes)
+    shape = np.full(width * height, NOTHING, dtype=np.uint32)
+    valid = np.array(found.is_valid())
+    for index, shape_identity in enumerate(order):
+        shape[valid & (identity == shape_identity)] = index
+    vectors = (np.array(v).T.astype(np.float32).copy() for v in (found.p, found.sh_frame.n, found.uv))
+    return *vectors, np.array(found.prim_index).astype(np.uint32), shape
+
+
+def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
+    """Trace as `_trace_arrays` does, in a scalar variant."""
+    count = width * height
+    position, normal, uv = (np.zeros((count, n), dtype=np.float32) for n in (3, 3, 2))
+    triangle, shape = (np.full(count, NOTHING, dtype=np.uint32) for _ in range(2))
+    # Any, as the stubs are those of variants with arrays.
+    sensor: Any = loaded.sensor
+    scene: Any = loaded.scene
+    shapes = scene.shapes()
+    for i in range(count):
+        film_position = [(i % width + 0.5) / width, (i // width + 0.5) / height]
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, [0.5, 0.5])
+        found = scene.ray_intersect(ray)
+        if found.is_valid():
+            position[i], normal[i], uv[i] = found.p, found.sh_frame.n, found.uv
+            triangle[i], shape[i] = found.prim_index, shapes.index(found.shape)
+    return position, normal, uv, triangle, shape
+
+
+def _elements(scene: mi.Scene, shape: NDArray[np.uint32], triangle: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Faces of the cage that triangles belong to, `NOTHING` for shapes without a cage."""
+    found = np.full(shape.shape, NOTHING, dtype=np.uint32)
+    for index, candidate in enumerate(scene.shapes()):
+        at = np.flatnonzero(shape == index)
+        parameters = mi.traverse(candidate) if len(at) and candidate.is_mesh() else {}
+        if ELEMENT_ATTRIBUTE in parameters:
+            elements = np.array(parameters[ELEMENT_ATTRIBUTE]).astype(np.uint32)
+            found[at] = elements[triangle[at]]
+    return found
+
+
+T = TypeVar("T")
+
+# A worker may have several threads. But Mitsuba has one variant at a time, and an LLVM variant takes all cores.
+_lock = threading.Lock()
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Client]:
+    """The cluster of a scheduler, at an address such as "tcp://farm:8786".
+
+    Raises
+    ------
+    RegressionError
+        If `distributed` is not installed, or the cluster is not there.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise RegressionError("Dask is not installed: pip install 'mitsuba-subdivision[dask]'") from None
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise RegressionError(f'no Dask scheduler at "{address}": {error}') from None
+    with client:
+        if not client.nthreads():
+            raise RegressionError(f'the Dask scheduler at "{address}" has no workers')
+        yield client
+
+
+def results(client: Client, work: Callable[[int], T], variant: str, numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
+    """Numbers and what the workers of a cluster make of them, in the order in which they finish.
+
+    Where a worker ends early, another one repeats its work, one call at a time in each, in a variant of Mitsuba. The
+    work must be picklable.
+    """
+    from distributed import as_completed
+
+    # Not pure, in the sense of Dask: a repeated request renders again.
+    futures = as_completed(client.map(partial(_work, work, variant), numbers, pure=False), with_results=True)
+    return (result for _, result in futures)
+
+
+def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
+    """Runs on a worker."""
+    with _lock:
+        set_variant(variant)
+        return number, work(number)
+
+
+def render_on_cluster(
+    address: str,
+    load: Callable[[], LoadedScene],
+    variant: str,
+    sampling: Sampling,
+    count: int,
+    *,
+    with_probe: bool = False,
+) -> Image:
+    """Render the passes of an image on the workers of a cluster, and merge them.
+
+    With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine, if the
+    workers have that machine's versions and processor. Each loads the scene by ``load``, which must be picklable. A
+    ``count`` of 0 makes as many passes as the workers have threads.
+    """
+    with cluster(address) as client, timed("Rendering on the cluster"):
+        count = count or min(sum(client.nthreads().values()), sampling.batches)
+        work = partial(_render_pass, load, sampling, count, with_probe)
+        return merge_passes([image for _, image in results(client, work, variant, range(1, count + 1))])
+
+
+def _render_pass(
+    load: Callable[[], LoadedScene], sampling: Sampling, count: int, with_probe: bool, number: int
+) -> Image:
+    return render_pass(load(), sampling, number, count, with_probe=with_probe)

@@ -1,16 +1,22 @@
-"""Loading a scene, with another reconstruction filter if wanted, and checksums of its files."""
+"""Scenes of the current variant of Mitsuba: loading, rendering in one process, and what their last bits depend on."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+import platform
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Union
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
+import scipy
+from numpy.typing import NDArray
 
+from ..llvm import llvm_problem, loaded_version
 from ..progress import timed
 from . import RegressionError
 
@@ -210,3 +216,116 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
         Path(os.path.relpath(file, folder)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted(files)
     }
+
+
+# Samples of a part, and the fewest samples per pixel of a part: with fewer, the weights of a wide reconstruction filter
+# would differ too much from part to part.
+PART_SAMPLES = 1 << 22
+LEAST_PART_SPP = 16
+# Seeds of Mitsuba have 32 bits.
+SEEDS = 2**32
+
+
+def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArray[np.float32]:
+    """Render a scene in the current variant with all channels of its film: ``(height, width, channels)``.
+
+    The other options are those of `mi.render`.
+    """
+    return np.array(mi.render(scene, seed=seed, spp=spp, **options))  # type: ignore[arg-type] # a seed may be an int
+
+
+def render_parts(
+    scene: mi.Scene, parts: Sequence[int], seed: int = 0, on_part: Callable[[int], None] | None = None, **options: Any
+) -> NDArray[np.float32]:
+    """Mean of parts of an image, given by their samples per pixel, each weighted by these.
+
+    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples. ``on_part`` gets the
+    index of each part before it is rendered. The other options are those of `mi.render`.
+    """
+    total: NDArray[np.float64] | float = 0.0
+    for index, spp in enumerate(parts):
+        if on_part:
+            on_part(index)
+        pixels = render_pixels(scene, (seed * len(parts) + index) % SEEDS, spp, **options)
+        total = total + spp * pixels.astype(np.float64)
+    return np.asarray(total / sum(parts), dtype=np.float32)
+
+
+def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.float32]:
+    """Render a scene in the current variant with all channels of its film: ``(height, width, channels)``.
+
+    Where the sampler is "independent", an image of many samples is rendered in parts, as these do not depend on each
+    other. Any other image is one call of `mi.render`.
+    """
+    is_independent = str(loaded.sensor.sampler()).startswith("IndependentSampler")
+    parts = parts_of(spp, loaded.size) if is_independent else [spp]
+    sensor = {"sensor": loaded.sensor_index}
+    with timed("Rendering") as at:
+        if len(parts) == 1:
+            return render_pixels(loaded.scene, seed, spp, **sensor)
+        return render_parts(loaded.scene, parts, seed, lambda index: at(f"part {index + 1} of {len(parts)}"), **sensor)
+
+
+def parts_of(spp: int, size: tuple[int, int]) -> list[int]:
+    """Samples per pixel of the parts of an image of this width and height; they differ by one at most."""
+    count = max(1, spp // max(LEAST_PART_SPP, PART_SAMPLES // (size[0] * size[1])))
+    return [(i + 1) * spp // count - i * spp // count for i in range(count)]
+
+
+# Fields that distinguish processors of one name on x86, and that identify those of ARM, which have no name.
+_NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU variant", "CPU part")
+
+
+def environment(variant: str) -> dict[str, str]:
+    """Versions of libraries, and the processor, that renders in a variant depend on.
+
+    The version of this package is left out: its changes are what the tests are for.
+    """
+    modules = {"mitsuba": mi, "drjit": dr, "numpy": np, "scipy": scipy}
+    found = {name: module.__version__ for name, module in modules.items()} | {"processor": _processor()}
+    if variant.startswith("llvm"):
+        found["llvm"] = str(loaded_version())
+    return found
+
+
+def require_variant(variant: str) -> str:
+    """Return the name of a variant that can run here.
+
+    Raises
+    ------
+    RegressionError
+        If it cannot.
+    """
+    problem = variant_problem(variant)
+    if problem:
+        raise RegressionError(problem)
+    return variant
+
+
+def variant_problem(variant: str) -> str | None:
+    """Why a variant cannot run here, None if it can."""
+    if variant not in mi.variants():
+        return f'unknown variant "{variant}"; expected one of {", ".join(mi.variants())}'
+    if variant.startswith("llvm"):
+        return llvm_problem()
+    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        return f"variant {variant} needs an NVIDIA GPU, and Dr.Jit finds none"
+    return None
+
+
+def _processor() -> str:
+    # Code for another processor may add in another order. On Linux, `platform` does not know the model.
+    information = Path("/proc/cpuinfo")
+    found = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
+    return found or platform.processor() or platform.machine()
+
+
+def _first_of(information: str) -> str:
+    """The first processor of Linux's list, by its name and numbers.
+
+    The name is not enough: virtual machines call processors of several generations "AMD EPYC".
+    """
+    lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
+    values = {name.strip(): value.strip() for name, value in lines}
+    numbers = [f"{name} {values[name]}" for name in _NUMBERS if name in values]
+    return ", ".join([*([values["model name"]] if "model name" in values else []), *numbers])

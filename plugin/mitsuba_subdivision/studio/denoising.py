@@ -6,8 +6,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..regression.rendering import render_image, render_pixels
-from ..regression.scene import BOX, LoadedScene, SceneSource, load_scene
+from ..regression.scene import BOX, LoadedScene, SceneSource, load_scene, render_image, render_pixels
 
 # Samples per pixel of albedo and normals, which take one ray each: enough for smooth edges, and for little noise where
 # a lens blurs them. Measured up to 256, more change nothing.

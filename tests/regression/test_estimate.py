@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from images.random_images import BATCH, SPREAD, estimate, truth
-from mitsuba_subdivision.images import ImageError
-from mitsuba_subdivision.images.estimate import Estimate, combine
+from mitsuba_subdivision.regression import ImageError
+from mitsuba_subdivision.regression.image import Estimate, combine
+from regression.random_images import BATCH, SPREAD, estimate, truth
 
 
 def batches(rng, count, samples=16, offset=0.0):

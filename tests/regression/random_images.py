@@ -1,14 +1,15 @@
 """Images made of random numbers instead of renders."""
 
 import numpy as np
-from mitsuba_subdivision.images.estimate import Estimate, combine
-from mitsuba_subdivision.images.image import Image
-from mitsuba_subdivision.images.probe_aovs import Probe
+from mitsuba_subdivision.regression.image import Estimate, Image, combine
+from mitsuba_subdivision.regression.probe import Probe
 
 SIZE = 32
 # Standard deviation of a sample, in parts of its mean.
 SPREAD = 0.5
 BATCH = 16
+# A rare event, in parts of the mean.
+BRIGHT = 20.0
 METADATA = {
     "variant": "llvm_ad_rgb",
     "filter": "box",
@@ -23,10 +24,16 @@ def truth(size=SIZE):
     return np.stack([0.2 + x, 0.5 + y, 1.5 - x], axis=-1)
 
 
-def estimate(rng, batches, mean=None):
+def estimate(rng, batches, mean=None, rate=0.0):
+    """Normal noise, and events of `BRIGHT` times the mean, of which a pixel has so many in each batch."""
     mean = truth() if mean is None else mean
     width = SPREAD * mean / np.sqrt(BATCH)
-    return combine(Estimate.of_batch(mean + width * rng.standard_normal(mean.shape), BATCH) for _ in range(batches))
+
+    def batch():
+        bright = BRIGHT * mean * (rng.poisson(rate, mean.shape[:2])[..., None] - rate) if rate else 0.0
+        return Estimate.of_batch(mean + width * rng.standard_normal(mean.shape) + bright, BATCH)
+
+    return combine(batch() for _ in range(batches))
 
 
 def dome(size=SIZE):
@@ -41,8 +48,8 @@ def dome(size=SIZE):
     return Probe(point, point.copy(), np.abs(point[..., :2]) % 1, shape, element.copy(), element)
 
 
-def random_image(rng, batches=4, name="image", mean=None, **changes):
-    found = estimate(rng, batches, mean).stored()
+def random_image(rng, batches=4, name="image", mean=None, rate=0.0, **changes):
+    found = estimate(rng, batches, mean, rate).stored()
     paired = estimate(np.random.default_rng(99), 1, mean).stored().mean
     values = {"estimate": found, "paired": paired, "probe": dome(), "metadata": METADATA, **changes}
     return Image(name, found.mean, **values)

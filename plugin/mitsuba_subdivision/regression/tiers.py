@@ -1,18 +1,75 @@
-"""Tolerances: how much two images may differ. They are stored with the reference."""
+"""The tiers of a comparison, their tolerances, and what they find."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from enum import Enum
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from . import ImageError
+
+# Names, and what each compares. The functions are in `compare.COMPARED_BY`.
+TIERS = {
+    "probe": "what the rays through the centres of the pixels hit",
+    "paired": "pixels from the same samples, which must be the same",
+    "tile": "tiles of several sizes: does noise explain their difference?",
+    "flip": "converged pixels, as an eye sees them",
+}
+# Noise makes FLIP's errors large. So this tier is left for images that no other tier can compare.
+DEFAULT_TIERS = ("probe", "paired", "tile")
+
+
+class Status(Enum):
+    """Outcome of a tier, or of a whole comparison."""
+
+    # In the order of their weight. Skipped: the images lack what the tier compares.
+    SKIPPED = "skipped"
+    PASS = "pass"
+    WARN = "warn"
+    FAIL = "fail"
+
+
+@dataclass(eq=False)
+class TierResult:
+    """The result of one tier."""
+
+    name: str
+    status: Status
+    # The findings in words, the most important first, and for programs, as plain numbers, strings and lists.
+    lines: list[str]
+    numbers: dict[str, Any] = field(default_factory=dict)
+    # Row and column of the pixel that shows the difference best.
+    worst: tuple[int, int] | None = None
+    # Values of every pixel, (height, width), for the report.
+    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
+
+
+def skipped(name: str, reason: str) -> TierResult:
+    """Result of a tier that cannot compare these images."""
+    return TierResult(name, Status.SKIPPED, [reason])
+
+
+def skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
+    """Result of a tier that needs data of both images that at least one of them lacks."""
+    if reference is None and test is None:
+        return skipped(name, f"the images have no {what}")
+    return skipped(name, f"the {'reference' if reference is None else 'test'} has no {what}")
+
+
+def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
+    """Row and column of the largest value of a map ``(height, width)``."""
+    row, column = np.unravel_index(np.argmax(values), values.shape)
+    return int(row), int(column)
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Limits of the tiers.
+    """Limits of the tiers: how much two images may differ. They are stored with the reference.
 
     Those of the probe are at least four times as large as the differences between variants of Mitsuba (scalar against
     LLVM: 6e-5 degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and small enough to notice one weight

@@ -1,0 +1,255 @@
+"""Comparison of a test with a reference, tier by tier, and its result as text and as plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import ImageError
+from .image import Image
+from .probe import compare_probes
+from .radiance_tiers import compare_flip, compare_paired, compare_tiles
+from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, pixel_of_largest, skipped_without
+
+EXIT_STATUS = {Status.PASS: 0, Status.WARN: 1, Status.FAIL: 2}
+
+
+@dataclass(frozen=True, eq=False)
+class WorstPixel:
+    """The pixel that shows the difference best."""
+
+    y: int
+    x: int
+    # Name of the tier that chose the pixel; "z-score" or "difference" where no tier failed or warned.
+    shown_by: str
+    # The pixel's values; those of the first batch if the paired tier chose it.
+    reference: tuple[float, ...]
+    test: tuple[float, ...]
+    # The first hit of the ray through the pixel, by the reference's probe, or else the test's.
+    surface: str | None = None
+    # Normal in the reference and in the test, if the probe tier chose the pixel.
+    normals: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+    def __str__(self) -> str:
+        parts = [
+            f"worst pixel ({self.shown_by}) x = {self.x}, y = {self.y}: "
+            f"reference ({_numbers(self.reference)}), test ({_numbers(self.test)})"
+        ]
+        if self.normals:
+            parts.append(f"normals ({_numbers(self.normals[0])}), ({_numbers(self.normals[1])})")
+        return "; ".join([*parts, *([self.surface] if self.surface else [])])
+
+
+@dataclass(eq=False)
+class Comparison:
+    """The result of a comparison; its status is the worst of the tiers'."""
+
+    reference: Image
+    test: Image
+    status: Status
+    tiers: list[TierResult]
+    # Further findings: the relative error of the whole image, files that changed, a second attempt.
+    notes: list[str]
+    # None only if the images are equal in all that was compared.
+    worst: WorstPixel | None
+    tolerances: Tolerances
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def exit_status(self) -> int:
+        """0 for pass, 1 for warn, 2 for fail."""
+        return EXIT_STATUS[self.status]
+
+    def tier(self, name: str) -> TierResult | None:
+        """Result of the tier of a name, None if that did not run."""
+        return next((tier for tier in self.tiers if tier.name == name), None)
+
+    def __str__(self) -> str:
+        lines = [f"{self.status.value.upper()}: {self.test.name} against {self.reference.name}"]
+        for tier in self.tiers:
+            first, *others = tier.lines
+            lines.append(f"  {tier.name:<7}{tier.status.value:<8} {first}")
+            lines += [f"{'':<18}{line}" for line in others]
+        return "\n".join([*lines, *(f"  {line}" for line in self.remarks())])
+
+    def remarks(self) -> list[str]:
+        """The notes, and the worst pixel in words."""
+        return [*self.notes, *([str(self.worst)] if self.worst else [])]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The comparison as plain values, for JSON."""
+        return {
+            "status": self.status.value,
+            "reference": self.reference.name,
+            "test": self.test.name,
+            "tiers": {
+                tier.name: {"status": tier.status.value, "lines": tier.lines, **tier.numbers} for tier in self.tiers
+            },
+            "notes": self.notes,
+            "worst_pixel": vars(self.worst) if self.worst else None,
+            "tolerances": self.tolerances.as_dict(),
+            **self.numbers,
+        }
+
+
+def compare(
+    reference: Image,
+    test: Image,
+    tiers: Sequence[str] | None = None,
+    tolerances: Tolerances | None = None,
+    suite_size: int = 1,
+) -> Comparison:
+    """Compare a test with a reference.
+
+    An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
+    where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
+    Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
+
+    Parameters
+    ----------
+    tiers : sequence of str, optional
+        Names in `TIERS`. By default `DEFAULT_TIERS`; FLIP besides, if no tier can compare the radiance.
+    tolerances : Tolerances, optional
+        By default those stored with the reference.
+    suite_size : int
+        Number of scenes that share the probability of a false alarm.
+
+    Raises
+    ------
+    ImageError
+        If an image is denoised, the sizes differ, a tier is unknown, or the images lack what a chosen tier compares.
+    """
+    for image in (reference, test):
+        if image.metadata.get("denoised"):
+            raise ImageError(f'"{image.name}" is denoised, which removes what is compared; expected one as rendered')
+    if reference.size != test.size:
+        sizes = [f'"{image.name}" has {image.size[0]} x {image.size[1]} pixels' for image in (reference, test)]
+        raise ImageError(f"{sizes[0]} and {sizes[1]}; expected the same size")
+    unknown = [name for name in tiers or () if name not in TIERS]
+    if unknown:
+        raise ImageError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
+    limits = tolerances or Tolerances().with_values(reference.metadata.get("tolerances", {}))
+
+    for image, role in ((test, "test"), (reference, "reference")):
+        broken = image.not_finite()
+        if broken:
+            result = TierResult("finite", Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
+            return Comparison(reference, test, Status.FAIL, [result], [], _worst(reference, test, [result]), limits)
+
+    compared_by: dict[str, Callable[[], TierResult]] = {
+        "probe": lambda: _compare_probes(reference, test, limits),
+        "paired": lambda: compare_paired(reference, test, limits),
+        "tile": lambda: compare_tiles(reference, test, limits, suite_size),
+        "flip": lambda: compare_flip(reference, test, limits),
+    }
+    results = {name: compared_by[name]() for name in tiers or DEFAULT_TIERS}
+    _decide(results, compared_by, tiers)
+    weights = list(Status)
+    return Comparison(
+        reference,
+        test,
+        max((tier.status for tier in results.values()), key=weights.index),
+        list(results.values()),
+        [_relative_error(reference, test), *_changed_files(reference, test)],
+        _worst(reference, test, list(results.values())),
+        limits,
+        {"relmse": relmse(reference.pixels, test.pixels)},
+    )
+
+
+def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float:
+    """Mean of ``(a - b)^2 / (b^2 + 0.01)`` over pixels and channels, where b is the reference."""
+    return float(np.mean((test - reference) ** 2 / (reference**2 + 0.01)))
+
+
+def _compare_probes(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
+    if reference.probe is None or test.probe is None:
+        what = "geometry probe (channels P, Ns, uv, prim)"
+        return skipped_without("probe", reference.probe, test.probe, what)
+    return compare_probes(reference.probe, test.probe, tolerances)
+
+
+def _decide(
+    results: dict[str, TierResult], compared_by: dict[str, Callable[[], TierResult]], chosen: Sequence[str] | None
+) -> None:
+    """Let other tiers decide where one cannot, and where one proves that another's finding is chance.
+
+    Raises
+    ------
+    ImageError
+        If a tier that was chosen cannot run, and no other stands in for it.
+    """
+    paired, is_replaced = results.get("paired"), False
+    if paired and paired.status in (Status.SKIPPED, Status.WARN):
+        tile = results.setdefault("tile", results.get("tile") or compared_by["tile"]())
+        is_replaced = tile.status is not Status.SKIPPED
+        if is_replaced:
+            paired.lines.append("the tile tier decides instead")
+        elif paired.status is Status.WARN:
+            paired.status = Status.FAIL
+    if chosen is None and all(result.status is Status.SKIPPED for name, result in results.items() if name != "probe"):
+        results["flip"] = compared_by["flip"]()
+    for result in results.values():
+        cannot_run = result.status is Status.SKIPPED and not (result is paired and is_replaced)
+        if cannot_run and result.name in (chosen or ()):
+            raise ImageError(f'tier "{result.name}" cannot run: {result.lines[0]}')
+    tiles, probe = results.get("tile"), results.get("probe")
+    same = paired and paired.numbers.get("changed_pixels") == 0 and probe and probe.status is Status.PASS
+    if same and tiles and tiles.status is Status.FAIL:
+        tiles.status, tiles.worst = Status.PASS, None
+        tiles.lines.insert(0, "chance: the same samples give the same bits, and the probe passes")
+
+
+def _relative_error(reference: Image, test: Image) -> str:
+    """The relative mean squared error, and how large noise alone would make it."""
+    measured = f"relMSE {relmse(reference.pixels, test.pixels):.3g}"
+    if reference.estimate is None or test.estimate is None:
+        return measured
+    share = (1 / reference.estimate.count + 1 / test.estimate.count)[..., None]
+    expected = np.mean(reference.estimate.variance * share / (reference.pixels**2 + 0.01))
+    return f"{measured}; noise alone would make it {expected:.3g}"
+
+
+def _changed_files(reference: Image, test: Image) -> list[str]:
+    before, now = (image.metadata.get("files") for image in (reference, test))
+    if not before or not now:
+        return []
+    changed = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+    return [f"changed since the reference was made: {', '.join(changed)}"] if changed else []
+
+
+def _worst(reference: Image, test: Image, results: list[TierResult]) -> WorstPixel | None:
+    """The pixel of the first tier that fails, else of the first that warns, else where the images differ most."""
+    for status in (Status.FAIL, Status.WARN):
+        for result in results:
+            if result.status is status and result.worst is not None:
+                return _worst_pixel(reference, test, result.worst, result.name)
+    difference = np.abs(test.pixels - reference.pixels).max(axis=2)
+    if not difference.max() > 0:
+        return None
+    for result in results:
+        if "z" in result.maps:
+            return _worst_pixel(reference, test, pixel_of_largest(np.abs(result.maps["z"])), "z-score")
+    return _worst_pixel(reference, test, pixel_of_largest(difference), "difference")
+
+
+def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:
+    def values(pixels: NDArray[np.floating]) -> tuple[float, ...]:
+        return tuple(map(float, pixels[pixel]))
+
+    a, b = reference.pixels, test.pixels
+    if shown_by == "paired" and reference.paired is not None and test.paired is not None:
+        a, b = reference.paired, test.paired
+    normals = None
+    if shown_by == "probe" and reference.probe and test.probe:
+        normals = values(reference.probe.normal), values(test.probe.normal)
+    probe = reference.probe or test.probe
+    return WorstPixel(*pixel, shown_by, values(a), values(b), probe.describe(*pixel) if probe else None, normals)
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.6g}" for value in values)

@@ -1,0 +1,374 @@
+"""Images: Monte Carlo estimates of pixels, what else their files hold, and OpenEXR files of one part."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from ..whole_file import whole_file
+from . import ImageError
+from .probe import Probe
+
+SCHEMA = 1
+METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
+
+Channels = dict[str, NDArray]
+
+_RGB = ("R", "G", "B")
+_MAGIC = b"\x76\x2f\x31\x01"
+_LONGEST = 60
+_quieting = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Pixels estimated from batches of samples.
+
+    A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
+    samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
+    and a renderer needs to output images only.
+
+    Attributes
+    ----------
+    mean : (height, width, 3) float64
+    variance : (height, width, 3) float64
+        Of one sample. Zero if there is one batch only, from which it cannot be estimated.
+    count : (height, width) int64
+        Samples of each pixel.
+    batches : int
+    """
+
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    count: NDArray[np.int64]
+    batches: int
+
+    @classmethod
+    def of_batch(cls, pixels: NDArray[np.floating], samples: int) -> Estimate:
+        """Estimate from one batch, an image ``(height, width, 3)``."""
+        mean = np.asarray(pixels, dtype=np.float64)
+        return cls(mean, np.zeros_like(mean), np.full(mean.shape[:2], samples, dtype=np.int64), 1)
+
+    def stored(self) -> Estimate:
+        """The estimate as it would come back from a file, rounded to single precision."""
+        with np.errstate(over="ignore"):
+            mean, variance = (values.astype(np.float32).astype(np.float64) for values in (self.mean, self.variance))
+        return Estimate(mean, variance, self.count, self.batches)
+
+
+def combine(estimates: Iterable[Estimate]) -> Estimate:
+    """Combine estimates with independent samples into one, in double precision.
+
+    The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
+    same order, the same estimates give the same bits.
+
+    Raises
+    ------
+    ImageError
+        If there is no estimate, or their sizes differ.
+    """
+    total: Estimate | None = None
+    squares = np.zeros(())
+    for estimate in estimates:
+        squares_within = estimate.variance * max(estimate.batches - 1, 0)
+        if total is None:
+            total, squares = estimate, squares_within
+            continue
+        if estimate.mean.shape != total.mean.shape:
+            sizes = " and ".join(f"{e.mean.shape[1]} x {e.mean.shape[0]}" for e in (total, estimate))
+            raise ImageError(f"images of {sizes} pixels cannot be combined; expected one size")
+        count = total.count + estimate.count
+        share = (estimate.count / count)[..., None]
+        batches = total.batches + estimate.batches
+        # What is not finite is told of the image.
+        with np.errstate(invalid="ignore", over="ignore"):
+            step = estimate.mean - total.mean
+            squares = squares + squares_within + step**2 * share * total.count[..., None]
+            total = Estimate(total.mean + step * share, squares / (batches - 1), count, batches)
+    if total is None:
+        raise ImageError("there is nothing to combine")
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A linear RGB image, and the further data of its file.
+
+    Attributes
+    ----------
+    name : str
+        For messages: the path of the file, in most cases.
+    pixels : (height, width, 3) float64
+    estimate : Estimate or None
+        Variance and number of samples; the mean of the estimate is ``pixels``.
+    paired : (height, width, 3) float64 or None
+        The first batch alone. A later render of the same scene repeats its samples one by one.
+    probe : Probe or None
+        What the ray through the centre of each pixel hits.
+    metadata : dict
+        How the image was made.
+    """
+
+    name: str
+    pixels: NDArray[np.float64]
+    estimate: Estimate | None = None
+    paired: NDArray[np.float64] | None = None
+    probe: Probe | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    def channels(self) -> Channels:
+        """Channels of an OpenEXR file, in single precision."""
+        found = _rgb_channels("", self.pixels)
+        if self.estimate is not None:
+            found |= _rgb_channels("variance.", self.estimate.variance) | {"N": self.estimate.count}
+        if self.paired is not None:
+            found |= _rgb_channels("paired.", self.paired)
+        return found | (self.probe.channels() if self.probe is not None else {})
+
+    def not_finite(self) -> tuple[str, tuple[int, int]] | None:
+        """Values that are not finite, in words, and row and column of the first; None if there are none."""
+        broken = {name: values for name, values in self.channels().items() if not np.isfinite(values).all()}
+        if not broken:
+            return None
+        bad = np.argwhere(np.any([~np.isfinite(values) for values in broken.values()], axis=0))
+        y, x = (int(i) for i in bad[0])
+        first = next(name for name, values in broken.items() if not np.isfinite(values[y, x]))
+        more = f" and at {len(bad) - 1} more pixels" if len(bad) > 1 else ""
+        others = f"; channels {', '.join(broken)}" if len(broken) > 1 else ""
+        return f"{first} = {broken[first][y, x]} at x = {x}, y = {y}{more}{others}", (y, x)
+
+
+def require_finite(image: Image) -> None:
+    """Refuse an image with values that are not finite, which merging would spread, and no tier can compare.
+
+    Raises
+    ------
+    ImageError
+        If there are any; the message names the first.
+    """
+    broken = image.not_finite()
+    if broken:
+        raise ImageError(f'image "{image.name}" is not finite: {broken[0]}')
+
+
+def save_image(path: str | Path, image: Image) -> None:
+    """Write an image. The same image gives the same bytes, and the file appears whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_channels(path, image.channels(), {"schema": SCHEMA, **image.metadata})
+
+
+def load_image(path: str | Path) -> Image:
+    """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read, channels are missing, or the number of samples or the variance is impossible.
+    """
+    channels, metadata = read_channels(path)
+    source = str(path)
+    pixels = _rgb(channels, "", source)
+    if pixels is None:
+        raise ImageError(f'image "{source}" has no channels R, G, B; found {", ".join(sorted(channels)) or "none"}')
+    if metadata.get("schema", SCHEMA) != SCHEMA:
+        raise ImageError(
+            f'image "{source}" has metadata of schema {metadata["schema"]}; this version reads schema {SCHEMA}'
+        )
+    _require_metadata(metadata, source)
+    estimate = _estimate(channels, pixels, metadata, source)
+    paired, probe = _rgb(channels, "paired.", source), Probe.from_channels(channels, source)
+    return Image(source, pixels, estimate, paired, probe, metadata)
+
+
+def _estimate(
+    channels: Channels, pixels: NDArray[np.float64], metadata: dict[str, Any], source: str
+) -> Estimate | None:
+    variance = _rgb(channels, "variance.", source)
+    if variance is None:
+        return None
+    if "N" not in channels:
+        raise ImageError(f'image "{source}" has a variance but no channel N; expected the samples of each pixel')
+    if channels["N"].dtype.kind not in "ui":
+        raise ImageError(f'channel N of image "{source}" has numbers of type {channels["N"].dtype}; expected integers')
+    count = channels["N"].astype(np.int64)
+    if count.min() < 1:
+        raise ImageError(f'image "{source}" has pixels without samples (channel N is 0); expected at least 1 each')
+    if (variance < 0).any():
+        raise ImageError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
+    ranges = metadata.get("sampling", {}).get("batches")
+    # A file of another program records no batches: each sample then counts as a batch.
+    batches = sum(end - start for start, end in ranges) if ranges else int(count.max())
+    return Estimate(pixels, variance, count, batches)
+
+
+def _rgb_channels(prefix: str, values: NDArray[np.floating]) -> Channels:
+    return {f"{prefix}{name}": values[..., i].astype(np.float32) for i, name in enumerate(_RGB)}
+
+
+def _rgb(channels: Channels, prefix: str, source: str) -> NDArray[np.float64] | None:
+    names = [f"{prefix}{name}" for name in _RGB]
+    missing = [name for name in names if name not in channels]
+    if len(missing) == len(names):
+        return None
+    if missing:
+        raise ImageError(f'image "{source}" has no channel {", ".join(missing)}; expected {", ".join(names)}')
+    return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
+
+
+def _require_metadata(metadata: dict[str, Any], source: str) -> None:
+    """Refuse metadata of another form than `save_image` writes. Any entry may be missing."""
+    for name, (is_right, expected) in _FORMS.items():
+        if name in metadata and not is_right(metadata[name]):
+            found = str(metadata[name])
+            shown = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}.."
+            raise ImageError(f'metadata of image "{source}": {name} is {shown}; expected {expected}')
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, dict) and all(map(_is_text, value.values()))
+
+
+def _are_integers(value: Any, **least: int) -> bool:
+    """Whether a dictionary has these integers, each of at least the value given."""
+    return isinstance(value, dict) and all(type(value.get(key)) is int and value[key] >= n for key, n in least.items())
+
+
+def _is_sampling(value: Any) -> bool:
+    if not _are_integers(value, seed=0, batch=1) or not _are_ranges(value.get("batches")):
+        return False
+    # Files of older versions have neither of these.
+    counts = {"total": value["batches"][-1][1], "passes": 1, **value}
+    return _are_integers(counts, total=value["batches"][-1][1], passes=1) and counts["passes"] <= counts["total"]
+
+
+def _are_ranges(value: Any) -> bool:
+    if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
+        return False
+    ends = [end for pair in value for end in pair]
+    if not ends or not all(type(end) is int and end >= 0 for end in ends):
+        return False
+    return all(a < b for a, b in value) and all(first[1] <= second[0] for first, second in pairwise(value))
+
+
+_FORMS = {
+    "sampling": (_is_sampling, "a seed, the samples of a batch, and ranges of batches"),
+    "paired": (lambda value: _are_integers(value, seed=0, spp=1), "a seed and samples per pixel"),
+    "variant": (_is_text, "a name"),
+    "filter": (_is_text, "a name"),
+    "files": (_are_texts, "checksums by name"),
+    "parameters": (_are_texts, "values by name"),
+    "environment": (_are_texts, "versions by name"),
+    "tolerances": (lambda value: isinstance(value, dict), "numbers by name"),
+}
+
+
+def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
+    """Write linear RGB pixels ``(height, width, 3)``, as `write_channels` does."""
+    write_channels(path, _rgb_channels("", pixels), metadata)
+
+
+def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: dict | None = None) -> None:
+    """Write named channels into one single-part file; the file appears whole or not at all.
+
+    The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
+    several, without a warning.
+
+    Parameters
+    ----------
+    channels : dict of (height, width)
+        Integers become 32 bits unsigned, all else float32. A dot in a name makes a layer: ``variance.R``.
+    metadata : dict, optional
+        Kept in the file as JSON, in the string attribute `METADATA_ATTRIBUTE`.
+    """
+    converted = {
+        name: np.ascontiguousarray(values, dtype=np.uint32 if values.dtype.kind in "iu" else np.float32)
+        for name, values in channels.items()
+    }
+    header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if metadata:
+        # JSON, as OpenEXR would round Python's numbers to 32 bits.
+        header[METADATA_ATTRIBUTE] = json.dumps(metadata, sort_keys=True)
+    with whole_file(Path(path)) as beside, OpenEXR.File(header, converted) as file:
+        file.write(str(beside))
+
+
+def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
+    """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
+
+    Raises
+    ------
+    ImageError
+        If there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep pixels or broken
+        metadata.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ImageError(f'image "{path}" is not a file; expected an OpenEXR file')
+    try:
+        with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = len(file.parts)
+            if not parts:
+                raise RuntimeError("its pixels cannot be read")
+            if parts != 1:
+                raise ImageError(
+                    f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part'
+                )
+            header = dict(file.header())
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except ImageError:
+        raise
+    except (RuntimeError, ValueError, OSError):
+        with path.open("rb") as start:
+            is_exr = start.read(len(_MAGIC)) == _MAGIC
+        problem = "is truncated, or damaged" if is_exr else "is not an OpenEXR file"
+        raise ImageError(f'image "{path}" {problem}') from None
+    if any(values.dtype == object or values.ndim != 2 for values in channels.values()):
+        raise ImageError(f'image "{path}" has deep or subsampled channels; expected one value per pixel')
+    try:
+        metadata = json.loads(header.get(METADATA_ATTRIBUTE, "{}"))
+    except ValueError as error:
+        raise ImageError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is not JSON: {error}') from None
+    if not isinstance(metadata, dict):
+        raise ImageError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is no JSON object')
+    return channels, metadata
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Close standard output and error while OpenEXR reads: of a damaged file, it writes a line for each row."""
+    with _quieting, contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+        try:
+            kept = os.dup(2)
+        except OSError:
+            # Standard error is closed.
+            yield
+            return
+        stack.callback(os.close, kept)
+        null_device = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null_device, 2)
+        os.close(null_device)
+        stack.callback(os.dup2, kept, 2)
+        yield

@@ -1,0 +1,270 @@
+"""The tiers that compare pixels: the same samples, noise in tiles of several sizes, and what an eye sees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from . import ImageError
+from .image import Estimate, Image
+from .tiers import Status, TierResult, Tolerances, pixel_of_largest, skipped, skipped_without
+
+# The difference of a pixel that is darker than this part of the image's mean is taken relative to that part.
+DARK = 1e-3
+# Both images drew the same samples if these agree.
+_SAME_SAMPLES = ("variant", "filter", "paired")
+
+# Sides of the square tiles in pixels; None is the whole image. Small tiles find dents, large ones a change of colour.
+SCALES: tuple[int | None, ...] = (4, 8, 16, None)
+# Samples that a reference should have for each of the test's, so that its own noise hardly counts.
+REFERENCE_SAMPLES = 16
+# Events of a kind that a reference may miss by chance: it misses three expected ones in 5 % of all cases.
+MISSED_EVENTS = 3.0
+# Below it, the deviance is that of the normal distribution to one part in 10^5.
+_SMALL_EXCESS = 1e-5
+
+# ACES tone curve (a x^2 + b x + c) / (d x^2 + e x + f), as in FLIP, and the value that limits its exposures.
+_ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.0, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
+_ACES_LIMIT = 0.85
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+# Stops between the brightest and the median pixel at most: more would take time and show nothing new.
+_MOST_STOPS = 12
+
+
+def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
+    """Compare the first batches of two images, which are drawn from the same samples.
+
+    Skipped, with the reason, where the samples are not the same. On another machine or with other versions of the
+    libraries, equal pixels still prove that nothing changed, but different ones prove nothing: the tier then warns.
+    """
+    if reference.paired is None or test.paired is None:
+        what = "first batch to pair (channels paired.R, paired.G, paired.B)"
+        return skipped_without("paired", reference.paired, test.paired, what)
+    reason = _different_samples(reference, test)
+    if reason:
+        return skipped("paired", reason)
+    difference = np.abs(test.paired - reference.paired)
+    size = np.maximum(np.abs(reference.paired), DARK * np.abs(reference.paired).mean())
+    relative = difference / np.where(size > 0, size, 1)
+    largest = float(relative.max())
+    changed = int((difference.max(axis=2) > 0).sum())
+    numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels": int(difference[..., 0].size)}
+    maps = {"paired": relative_difference(reference.paired, test.paired)}
+    if largest <= tolerances.paired_relative:
+        found = "the same bits" if changed == 0 else f"relative difference up to {largest:.2g}, in {changed} pixels"
+        return TierResult("paired", Status.PASS, [found], numbers, maps=maps)
+    line = (
+        f"same samples, but {changed} of {numbers['pixels']} pixels differ, by up to {largest:.3g} relative; "
+        f"at most {tolerances.paired_relative:.2g} expected"
+    )
+    result = TierResult("paired", Status.FAIL, [line], numbers, pixel_of_largest(relative.max(axis=2)), maps)
+    environment = _differences(reference.metadata.get("environment", {}), test.metadata.get("environment", {}))
+    if environment:
+        result.status = Status.WARN
+        result.lines.append(f"which may come from the environment: {'; '.join(environment)}")
+    return result
+
+
+def relative_difference(reference: NDArray[np.floating], test: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Map of the relative difference between two images, in the mean of R, G and B; less so where it is dark."""
+    grey = 0.01 * np.abs(reference).mean() + 1e-12
+    return (test.mean(axis=2) - reference.mean(axis=2)) / (np.abs(reference).mean(axis=2) + grey)
+
+
+def _different_samples(reference: Image, test: Image) -> str | None:
+    """Why the samples of two images are not the same, None if they are."""
+    for image, role in ((reference, "reference"), (test, "test")):
+        if "paired" not in image.metadata:
+            return f"the {role} does not say with which seed its first batch was rendered"
+    wanted, found = ({key: image.metadata.get(key) for key in _SAME_SAMPLES} for image in (reference, test))
+    different = _differences(wanted, found)
+    if different:
+        return f"the samples are not the same: {'; '.join(different)}"
+    if wanted["filter"] != "box":
+        return f'filter "{wanted["filter"]}" adds samples in any order; expected "box"'
+    return None
+
+
+def _differences(reference: dict[str, Any], test: dict[str, Any]) -> list[str]:
+    """One phrase for each entry of two dictionaries that is not the same."""
+    return [
+        f"{key} {_in_words(test.get(key))} here, {_in_words(reference.get(key))} in the reference"
+        for key in sorted({*reference, *test})
+        if reference.get(key) != test.get(key)
+    ]
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {entry}" for key, entry in value.items())
+    return "unknown" if value is None else str(value)
+
+
+def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
+    """Test each tile for whether noise alone explains its difference: two-sided tests, at several scales.
+
+    A tile's difference is the sum of many small contributions, and of a few large ones where bright paths are rare. The
+    small ones are normally distributed, with the variance that the reference measures. The large ones are rare events,
+    whose number is Poisson distributed: a single one in the test may lie many standard errors from the mean. The
+    variance between the test's batches tells them: k events where the reference expects l raise the variance k / l
+    times, but a change of the scene raises it little. `_z_scores` has the formulas.
+
+    Single precision adds a bias: the standard error has a floor for that. Šidák's correction covers the tiles and
+    channels of a scale, Bonferroni's the scales and the scenes of a suite, of which there are ``suite_size``.
+    """
+    expected, found = reference.estimate, test.estimate
+    if expected is None or found is None:
+        return skipped_without("tile", expected, found, "channels variance.R, .G, .B and N")
+    for estimate, role in ((expected, "reference"), (found, "test")):
+        if estimate.batches < 2:
+            return skipped("tile", f"the {role} has one batch only, which gives no variance")
+    height, width, _ = expected.mean.shape
+    scales, failing, evidence = {}, [], {}
+    for scale in SCALES:
+        side = scale or max(height, width)
+        z = _z_scores(expected, found, side, tolerances)
+        p = 2 * norm.sf(np.abs(z))
+        limit = float(-np.expm1(np.log1p(-tolerances.alpha / (len(SCALES) * suite_size)) / z.size))
+        places = np.argwhere(p < limit)
+        scales[str(scale or "whole")] = {
+            "smallest_p": float(p.min()),
+            "limit": limit,
+            "largest_z": float(np.abs(z).max()),
+            "failing": len(places),
+            "tests": int(z.size),
+        }
+        for row, column, channel in places:
+            x, y = side * int(column), side * int(row)
+            place = {"x": x, "y": y, "width": min(side, width - x), "height": min(side, height - y)}
+            failing.append({**place, "channel": "RGB"[channel], "z": float(z[row, column, channel])})
+        if scale:
+            smallest = (norm.logsf(np.abs(z)).min(axis=2) + np.log(2)) / -np.log(10)
+            evidence[p.min() / limit] = np.repeat(np.repeat(smallest, side, axis=0), side, axis=1)[:height, :width]
+
+    pixel_z = _z_scores(expected, found, 1, tolerances)
+    strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
+    spp, reference_spp = (int(np.median(estimate.count)) for estimate in (found, expected))
+    samples = f"{spp} samples per pixel against {reference_spp}"
+    result = TierResult(
+        "tile",
+        Status.FAIL if failing else Status.PASS,
+        [f"noise explains every tile ({samples})"],
+        {"scales": scales, "samples": spp, "failing": failing},
+        # Of the scale that shows the difference best, by its smallest probability in units of the limit.
+        maps={"z": strongest, "evidence": evidence[min(evidence)]},
+    )
+    if failing:
+        counts = ", ".join(
+            f"{scale['failing']} of {scale['tests']} at {'full size' if name == 'whole' else f'{name} x {name}'}"
+            for name, scale in scales.items()
+            if scale["failing"]
+        )
+        clearest = max(failing, key=lambda tile: abs(tile["z"]))
+        result.lines = [
+            f"not noise ({samples}); tests that fail: {counts}",
+            "clearest: {width} x {height} pixels at x = {x}, y = {y}, channel {channel}, z = {z:+.1f}".format(
+                **clearest
+            ),
+        ]
+        # The pixel to look at lies in the smallest tile that failed.
+        small = min(failing, key=lambda tile: (tile["width"] * tile["height"], -abs(tile["z"])))
+        x, y = small["x"], small["y"]
+        row, column = pixel_of_largest(np.abs(strongest[y : y + small["height"], x : x + small["width"]]))
+        result.worst = (y + row, x + column)
+    if reference_spp < REFERENCE_SAMPLES * spp:
+        result.lines.append(
+            f"the reference has less than {REFERENCE_SAMPLES} times the samples: its own noise hides small changes"
+        )
+    return result
+
+
+def _z_scores(reference: Estimate, test: Estimate, side: int, tolerances: Tolerances) -> NDArray[np.float64]:
+    """z-scores ``(rows, columns, 3)`` of the tiles of one size, reduced where rare events may explain the difference.
+
+    Let D be the difference of a tile's means, V its variance by the reference, and E what the variance of the test's
+    own mean has in excess of that. If both come of events of one size, that size is M = E / |D|, in units of D: the
+    reference expects V / M^2 of them and the test has D / M more. The deviance of the Poisson distribution then gives
+
+        z = D / sqrt(V) * sqrt(2 ((1 + u) log(1 + u) - u)) / u,    u = E / V,
+
+    which is D / sqrt(V) without an excess. The reference may have missed some: V gets `MISSED_EVENTS` of this size for
+    all its samples. Tiles at the right and lower border may be smaller.
+    """
+    area = _tile_sums(np.ones((*test.count.shape, 1)), side)
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _tile_sums(values, side) / area
+
+    count, reference_count = test.count[..., None], reference.count[..., None]
+    difference = mean(test.mean - reference.mean)
+    floor = tolerances.floor_relative * np.abs(mean(reference.mean)) + tolerances.floor_absolute
+    variance = mean(reference.variance * (1 / count + 1 / reference_count)) / area + floor**2
+    excess = np.maximum(mean((test.variance - reference.variance) / count) / area, 0)
+    size = excess / np.where(difference == 0, np.inf, np.abs(difference))
+    variance += MISSED_EVENTS * mean(count / reference_count) * size**2
+    u = np.maximum(excess / variance, _SMALL_EXCESS)
+    return difference / np.sqrt(variance) * np.sqrt(2 * ((1 + u) * np.log1p(u) - u)) / u
+
+
+def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
+    """Sums of values ``(height, width, channels)`` over each tile."""
+    rows, columns = (np.arange(0, length, side) for length in values.shape[:2])
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+
+
+def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
+    """First and last exposure for FLIP, in stops, and the number of exposures, chosen from a reference.
+
+    FLIP would end the whole process at a black image. As in FLIP, the first and the last exposure map the brightest and
+    the median luminance to 0.85 of the tone curve.
+    """
+    a, b, c, d, e, f = _ACES
+    t = _ACES_LIMIT
+    bright = max(np.roots([a - t * d, b - t * e, c - t * f]).real)
+    luminance = np.maximum(pixels, 0) @ _LUMINANCE
+    brightest = float(luminance.max())
+    if not brightest > 0:
+        return 0.0, 1.0, 2
+    median = max(float(np.median(luminance)), brightest * 2.0**-_MOST_STOPS)
+    start, stop = float(np.log2(bright / brightest)), float(np.log2(bright / median))
+    stop = max(stop, start + 1)
+    return round(start, 3), round(stop, 3), max(2, int(np.ceil(stop - start)))
+
+
+def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
+    """Compare two converged images as an eye does that flips between them.
+
+    Raises
+    ------
+    ImageError
+        If FLIP is not installed, or pixels are not finite, to which it gives good scores.
+    """
+    try:
+        import flip_evaluator
+    except ImportError:
+        raise ImageError("FLIP is not installed: pip install 'mitsuba-subdivision[metrics]'") from None
+    if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
+        raise ImageError("FLIP does not see pixels that are not finite; expected finite images")
+    start, stop, count = flip_exposures(reference.pixels)
+    # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
+    arrays = [np.ascontiguousarray(np.maximum(image.pixels, 0), dtype=np.float32) for image in (reference, test)]
+    errors, _, _ = flip_evaluator.evaluate(
+        *arrays,
+        "HDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"},
+    )
+    errors = np.asarray(errors, dtype=np.float64)[..., 0]
+    mean, p95 = float(errors.mean()), float(np.percentile(errors, 95))
+    numbers = {"flip_mean": mean, "flip_p95": p95, "exposures": [start, stop, count]}
+    failed = mean > tolerances.flip_mean or p95 > tolerances.flip_p95
+    line = (
+        f"mean {mean:.2g}, 95th percentile {p95:.2g}; "
+        f"at most {tolerances.flip_mean:.2g} and {tolerances.flip_p95:.2g} expected"
+    )
+    worst = pixel_of_largest(errors) if failed else None
+    return TierResult("flip", Status.FAIL if failed else Status.PASS, [line], numbers, worst, {"flip": errors})

@@ -1,0 +1,242 @@
+"""The report of a comparison: one static HTML page, its numbers as JSON, and its maps as an OpenEXR file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..srgb import encoded
+from ..whole_file import whole_file
+from . import ImageError
+from .compare import Comparison
+from .image import write_channels
+from .radiance_tiers import compare_flip, relative_difference
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PAGE, NUMBERS, MAPS = "index.html", "comparison.json", "maps.exr"
+COLUMNS, PANEL_INCHES, DOTS_PER_INCH = 4, 2.9, 160
+# Degrees that the first and the last colour stand for.
+ANGLES = (1e-5, 10.0)
+_SIGNED = "RdBu_r"
+# Title, caption and colours of each map; what the colours reach at least, so that rounding stays pale; and the
+# percentile that they reach.
+_MAPS = {
+    "relative": ("Relative difference", "(test - reference) / reference,\nmean of R, G, B", _SIGNED, 0.01, 99.0),
+    "paired": ("Paired difference", "from the same samples, so\nwithout noise", _SIGNED, 0.01, 99.0),
+    "z": ("z-score", "over the standard error, strongest\nchannel; failing tiles outlined", _SIGNED, 5.0, 99.9),
+    "evidence": (
+        "Evidence against noise",
+        "$-\\log_{10} p$ at the most\ntelling size of tiles",
+        "viridis",
+        10.0,
+        100.0,
+    ),
+    "flip": ("FLIP", "HDR-FLIP error", "magma", 0.05, 100.0),
+    "angle": ("Angle between normals", "degrees; grey at silhouettes\nand where nothing is hit", "magma", 0.0, 100.0),
+}
+
+
+def write_report(folder: str | Path, comparison: Comparison, title: str | None = None) -> Path:
+    """Write the report of a comparison: ``index.html``, which needs no other file, ``comparison.json``, ``maps.exr``.
+
+    The title is by default the reference's name. Returns the path of the page.
+
+    Raises
+    ------
+    ImageError
+        If matplotlib is not installed.
+    """
+    folder = Path(folder)
+    title = title or comparison.reference.name
+    picture = _panels(comparison)
+    folder.mkdir(parents=True, exist_ok=True)
+    maps = {name: values for tier in comparison.tiers for name, values in tier.maps.items()}
+    if maps:
+        write_channels(folder / MAPS, maps)
+    _write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()}, indent=1) + "\n")
+    _write_text(folder / PAGE, _page(title, comparison, picture))
+    return folder / PAGE
+
+
+def write_index(folder: str | Path) -> Path | None:
+    """Write a page that links to the reports in a folder, the failed ones first; None if there are none."""
+    folder = Path(folder)
+    rows = []
+    for path in sorted(folder.glob(f"*/{NUMBERS}")):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        tiers = ", ".join(f"{name} {tier['status']}" for name, tier in found["tiers"].items())
+        link = f'<a href="{html.escape(path.parent.name)}/{PAGE}">{html.escape(found["title"])}</a>'
+        rows.append((found["status"], f"<tr><td>{_badge(found['status'])}<td>{link}<td>{html.escape(tiers)}"))
+    if not rows:
+        return None
+    order = ["fail", "warn", "pass"]
+    lines = [line for _, line in sorted(rows, key=lambda row: order.index(row[0]))]
+    body = f"<h1>Render-difference tests</h1><table class=tiers>{''.join(lines)}</table>"
+    _write_text(folder / PAGE, _document("Render-difference tests", body))
+    return folder / PAGE
+
+
+def srgb(pixels: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Codes of sRGB from 0 to 1 of linear RGB; magenta where a pixel is not finite."""
+    finite = np.isfinite(pixels).all(axis=-1, keepdims=True)
+    return np.where(finite, encoded(np.clip(np.nan_to_num(pixels, posinf=0, neginf=0), 0, 1)), (1.0, 0.0, 1.0))
+
+
+def _panels(comparison: Comparison) -> bytes:
+    """Both images, their relative difference and the maps of the tiers, as a PNG file."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImageError("reports need matplotlib: pip install 'mitsuba-subdivision[metrics]'") from None
+    a, b = comparison.reference.pixels, comparison.test.pixels
+    finite = bool(np.isfinite(a).all() and np.isfinite(b).all())
+    maps = {"relative": relative_difference(a, b), **_maps(comparison)} if finite else {}
+    count = 2 + len(maps)
+    rows, columns = -(-count // COLUMNS), min(COLUMNS, count)
+    height = PANEL_INCHES * (a.shape[0] / a.shape[1] + 0.33)
+    figure = Figure((columns * PANEL_INCHES, rows * height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel in axes:
+        panel.set_anchor("N")
+    for panel in axes[count:]:
+        panel.set_axis_off()
+
+    peak = np.percentile(a[np.isfinite(a)], 99.5) if np.isfinite(a).any() else 1.0
+    scale = 1 / peak if peak > 0 else 1.0
+    stops = f"sRGB at {np.log2(scale):+.1f} stops"
+    for panel, title, pixels in ((axes[0], "Reference", a), (axes[1], "Test", b)):
+        panel.imshow(srgb(pixels * scale), interpolation="nearest")
+        _finish(panel, comparison, title, stops + ("" if finite else ",\nnot finite in magenta"))
+    for panel, (name, values) in zip(axes[2:], maps.items(), strict=False):
+        _draw_map(panel, comparison, name, values)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
+    return file.getvalue()
+
+
+def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
+    """The maps of all tiers, with that of FLIP for inspection where its tier did not run but can."""
+    maps = {name: values for tier in comparison.tiers for name, values in tier.maps.items()}
+    if "flip" not in maps:
+        try:
+            maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
+        except ImageError:
+            return maps
+    return maps
+
+
+def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np.floating]) -> None:
+    """Draw a map with the meaning of its colours: grey where it has no value."""
+    import matplotlib
+    from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.patches import Rectangle
+    from matplotlib.ticker import MaxNLocator
+
+    title, caption, colours, least, percentile = _MAPS[name]
+    if name == "angle":
+        norm: Normalize = LogNorm(*ANGLES)
+        values = np.maximum(values, ANGLES[0])
+    else:
+        reach = max(least, float(np.percentile(np.abs(values), percentile)))
+        norm = Normalize(-reach if colours == _SIGNED else 0, reach)
+    colour_map = matplotlib.colormaps[colours].with_extremes(bad="0.55")
+    picture = panel.imshow(np.ma.masked_invalid(values), colour_map, norm, interpolation="nearest")
+    bar = panel.figure.colorbar(
+        picture, ax=panel, location="bottom", shrink=0.9, aspect=30, pad=0.02, panchor=(0.5, 1.0)
+    )
+    bar.ax.tick_params(labelsize=7.5)
+    if name != "angle":
+        bar.locator = MaxNLocator(5)
+    tile = comparison.tier("tile")
+    for place in tile.numbers["failing"] if tile and name in ("z", "evidence") else ():
+        corner = place["x"] - 0.5, place["y"] - 0.5
+        for colour, line in (("white", 2.0), ("black", 0.8)):
+            size = place["width"], place["height"]
+            panel.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=line))
+    if name == "flip" and not comparison.tier("flip"):
+        caption += "; high where there is noise,\ndoes not count here"
+    _finish(panel, comparison, title, caption)
+
+
+def _finish(panel: Axes, comparison: Comparison, title: str, caption: str) -> None:
+    """Title and caption of a panel, and a circle around the worst pixel."""
+    from matplotlib.patches import Ellipse
+
+    panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
+    panel.set_xlabel(caption, fontsize=7.5, color="0.35")
+    panel.set_xticks([])
+    panel.set_yticks([])
+    if comparison.worst:
+        size = max(comparison.reference.size) / 14
+        at = comparison.worst.x, comparison.worst.y
+        panel.add_patch(Ellipse(at, size, size, fill=False, edgecolor="#ff2d9b", linestyle="--"))
+
+
+def _page(title: str, comparison: Comparison, picture: bytes) -> str:
+    rows = "".join(
+        f"<tr><th>{tier.name}<td>{_badge(tier.status.value)}<td>{'<br>'.join(map(html.escape, tier.lines))}"
+        for tier in comparison.tiers
+    )
+    remarks = "".join(f"<li>{html.escape(line)}" for line in comparison.remarks())
+    marker = "Dashed circle: worst pixel. " if comparison.worst else ""
+    width, height = comparison.reference.size
+    body = (
+        f"<h1>{html.escape(title)} {_badge(comparison.status.value)}</h1>"
+        f"<p class=names>reference <code>{html.escape(comparison.reference.name)}</code>, "
+        f"test <code>{html.escape(comparison.test.name)}</code>, {width} &times; {height} pixels</p>"
+        f"<table class=tiers>{rows}</table><ul>{remarks}</ul>"
+        f"<img src='data:image/png;base64,{base64.b64encode(picture).decode()}' alt='maps of the difference'>"
+        f"<p class=foot>{marker}The numbers are in <a href='{NUMBERS}'>{NUMBERS}</a>, the maps at full precision in "
+        f"<a href='{MAPS}'>{MAPS}</a>.</p>{_how_made(comparison)}"
+    )
+    return _document(title, body)
+
+
+def _how_made(comparison: Comparison) -> str:
+    rows = []
+    for role, image in (("reference", comparison.reference), ("test", comparison.test)):
+        for key in ("variant", "filter", "sampling", "environment", "command"):
+            if key in image.metadata:
+                value: Any = image.metadata[key]
+                text = value if isinstance(value, str) else json.dumps(value)
+                rows.append(f"<tr><th>{role}<td>{key}<td><code>{html.escape(text)}</code>")
+    table = f"<table>{''.join(rows)}</table>"
+    return f"<details><summary>How the images were made</summary>{table}</details>" if rows else ""
+
+
+def _badge(status: str) -> str:
+    return f"<span class='badge {status}'>{status}</span>"
+
+
+def _document(title: str, body: str) -> str:
+    return f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>{_STYLE}<body>{body}\n"
+
+
+def _write_text(path: Path, text: str) -> None:
+    with whole_file(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+_STYLE = """<meta name=viewport content="width=device-width"><style>
+body { font: 15px/1.45 system-ui, sans-serif; color: #1d1d1f; background: #fff; margin: 2rem auto; max-width: 1180px;
+  padding: 0 1.5rem }
+h1 { font-size: 1.5rem; margin: 0 } img { max-width: 100% }
+.names, .foot { color: #57575c } .names { margin: .2rem 0 1.2rem }
+table { border-collapse: collapse; margin: .5rem 0 } td, th { text-align: left; vertical-align: top;
+  padding: .35rem 1rem .35rem 0; font-weight: normal } .tiers tr { border-top: 1px solid #e3e3e6 }
+.tiers th { font-weight: 600 } ul { margin: 1rem 0; padding-left: 1.2rem }
+.badge { font: 600 .8rem/1 system-ui, sans-serif; padding: .22em .6em; border-radius: .3em; vertical-align: middle;
+  text-transform: uppercase; letter-spacing: .03em }
+.pass { background: #d8f0de; color: #10562a } .fail { background: #fbdcd8; color: #8d1c10 }
+.warn { background: #fdedc8; color: #6c4a00 } .skipped { background: #e9e9ec; color: #4c4c52 }
+details { margin: 1rem 0 3rem; font-size: .85rem } code { font-size: .92em; overflow-wrap: anywhere }
+</style>"""

@@ -1,0 +1,170 @@
+"""The report, read as a page and looked at in a browser."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.patches import Rectangle
+from mitsuba_subdivision.regression import report
+from mitsuba_subdivision.regression.compare import compare
+from mitsuba_subdivision.regression.image import Image, read_channels
+from mitsuba_subdivision.regression.report import srgb, write_index, write_report
+from regression.random_images import random_image, truth
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+# Saturated red, which the page itself has nowhere.
+SPOT = (0.9, 0.02, 0.02)
+
+
+@pytest.fixture(scope="module")
+def failed():
+    """A bright red square that the reference does not have, in an image of grey."""
+    rng = np.random.default_rng(3)
+    mean = truth()
+    mean[8:16, 8:16] = np.array(SPOT) * 2
+    return compare(random_image(rng, 400, "reference"), random_image(rng, 8, "test <1>", mean=mean))
+
+
+class Reader(HTMLParser):
+    """Collects what the page has, and what it would load or run."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags, self.links = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("href", "src") and not value.startswith("data:")]
+
+
+def drawn(comparison, monkeypatch):
+    """The figure of a report, as matplotlib has it, by the titles of its panels."""
+    figures = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *a, **b: (figures.append(figure), save(figure, *a, **b))[1])
+    report._panels(comparison)
+    return {axes.get_title(loc="left"): axes for axes in figures[0].axes if axes.get_title(loc="left")}
+
+
+def test_the_page_has_one_picture_and_runs_nothing(tmp_path, failed):
+    reader = Reader()
+    reader.feed(write_report(tmp_path, failed).read_text())
+    assert "script" not in reader.tags
+    assert reader.tags.count("img") == 1
+    assert reader.links == ["comparison.json", "maps.exr"]
+
+
+def test_the_picture_has_every_panel(failed, monkeypatch):
+    assert list(drawn(failed, monkeypatch)) == [
+        "Reference",
+        "Test",
+        "Relative difference",
+        "Angle between normals",
+        "Paired difference",
+        "z-score",
+        "Evidence against noise",
+        "FLIP",
+    ]
+
+
+def test_the_ends_of_the_scale_are_the_differences_they_say(monkeypatch):
+    """Half of the pixels are brighter, and half are darker, by as much as the scale reaches."""
+    grey = np.ones((4, 4, 3))
+    change = np.where(np.arange(4)[:, None, None] < 2, -0.1, 0.1)
+    (picture,) = drawn(compare(Image("a", grey), Image("b", grey + change)), monkeypatch)["Relative difference"].images
+    # Differences are relative to the sum of a pixel and a hundredth of the mean.
+    np.testing.assert_allclose(picture.get_clim(), np.array([-0.1, 0.1]) / 1.01)
+    np.testing.assert_allclose(np.unique(picture.get_array()), picture.get_clim())
+
+
+def test_equal_pictures_are_shown_alike_with_white_for_the_brightest(failed, monkeypatch):
+    panels = drawn(compare(failed.reference, failed.reference), monkeypatch)
+    reference, test = (panels[name].images[0].get_array() for name in ("Reference", "Test"))
+    np.testing.assert_array_equal(reference, test)
+    is_brightest = failed.reference.pixels.max(axis=2) >= np.percentile(failed.reference.pixels, 99.5)
+    assert (np.round(255 * reference[is_brightest].max(axis=1)) == 255).all()
+    assert reference.min() < 0.8
+
+
+def test_the_circle_is_around_the_worst_pixel_where_there_is_one(tmp_path, failed, monkeypatch):
+    same = compare(failed.reference, failed.reference)
+    for comparison, centre in ((failed, [(failed.worst.x, failed.worst.y)]), (same, [])):
+        axes = drawn(comparison, monkeypatch)["Reference"]
+        assert [patch.center for patch in axes.patches] == centre
+        assert ("Dashed circle: worst pixel" in write_report(tmp_path, comparison).read_text()) == bool(centre)
+
+
+def test_colours_of_evidence_and_of_angles_reach_what_they_say(failed, monkeypatch):
+    panels = drawn(failed, monkeypatch)
+    evidence, angle = (panels[name].images[0] for name in ("Evidence against noise", "Angle between normals"))
+    assert evidence.get_clim() == (0, failed.tier("tile").maps["evidence"].max())
+    np.testing.assert_allclose(angle.norm([1e-5, 1e-2, 10]), [0, 0.5, 1])
+    # Silhouettes are grey.
+    np.testing.assert_allclose(angle.to_rgba(np.ma.masked_invalid([np.nan]))[0], [0.55, 0.55, 0.55, 1])
+
+
+def test_tiles_that_fail_are_outlined(failed, monkeypatch):
+    panels = drawn(failed, monkeypatch)
+    tiles = {(x["x"] - 0.5, x["y"] - 0.5, x["width"], x["height"]) for x in failed.tier("tile").numbers["failing"]}
+    for name, expected in (("z-score", tiles), ("Evidence against noise", tiles), ("FLIP", set())):
+        boxes = [patch for patch in panels[name].patches if isinstance(patch, Rectangle)]
+        assert {(*box.get_xy(), box.get_width(), box.get_height()) for box in boxes} == expected
+
+
+def test_names_are_escaped(tmp_path, failed):
+    assert "test &lt;1&gt;" in write_report(tmp_path, failed).read_text()
+
+
+def test_numbers_and_maps_lie_beside_it(tmp_path, failed):
+    write_report(tmp_path, failed)
+    numbers = json.loads((tmp_path / "comparison.json").read_text())
+    assert numbers["status"] == "fail"
+    assert numbers["tiers"]["tile"]["failing"]
+    channels, _ = read_channels(tmp_path / "maps.exr")
+    assert np.abs(channels["z"][8:16, 8:16]).mean() > 5 * np.abs(channels["z"][20:, 20:]).mean()
+
+
+def test_images_that_are_not_finite_have_both_pictures(failed, monkeypatch):
+    pixels = failed.test.pixels.copy()
+    pixels[2, 2] = np.nan
+    panels = drawn(compare(failed.reference, replace(failed.test, pixels=pixels)), monkeypatch)
+    assert list(panels) == ["Reference", "Test"]
+    assert "not finite in magenta" in panels["Test"].get_xlabel()
+
+
+def test_the_index_lists_failures_first(tmp_path, failed):
+    assert write_index(tmp_path) is None
+    write_report(tmp_path / "a", compare(failed.reference, failed.reference), "unchanged")
+    write_report(tmp_path / "b", failed, "changed")
+    text = write_index(tmp_path).read_text()
+    assert text.index("changed") < text.index("unchanged")
+    assert 'href="b/index.html"' in text
+
+
+def test_pixels_that_are_not_finite_are_magenta():
+    codes = srgb(np.array([[[0.0, 0.5, 2.0]], [[np.nan, 0, 0]]]))
+    np.testing.assert_array_equal(np.round(255 * codes), [[[0, 188, 255]], [[255, 0, 255]]])
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_browser_shows_the_difference(tmp_path, failed):
+    page = write_report(tmp_path, failed)
+    shot = tmp_path / "page.png"
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1240,1400"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}", page.as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    pixels = imread(shot)[..., :3]
+    # Panels of about 290 pixels in four columns: the square, a quarter of the test's side, is there once.
+    red = (pixels[..., 0] > 0.8) & (pixels[..., 1:] < 0.45).all(axis=2)
+    rows, columns = np.nonzero(red)
+    assert len(rows) > 0.5 * (250 / 4) ** 2
+    # In the second of four columns.
+    assert 300 < np.median(columns) < 620
+    # The page fits: nothing but white at its right border.
+    assert (pixels[:, -10:] == 1).all()
