@@ -264,7 +264,7 @@ def test_an_impossible_to_world_is_an_error_and_changes_nothing(value, message):
     shape = make(named_cages.cube())
     before = buffer(shape, "vertex_positions")
     parameters = mi.traverse(shape)
-    parameters["to_world"] = upload(type(parameters["to_world"]), value())
+    parameters["to_world"] = type(parameters["to_world"])(value())
     with pytest.raises(ValueError, match=re.escape(f'parameter "to_world" {message}')):
         parameters.update()
     np.testing.assert_array_equal(buffer(shape, "vertex_positions"), before)

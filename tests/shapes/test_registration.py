@@ -10,7 +10,7 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import pytest
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.llvm import llvm_problem, require_llvm
 from mitsuba_subdivision.shapes import register_variant
 
 STAR = Path(__file__).parents[2] / "scenes/cages/star.obj"
@@ -63,8 +63,9 @@ def test_every_variant(variants_all):
 
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_a_missing_llvm_matters_to_its_own_variants_only(monkeypatch):
-    monkeypatch.setattr("mitsuba_subdivision.shapes.subdivision_shape.llvm_problem", lambda: "no LLVM here")
     shape = {"type": "subdivision", **named_cages.cube().as_properties(mi), "tessellation_rate": 1}
+    monkeypatch.setattr("mitsuba_subdivision.llvm.llvm_problem", lambda: "no LLVM here")
+    require_llvm.cache_clear()
     if mi.variant().startswith("llvm"):
         with pytest.raises(RuntimeError, match="no LLVM here"):
             mi.load_dict(shape)

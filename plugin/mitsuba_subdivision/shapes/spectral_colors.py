@@ -6,7 +6,6 @@ and have derivatives, so that kernels look them up.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -55,7 +54,8 @@ class SpectralUpsampling:
             return
         # Mitsuba's stub says of this function only that it is an object.
         file_resolver: Any = mi.file_resolver
-        content = Path(str(file_resolver().resolve(TABLE))).read_bytes()
+        with open(str(file_resolver().resolve(TABLE)), "rb") as file:
+            content = file.read()
         self._resolution = size = int(np.frombuffer(content, "<u4", 1, _MARK)[0])
         values = np.frombuffer(content, "<f4", size + 9 * size**3, _MARK + _WORD)
         self._levels, self._table = (upload(variant.Float, each) for each in (values[:size], values[size:]))
