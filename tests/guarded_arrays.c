@@ -1,7 +1,7 @@
 /* An allocator for NumPy with which reading beyond an array ends the process at once, instead of once in a thousand runs.
 
-   Each array ends where a page begins that must not be read. Its size stands in 16 bytes before it. Where the system
-   gives no more maps of memory, arrays come from malloc, and are counted. */
+   Each array ends where a page begins that must not be read. Its size stands in 16 bytes before it. Each needs
+   two maps of memory, of which Linux gives a process 65,530: where many arrays are alive, further ones come from malloc. */
 #define NPY_NO_DEPRECATED_API NPY_1_22_API_VERSION
 #include <Python.h>
 #include <numpy/arrayobject.h>
@@ -15,25 +15,27 @@ typedef struct {
     size_t size;   /* Of the array. */
 } Header;
 
-static size_t page, guarded, unguarded;
+/* Guarded arrays at a time. */
+#define MOST 20000
+
+static size_t page, live;
 
 static void *take(void *context, size_t size) {
     size_t used = size ? (size + 15) & ~(size_t) 15 : 16;
     size_t mapped = (used + sizeof(Header) + page - 1) / page * page;
-    char *memory = mmap(NULL, mapped + page, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
-    char *array;
-    if (memory != MAP_FAILED && mprotect(memory + mapped, page, PROT_NONE) == 0) {
+    char *memory, *array;
+    if (__atomic_load_n(&live, __ATOMIC_RELAXED) < MOST) {
+        memory = mmap(NULL, mapped + page, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+        if (memory == MAP_FAILED || mprotect(memory + mapped, page, PROT_NONE))
+            return NULL;
         array = memory + mapped - used;
-        __atomic_add_fetch(&guarded, 1, __ATOMIC_RELAXED);
+        __atomic_add_fetch(&live, 1, __ATOMIC_RELAXED);
     } else {
-        if (memory != MAP_FAILED)
-            munmap(memory, mapped + page);
         memory = calloc(1, used + sizeof(Header));
         if (!memory)
             return NULL;
         mapped = 0;
         array = memory + sizeof(Header);
-        __atomic_add_fetch(&unguarded, 1, __ATOMIC_RELAXED);
     }
     Header *header = (Header *) array - 1;
     header->mapped = mapped;
@@ -48,9 +50,10 @@ static void give(void *context, void *array, size_t size) {
         return;
     Header *header = (Header *) array - 1;
     size_t mapped = header->mapped, used = header->size ? (header->size + 15) & ~(size_t) 15 : 16;
-    if (mapped)
+    if (mapped) {
         munmap((char *) array + used - mapped, mapped + page);
-    else
+        __atomic_sub_fetch(&live, 1, __ATOMIC_RELAXED);
+    } else
         free(header);
 }
 
@@ -76,13 +79,8 @@ static PyObject *begin(PyObject *self, PyObject *none) {
     Py_RETURN_NONE;
 }
 
-static PyObject *counts(PyObject *self, PyObject *none) {
-    return Py_BuildValue("nn", (Py_ssize_t) guarded, (Py_ssize_t) unguarded);
-}
-
 static PyMethodDef methods[] = {
     {"begin", begin, METH_NOARGS, "Guard the arrays that are made from now on."},
-    {"counts", counts, METH_NOARGS, "Numbers of arrays that were guarded, and that were not."},
     {NULL},
 };
 static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_guarded_arrays", NULL, -1, methods};
