@@ -31,6 +31,12 @@ def failed():
     return compare(random_image(rng, 400, "reference"), random_image(rng, 8, "test <1>", mean=mean))
 
 
+@pytest.fixture(scope="module")
+def page(failed, tmp_path_factory):
+    """A report of it."""
+    return write_report(tmp_path_factory.mktemp("report"), failed)
+
+
 class Reader(HTMLParser):
     """Collects what the page has, and what it would load or run."""
 
@@ -46,15 +52,14 @@ class Reader(HTMLParser):
 def drawn(comparison, monkeypatch):
     """The figure of a report, as matplotlib has it, by the titles of its panels."""
     figures = []
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *a, **b: (figures.append(figure), save(figure, *a, **b))[1])
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     report._panels(comparison)
     return {axes.get_title(loc="left"): axes for axes in figures[0].axes if axes.get_title(loc="left")}
 
 
-def test_the_page_has_one_picture_and_runs_nothing(tmp_path, failed):
+def test_the_page_has_one_picture_and_runs_nothing(page):
     reader = Reader()
-    reader.feed(write_report(tmp_path, failed).read_text())
+    reader.feed(page.read_text())
     assert "script" not in reader.tags
     assert reader.tags.count("img") == 1
     assert reader.links == ["comparison.json", "maps.exr"]
@@ -117,16 +122,15 @@ def test_tiles_that_fail_are_outlined(failed, monkeypatch):
         assert {(*box.get_xy(), box.get_width(), box.get_height()) for box in boxes} == expected
 
 
-def test_names_are_escaped(tmp_path, failed):
-    assert "test &lt;1&gt;" in write_report(tmp_path, failed).read_text()
+def test_names_are_escaped(page):
+    assert "test &lt;1&gt;" in page.read_text()
 
 
-def test_numbers_and_maps_lie_beside_it(tmp_path, failed):
-    write_report(tmp_path, failed)
-    numbers = json.loads((tmp_path / "comparison.json").read_text())
+def test_numbers_and_maps_lie_beside_it(page):
+    numbers = json.loads((page.parent / "comparison.json").read_text())
     assert numbers["status"] == "fail"
     assert numbers["tiers"]["tile"]["failing"]
-    channels, _ = read_channels(tmp_path / "maps.exr")
+    channels, _ = read_channels(page.parent / "maps.exr")
     assert np.abs(channels["z"][8:16, 8:16]).mean() > 5 * np.abs(channels["z"][20:, 20:]).mean()
 
 
@@ -153,8 +157,7 @@ def test_pixels_that_are_not_finite_are_magenta():
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_a_browser_shows_the_difference(tmp_path, failed):
-    page = write_report(tmp_path, failed)
+def test_a_browser_shows_the_difference(tmp_path, page):
     shot = tmp_path / "page.png"
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--window-size=1240,1400"]
     command += [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}", page.as_uri()]

@@ -11,10 +11,8 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 
 # A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
-shadings = pytest.mark.parametrize(
-    "shading",
-    ["vertex", pytest.param("exact", marks=pytest.mark.skipif(hook_problem() is not None, reason="no exact shading"))],
-)
+exact = pytest.mark.skipif(hook_problem() is not None, reason="no exact shading")
+shadings = pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
 KEYS = {"points": "control_points", "world": "to_world", "colour": "cage_colour", "scale": "displacement_scale"}
 # Dr.Jit adds gradients of pixels in no fixed order.
 ORDER_OF_SUMS = 1e-5
@@ -87,8 +85,9 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by):
         assert frozen.n_recordings == 2
 
 
-@shadings
-@pytest.mark.parametrize("by", KEYS)
+@pytest.mark.parametrize(
+    ("shading", "by"), [*(("vertex", by) for by in KEYS), pytest.param("exact", "points", marks=exact)]
+)
 def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by):
     def picture(scene, parameters, seed):
         loss = dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None)
