@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
-    from .refinement.sharpness_linearization import SharpnessLinearization
-    from .refinement.variable_sharpness import VariableSharpness
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
     from .shapes.views import loss_of_views
@@ -50,11 +48,9 @@ __all__ = [
     "ElementBounds",
     "LimitSurface",
     "SchemeError",
-    "SharpnessLinearization",
     "StencilMatrices",
     "SurfaceSamples",
     "Tessellation",
-    "VariableSharpness",
     "VertexMatrices",
     "example_file",
     "limit_stencil",
@@ -81,11 +77,9 @@ _MODULES = {
     "ElementBounds": "patches",
     "LimitSurface": "surface",
     "SchemeError": "schemes",
-    "SharpnessLinearization": "refinement.sharpness_linearization",
     "StencilMatrices": "patches",
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
-    "VariableSharpness": "refinement.variable_sharpness",
     "VertexMatrices": "tessellation",
     "example_file": "examples",
     "limit_stencil": "evaluation.limit_stencil",

@@ -67,8 +67,8 @@ def validated_tags(
     )
 
 
-def validated_edges(topology: Topology, edges: ArrayLike | None, source: CageSource) -> IntArray:
-    """Check pairs of vertices, and find a half-edge of each; by default, of each edge of two faces.
+def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) -> IntArray:
+    """Check pairs of vertices, and find a half-edge of each.
 
     Raises
     ------
@@ -76,8 +76,6 @@ def validated_edges(topology: Topology, edges: ArrayLike | None, source: CageSou
         If a pair is no edge of two faces, or is given twice.
     """
     t = topology
-    if edges is None:
-        return np.flatnonzero(t.twin > np.arange(t.half_edge_count))
     ends = _indices(edges, (2,), "edges", source)
     found = _half_edges_between(t, *ends.T).astype(np.int64)
 
@@ -87,24 +85,6 @@ def validated_edges(topology: Topology, edges: ArrayLike | None, source: CageSou
     _require(found >= 0, where, "is no edge of a face", "edges of two faces", source)
     _require(t.twin[found] >= 0, where, "is infinitely sharp, as it has not two faces", "edges of two faces", source)
     _require(_is_first(t.edge[found]), where, "is given twice", "each edge once", source)
-    return found
-
-
-def validated_vertices(topology: Topology, vertices: ArrayLike, source: CageSource) -> IntArray:
-    """Check numbers of vertices that are to be corners.
-
-    Raises
-    ------
-    CageError
-        If one is no vertex, or is given twice.
-    """
-    found, count = _indices(vertices, (), "corners", source), topology.vertex_count
-
-    def where(row: int) -> str:
-        return f"{source.name}: {source.vertex(found[row])}"
-
-    _require((found >= 0) & (found < count), where, "is no vertex of the cage", f"one of {count}", source)
-    _require(_is_first(found), where, "is given twice", "each vertex once", source)
     return found
 
 

@@ -15,15 +15,14 @@ from ..cage import Attribute, ControlCage
 from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built
-from ..refinement.variable_sharpness import VariableSharpness
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
-from .crease_sharpness import refined_points
 from .fitting import Fit
 from .large_steps import LargeSteps
 from .regularizers import device_regularizer
 from .schedule import Schedulable, Schedule
+from .unknown_creases import UnknownCreases
 from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 
 # The optimiser's name of the coordinates of the control points.
@@ -70,7 +69,7 @@ class CageFit(Fit):
         mean of theirs. By default each edge is a crease of its own.
     highest_sharpness : int
         Upper bound of the sharpness, 1 to 6; one less after each refinement, but 1 at least. The shape's cage is then
-        one that is refined as often: see `VariableSharpness`.
+        one that is refined as often: see `UnknownCreases`.
     sharpness_rate : float or schedule
         How far a step moves a sharpness at most, about.
     regularizers : dict of str to float or schedule, optional
@@ -132,22 +131,21 @@ class CageFit(Fit):
         self._smoothing, self._laplacian, self._seed = smoothing, laplacian, seed
         self._weights = {name: Schedule.of(each, f"regularizer {name}") for name, each in (regularizers or {}).items()}
         self._other_rates = {name: Schedule.of(each, f"others {name}") for name, each in (others or {}).items()}
-        self._variable: VariableSharpness | None = None
+        self._creases: UnknownCreases | None = None
         if sharp_edges is not None:
-            self._variable = VariableSharpness(cage, sharp_edges, highest=highest_sharpness, scheme=scheme)
-            self._crease_of = _creases(crease_of, len(self._variable.initial))
+            creases = _checked_creases(crease_of, len(np.atleast_2d(sharp_edges)))
+            self._creases = UnknownCreases(cage, sharp_edges, creases, highest_sharpness, scheme)
             self._other_rates[SHARPNESS] = Schedule.of(sharpness_rate, "sharpness_rate")
         self._others = mi.ad.Adam(lr=1.0)
         super().__init__(cage, scheme, refine, callbacks)
 
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
-        variable = self._variable
-        if variable is None:
+        creases = self._creases
+        if creases is None:
             self._pictures.load(start.cage)
         else:
-            self._pictures.load(variable.cage, variable.highest)
-            edges_of = np.bincount(self._crease_of)
-            self._others[SHARPNESS] = upload(mi.Float, np.bincount(self._crease_of, variable.initial) / edges_of)
+            self._pictures.load(creases.refined, creases.highest)
+            self._others[SHARPNESS] = upload(mi.Float, creases.initial)
         self._steps: LargeSteps | None = None
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
@@ -159,9 +157,8 @@ class CageFit(Fit):
         self._load_others()
 
     def _follow(self, refinement: CageRefinement) -> None:
-        if self._variable is not None:
-            self._variable = self._variable.refined(refinement)
-            self._crease_of = np.tile(self._crease_of, 2)
+        if self._creases is not None:
+            self._creases = self._creases.after(refinement)
 
     def _load_others(self) -> None:
         """Start the other parameters from the scene's values, unless an earlier start has set them in the same size."""
@@ -171,7 +168,7 @@ class CageFit(Fit):
                 continue
             if name not in params:
                 raise ValueError(f'others has "{name}"; expected one of {", ".join(params.keys())}')
-            if name.startswith(CAGE_VALUES) and self._variable is not None:
+            if name.startswith(CAGE_VALUES) and self._creases is not None:
                 raise ValueError(f'others has "{name}", and sharp_edges are given; expected one of them')
             if name not in self._others or self._others[name].shape != params[name].shape:
                 self._others[name] = params[name]
@@ -185,8 +182,8 @@ class CageFit(Fit):
     @property
     def cage(self) -> ControlCage:
         """The current cage, with its tags and with fitted attributes and sharpness."""
-        if self._variable is not None:
-            return self._variable.with_sharpness(self.sharpness, self.control_points)
+        if self._creases is not None:
+            return self._creases.with_sharpness(self._crease_sharpness(), self.control_points)
         names = [name for name in self._other_rates if name.startswith(CAGE_VALUES)]
         if not names:
             return self._start.with_positions(self.control_points)
@@ -211,14 +208,15 @@ class CageFit(Fit):
 
         After a refinement these are the halves at the first ends, then those at the second ends.
         """
-        return np.empty((0, 2), dtype=np.int64) if self._variable is None else self._variable.edges
+        return np.empty((0, 2), dtype=np.int64) if self._creases is None else self._creases.edges
 
     @property
     def sharpness(self) -> FloatArray:
         """``(n,)`` current sharpness of `sharp_edges`; maybe empty."""
-        if self._variable is None:
-            return np.empty(0)
-        return np.array(self._others[SHARPNESS], dtype=np.float64)[self._crease_of]
+        return np.empty(0) if self._creases is None else self._crease_sharpness()[self._creases.crease_of]
+
+    def _crease_sharpness(self) -> FloatArray:
+        return np.array(self._others[SHARPNESS], dtype=np.float64)
 
     @property
     def scene(self) -> mi.Scene:
@@ -238,9 +236,8 @@ class CageFit(Fit):
         points = self._points()
         values = {name: self._others[name] for name in self._other_rates if name != SHARPNESS}
         values[CONTROL_POINTS] = points
-        if self._variable is not None:
-            sharpness = dr.gather(mi.Float, self._others[SHARPNESS], upload(mi.UInt32, self._crease_of))
-            values[CONTROL_POINTS] = refined_points(self._variable, sharpness, points)
+        if self._creases is not None:
+            values[CONTROL_POINTS] = self._creases.points(self._others[SHARPNESS], points)
         loss = self._pictures.loss(values, self._seed + number)
         total: Any = loss
         for name, regularizer in self._regularizers.items():
@@ -251,23 +248,23 @@ class CageFit(Fit):
         if self._other_rates:
             self._others.set_learning_rate({name: rate(number) for name, rate in self._other_rates.items()})
             self._others.step()
-        if self._variable is not None:
-            self._others[SHARPNESS] = dr.clip(self._others[SHARPNESS], 0, self._variable.highest)
+        if self._creases is not None:
+            self._others[SHARPNESS] = dr.clip(self._others[SHARPNESS], 0, self._creases.highest)
         return float(np.array(loss).ravel()[0])
 
     def _states(self) -> dict[str, State]:
         others = {f"other {name}": adam_state(self._others, name) for name in self._other_rates}
-        if self._variable is not None:
+        if self._creases is not None:
             # The refined cage depends on the sharpness at that time.
-            others["start"] = {"positions": self._start.positions, "sharpness": self._variable.initial}
+            others["start"] = {"positions": self._start.positions, "sharpness": self._creases.initial}
         return {"points": adam_state(self._optimizer, U), **others}
 
     def _restore(self, found: Checkpoint) -> None:
-        if self._variable is not None:
+        creases = self._creases
+        if creases is not None:
             start = found.state("start", self._states()["start"])
-            self._start = self._variable.with_sharpness(start["sharpness"], start["positions"])
-            edges, highest = self._variable.edges, self._variable.highest
-            self._variable = VariableSharpness(self._start, edges, highest=highest, scheme=self._scheme)
+            self._start = creases.with_sharpness(start["sharpness"], start["positions"])
+            self._creases = UnknownCreases(self._start, creases.edges, creases.crease_of, creases.highest, self._scheme)
             self._load(LimitSurface(self._start, self._scheme), self._start.positions)
         states = {name: found.state(name, own) for name, own in self._states().items()}
         restore_adam(self._optimizer, U, states["points"])
@@ -275,7 +272,7 @@ class CageFit(Fit):
             restore_adam(self._others, name, states[f"other {name}"])
 
 
-def _creases(crease_of: ArrayLike | None, edge_count: int) -> IntArray:
+def _checked_creases(crease_of: ArrayLike | None, edge_count: int) -> IntArray:
     """Creases of edges, checked."""
     found = np.arange(edge_count) if crease_of is None else np.asarray(crease_of)
     if found.shape != (edge_count,) or not np.issubdtype(found.dtype, np.integer):

@@ -1,0 +1,149 @@
+"""Creases whose sharpness is fitted.
+
+Where no sharpness is above an integer k, nothing semi-sharp is left after k refinements: the limit surface is that of a
+smooth cage, always of the same faces, whose control points are a matrix times those of the cage. Between two integers,
+the matrix is linear in each sharpness (with Chaikin's method, in parts), so that a difference is its derivative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..cage import CageError, ControlCage
+from ..cage.tags import validated_edges
+from ..device_arrays import upload
+from ..mesh.connectivity import IntArray
+from ..mesh.sharpness import Sharpness
+from ..refinement.adapted_scheme import adapted_scheme
+from ..refinement.cage_refinement import CageRefinement, built
+from ..schemes.domain import FloatArray
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+# More refinements than these would make a thousand faces and more of each.
+MOST_REFINEMENTS = 6
+# Of differences by sharpness; one at an integer begins so far inside the interval. Rounding leaves 1e-10 of it.
+STEP = 1e-6
+
+
+class UnknownCreases:
+    """A cage some of whose creases have a sharpness that is not known yet.
+
+    Derivatives at integers are those of the interval above, at ``highest`` of the one below. Where creases of unequal
+    sharpness meet, points may jump at integers: a vertex takes the mean sharpness of what a refinement makes smooth.
+
+    Parameters
+    ----------
+    cage : ControlCage
+        Its other tags stay.
+    edges : (n_e, 2) array of int
+        0-based ends of edges between two faces.
+    crease_of : (n_e,) int64
+        The crease that each edge belongs to: all edges of a crease have one sharpness.
+    highest : int
+        The highest sharpness, 1 to 6. `refined` is the cage refined as many times.
+    scheme : str, optional
+        As for `LimitSurface`.
+
+    Attributes
+    ----------
+    edges : (n_e, 2) int64
+    refined : ControlCage
+        The cage without semi-sharp creases that has the limit surface, with the control points of `points`.
+    initial : (n_c,) float64
+        Of each crease, the mean of its edges' sharpness in the cage, ``highest`` at most.
+
+    Raises
+    ------
+    CageError, SchemeError
+        Of an edge that is not between two faces, of ``highest`` out of range, and those of `ControlCage.refinement`.
+    """
+
+    def __init__(
+        self, cage: ControlCage, edges: ArrayLike, crease_of: IntArray, highest: int, scheme: str | None
+    ) -> None:
+        if highest not in range(1, MOST_REFINEMENTS + 1):
+            raise CageError(f"{cage.source.name}: highest_sharpness is {highest!r}; expected 1 to {MOST_REFINEMENTS}")
+        t = cage.topology
+        half_edges = validated_edges(t, edges, cage.source)
+        self.edges = np.stack([t.face_vertices[half_edges], t.face_vertices[t.next[half_edges]]], axis=1)
+        self.highest, self.crease_of = int(highest), crease_of
+        self._cage, self._chosen, self._half_edges = cage, scheme, np.stack([half_edges, t.twin[half_edges]])
+        given = np.minimum(cage.tags.edges[half_edges], highest)
+        self.initial: FloatArray = np.bincount(crease_of, given) / np.bincount(crease_of)
+        self._scheme = adapted_scheme(self.with_sharpness(np.full(len(self.initial), highest)), scheme)
+        self.refined = self.with_sharpness(self.initial)
+        for _ in range(self.highest):
+            self.refined = self.refined.refined(scheme)
+
+    def with_sharpness(self, sharpness: FloatArray, positions: FloatArray | None = None) -> ControlCage:
+        """The cage, not refined, whose creases have some sharpness."""
+        edges = self._cage.tags.edges.copy()
+        edges[self._half_edges] = sharpness[self.crease_of]
+        tags = Sharpness(edges, self._cage.tags.vertices)
+        contents = replace(self._cage.contents, creases=tags.creases(self._cage.topology), corners=tags.corners())
+        return built(contents if positions is None else replace(contents, positions=positions))
+
+    def matrix(self, sharpness: FloatArray) -> sparse.csr_array:
+        """Control points of `refined` as weights of those of the cage, ``(n, n_v)``; rows sum to one."""
+        from scipy import sparse
+
+        cut = self.with_sharpness(sharpness).cut_mesh
+        topology, found = cut.topology, sparse.eye_array(self._cage.vertex_count, format="csr")[cut.vertex]
+        for _ in range(self.highest):
+            refinement = self._scheme.refine(topology)
+            topology, found = refinement.topology, refinement.stencils.matrix @ found
+        # Face corners have the same numbers in the refined cage and in the refined cut mesh; vertices may have others.
+        kept = np.arange(self.refined.vertex_count)
+        kept[self.refined.face_vertices] = topology.face_vertices
+        return found[kept]
+
+    def derivatives(self, sharpness: FloatArray, positions: FloatArray) -> list[FloatArray]:
+        """Derivatives of the control points of `refined` by the sharpness of each crease, ``(n, 3)`` each."""
+        ahead = np.where(sharpness < self.highest, 1, -1)
+        inside = np.where(sharpness == np.round(sharpness), sharpness + STEP * ahead, sharpness)
+        before, ends = self.matrix(inside) @ positions, inside + np.diag(STEP * ahead)
+        return [(self.matrix(end) @ positions - before) / (STEP * side) for end, side in zip(ends, ahead, strict=True)]
+
+    def points(self, sharpness: dr.ArrayBase, positions: dr.ArrayBase) -> mi.Float:
+        """Control points of `refined`, flat x, y, z, differentiable by both; of the sharpness of each crease."""
+        return dr.custom(_RefinedPoints, self, sharpness, positions)
+
+    def after(self, refinement: CageRefinement) -> UnknownCreases:
+        """The same creases on a refinement of the cage: halves of edges, one less sharp, and at least 1 at most."""
+        finer = refinement.cage.topology
+        # The first of the refined faces' corners are at the ends of the old half-edges, in their order.
+        halves = finer.face_sizes[0] * self._half_edges.ravel()
+        edges = np.stack([finer.face_vertices[halves], finer.face_vertices[finer.next[halves]]], axis=1)
+        highest = max(self.highest - 1, 1)
+        return UnknownCreases(refinement.cage, edges, np.tile(self.crease_of, 2), highest, self._chosen)
+
+
+class _RefinedPoints(dr.CustomOp):
+    """Runs on the host: the cost of a cage is small beside that of a render."""
+
+    def eval(self, creases, sharpness, positions):
+        values = np.clip(np.array(sharpness, dtype=np.float64), 0, creases.highest)
+        self.matrix, self.moves = creases.matrix(values), creases.derivatives(values, _rows(positions))
+        return upload(mi.Float, self.matrix @ _rows(positions))
+
+    def forward(self):
+        along = np.array(self.grad_in("sharpness"), dtype=np.float64)
+        moved = sum(rate * move for rate, move in zip(along, self.moves, strict=True))
+        self.set_grad_out(upload(mi.Float, self.matrix @ _rows(self.grad_in("positions")) + moved))
+
+    def backward(self):
+        gradient = _rows(self.grad_out())
+        self.set_grad_in("sharpness", upload(mi.Float, [np.vdot(move, gradient) for move in self.moves]))
+        self.set_grad_in("positions", upload(mi.Float, self.matrix.T @ gradient))
+
+
+def _rows(flat: dr.ArrayBase) -> FloatArray:
+    return np.array(flat, dtype=np.float64).reshape(-1, 3)

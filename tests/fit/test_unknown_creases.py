@@ -1,0 +1,87 @@
+"""Creases of unknown sharpness: refined control points and their derivatives, against cages with these tags."""
+
+import numpy as np
+import pytest
+from mitsuba_subdivision import CageError, ControlCage, LimitSurface
+from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.fit.unknown_creases import UnknownCreases
+from patches.closed_cages import bumpy, mixed_torus, triangulated
+
+HIGHEST = 3
+# Of points of the size of one.
+ROUNDING = 1e-12
+# Of central differences; the derivatives are one-sided differences of 1e-6, and Chaikin's polynomials are curved.
+STEP, DIFFERENCE = 1e-4, 1e-6
+
+CAGES = {
+    "cube": (named_cages.cube, None),
+    "torus": (lambda: bumpy(mixed_torus()), None),
+    "triangles": (lambda: bumpy(triangulated(mixed_torus())), "loop"),
+}
+EVERY_CAGE = pytest.mark.parametrize("name", CAGES)
+
+
+def creases(name, method="uniform", count=6):
+    """Some edges of a cage as half as many creases, beside a crease whose sharpness is known."""
+    make, scheme = CAGES[name]
+    cage = make()
+    known, *edges = cage.edges[:: max(1, len(cage.edges) // count)][: count + 1]
+    cage = ControlCage.from_arrays(
+        cage.positions, cage.face_sizes, cage.face_vertices, creases=[(*known, 1.5)], crease_method=method
+    )
+    return UnknownCreases(cage, edges, np.arange(len(edges)) // 2, HIGHEST, scheme), scheme
+
+
+@pytest.mark.core
+@EVERY_CAGE
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+def test_points_are_those_of_the_tagged_cage_refined(name, method, np_rng):
+    unknown, scheme = creases(name, method)
+    for sharpness in (np_rng.uniform(0, HIGHEST, len(unknown.initial)), np.arange(len(unknown.initial)) % 4):
+        cage = unknown.with_sharpness(sharpness)
+        positions = unknown.matrix(sharpness) @ cage.positions
+        samples = LimitSurface(unknown.refined.with_positions(positions), scheme).tessellate(2).positions
+        for _ in range(HIGHEST):
+            cage = cage.refined(scheme)
+        np.testing.assert_allclose(positions, cage.positions, rtol=0, atol=ROUNDING)
+        np.testing.assert_array_equal(unknown.refined.face_vertices, cage.face_vertices)
+        expected = LimitSurface(cage, scheme).tessellate(2).positions
+        np.testing.assert_allclose(samples, expected, rtol=0, atol=ROUNDING)
+
+
+@EVERY_CAGE
+@pytest.mark.parametrize("method", ["uniform", "chaikin"])
+def test_derivatives_are_differences(name, method, np_rng):
+    """Between integers; at integers those of the interval above, at the highest of the one below."""
+    unknown, _ = creases(name, method)
+    positions = unknown.with_sharpness(unknown.initial).positions
+    count = len(unknown.initial)
+    inside = np_rng.integers(0, HIGHEST, count) + np_rng.uniform(0.2, 0.8, count)
+    at_ends = np.array([0, 1, HIGHEST])[:count]
+    for sharpness, at in ((inside, inside), (at_ends, at_ends + np.where(at_ends < HIGHEST, 2, -2) * STEP)):
+        for k, found in enumerate(unknown.derivatives(sharpness.astype(float), positions)):
+            ahead, behind = (unknown.matrix(at + side * STEP * np.eye(count)[k]) @ positions for side in (1, -1))
+            expected = (ahead - behind) / (2 * STEP)
+            bar = DIFFERENCE if at is sharpness else 10 * STEP * max(1, np.abs(expected).max())
+            np.testing.assert_allclose(found, expected, rtol=0, atol=bar)
+
+
+@pytest.mark.parametrize("name", ["cube", "triangles"])
+def test_what_is_left_after_a_refinement_makes_the_same_points(name):
+    unknown, scheme = creases(name)
+    sharpness = np.linspace(1, HIGHEST, len(unknown.initial))
+    cage = unknown.with_sharpness(sharpness)
+    left = unknown.after(cage.refinement(scheme))
+    np.testing.assert_allclose(left.initial, sharpness - 1, atol=ROUNDING)
+    expected = unknown.matrix(sharpness) @ cage.positions
+    np.testing.assert_allclose(left.matrix(sharpness - 1) @ cage.refined(scheme).positions, expected, atol=ROUNDING)
+
+
+def test_what_cannot_be_unknown_is_named():
+    cube, one = named_cages.cube(), np.zeros(1, dtype=np.int64)
+    for edges, highest, message in (
+        ([(0, 7)], HIGHEST, "is no edge of a face"),
+        ([(0, 1)], 7, "highest_sharpness is 7; expected 1 to 6"),
+    ):
+        with pytest.raises(CageError, match=message):
+            UnknownCreases(cube, edges, one, highest, None)
