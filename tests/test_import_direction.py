@@ -97,7 +97,7 @@ UP = {
     ("surface/limit_surface.py", "kernels"),
 }
 # Modules that import by names which are no constants: of modules of their own package, or of a user.
-BY_NAME = {"deferred.py", "schemes/scheme_table.py", "files/formats.py", "files/usd_process.py"}
+BY_NAME = {"deferred.py", "schemes/scheme_table.py", "files/formats.py"}
 BY_NAME |= {"figures/figure_table.py"}
 # Packages that may import a library that the numpy packages do without.
 MAY_IMPORT = {
@@ -131,7 +131,6 @@ MAY_IMPORT = {
     "MaterialX": {"usd"},
     "mitsuba_oidn": {"studio"},
     "PIL": {"usd"},
-    "lz4": {"files"},
 }
 
 

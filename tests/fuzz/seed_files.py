@@ -172,18 +172,9 @@ def _literal(reader: str) -> Iterator[tuple[str, bytes]]:
         yield ".ply", _PLY.replace(b"\n", b"\r\n")
         yield ".ply", _PLY.replace(b"\n", b"\r")
     else:
-        from pxr import Sdf, UsdUtils
-
-        for text in (_USD, _USD_ARCS):
-            yield ".usda", text
-            yield ".usda", text
-            layer = Sdf.Layer.CreateAnonymous(".usda")
-            layer.ImportFromString(text.decode())
-            yield from _saved(layer.Export, ".usdc")
-        with tempfile.TemporaryDirectory() as folder:
-            cube().save(f"{folder}/cube.usdc")
-            UsdUtils.CreateNewUsdzPackage(f"{folder}/cube.usdc", f"{folder}/cube.usdz")
-            yield ".usdz", Path(folder, "cube.usdz").read_bytes()
+        # The USD library trusts the sizes that its binary files announce.
+        yield ".usda", _USD
+        yield ".usda", _USD_ARCS
 
 
 def _written(reader: str) -> Iterator[tuple[str, bytes]]:
@@ -202,10 +193,10 @@ def _written(reader: str) -> Iterator[tuple[str, bytes]]:
         ),
     ]
     for cage in cages:
-        for suffix in {"usd": (".usdc", ".usda")}.get(reader, (f".{reader}",)):
-            yield from _saved(cage.save, suffix)
-            if reader == "ply":
-                yield from _saved(lambda path, cage=cage: _save_big_endian(cage, path), suffix)
+        suffix = {"usd": ".usda"}.get(reader, f".{reader}")
+        yield from _saved(cage.save, suffix)
+        if reader == "ply":
+            yield from _saved(lambda path, cage=cage: _save_big_endian(cage, path), suffix)
 
 
 def _save_big_endian(cage: ControlCage, path: str) -> None:

@@ -8,9 +8,7 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.equality import same
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
-from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_subdivision.usd.materialx_library import library
 from mitsuba_subdivision.usd.stage_reader import StageReader
@@ -108,7 +106,7 @@ def test_warnings_keep_their_kind_and_are_given_before_an_error(tmp_path, monkey
         raise CageError("the stage is unusable")
 
     reader = StageReader(stage(tmp_path, LOOKS % "" + bound(), red=RED))
-    monkeypatch.setattr(reader, "_read", read)
+    monkeypatch.setattr(reader, "_contents", read)
     with pytest.warns() as caught, pytest.raises(CageError, match="unusable"):
         reader.at()
     found = {each.category: str(each.message) for each in caught}
@@ -356,13 +354,6 @@ def test_each_output_of_a_node_is_its_own(tmp_path):
     inputs = '<input name="base_color" type="color3" nodename="turned" />'
     (found,) = materials(stage(tmp_path, LOOKS % "" + bound(), red=surface(inputs, graph=graph)))
     np.testing.assert_allclose(found.inputs["base_color"], [0.7, 0.2, 0.5], rtol=1e-6)
-
-
-def test_a_process_of_its_own_reads_the_same_expressions(tmp_path, monkeypatch):
-    path = stage(tmp_path, LOOKS % "" + bound(), red=surface(USED, graph=GRAPH))
-    here = StageReader(path).at().materials
-    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "60")
-    assert same(StageReader(path).at().materials, here)
 
 
 def test_packages_hold_documents_and_their_pictures(tmp_path):

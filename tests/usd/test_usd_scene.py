@@ -11,7 +11,6 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.cage.equality import same
-from mitsuba_subdivision.files.usd_process import ENVIRONMENT_VARIABLE
 from mitsuba_subdivision.usd import materialx_layers, stage_meshes
 from mitsuba_subdivision.usd.stage_walk import read_stage
 from mitsuba_subdivision.usd.texture_image import read_texture_image
@@ -1460,30 +1459,6 @@ def test_the_command_renders_the_whole_file(stage, tmp_path, request):
     assert main(["render", str(path), "-o", str(tmp_path / "one.exr"), "--prim", "/left", *small]) == 0
     assert np.array(mi.Bitmap(str(tmp_path / "one.exr"))).max() > 0.1
     assert main(["render", str(path), "-o", str(tmp_path / "none.exr"), "--cage", *small]) == 1
-
-
-def test_a_process_of_its_own_reads_the_same(stage, monkeypatch, tmp_path):
-    mi.Bitmap(QUADRANTS).write(str(tmp_path / "quadrants.png"))
-    inputs = "color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>"
-    curves = 'def BasisCurves "hair" {}\n'
-    path = stage(
-        CAMERA
-        + curves
-        + LIGHTS["rect"][0]
-        + material(inputs, texture("quadrants.png"))
-        + mesh("cube", CUBE + BOUND)
-        + mesh("square", SQUARE)
-    )
-    scenes, messages = [], []
-    for seconds in ("", "100"):
-        monkeypatch.setenv(ENVIRONMENT_VARIABLE, seconds)
-        with pytest.warns(CageWarning) as record:
-            scenes.append(msub.usd_scene(path, mi, size=(8, 8)))
-        messages.append([str(each.message) for each in record])
-    assert messages[0] == messages[1]
-    assert list(scenes[0]) == list(scenes[1])
-    assert "paint" in scenes[0]
-    np.testing.assert_array_equal(*[rendered(scene, spp=4) for scene in scenes])
 
 
 def test_the_library_prints_nothing_itself(stage, capfd, monkeypatch):

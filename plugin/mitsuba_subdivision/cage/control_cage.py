@@ -230,9 +230,7 @@ class ControlCage:
         OBJ files may have OpenSubdiv's tags. PLY and USD files need the extras ``ply`` and ``usd`` of this package.
 
         Points of USD files are transformed to world space, but not for the file's units and up axis. A USD file opens
-        the files that it refers to, and a damaged one can crash the USD library. If the environment variable
-        ``MITSUBA_SUBDIVISION_USD_PROCESS`` is a number of seconds, USD files are read in a process of their own, which
-        may take that long.
+        the files that it refers to, and a damaged one can crash the USD library.
 
         Parameters
         ----------

@@ -22,7 +22,6 @@ from ..mesh.connectivity import IntArray, Topology
 from .joined_meshes import joined
 from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import PrimvarChoice, read_primvars
-from .usd_process import call_in_process, seconds_in_process
 from .usd_skinning import Skinning
 from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at, usd_messages_of
 from .usd_values import local_to_world, time_of, value_at
@@ -65,8 +64,7 @@ def read_usd(
     CageError
         If the package usd-core is missing; if the file is malformed; if there is no such mesh, or more than one; if
         the mesh is not a subdivision surface of a known scheme and none is given; if attributes contradict each other;
-        if meshes that become one cage differ in scheme or rules. If `usd_process.ENVIRONMENT_VARIABLE` is set, also if
-        reading crashes or takes longer. The cage itself is not validated.
+        if meshes that become one cage differ in scheme or rules. The cage itself is not validated.
     OSError
         If the file cannot be read.
 
@@ -81,23 +79,8 @@ def read_usd(
         raise CageError(f"{name}: time {time}; expected a finite number, a time code")
     with Path(path).open("rb"):
         pass  # So that a missing file is an OSError, as for other formats.
-    seconds = seconds_in_process()
-    arguments: dict[str, Any] = {
-        "prim": prim,
-        "time": None if time is None else float(time),
-        "rules": dict(rules or {}),
-    }
-    if seconds is None:
-        meshes = read_meshes(path, **arguments)
-    else:
-        meshes = call_in_process(read_meshes, path, arguments, seconds)
-    return joined(meshes, name)
-
-
-def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> list[CageContents]:
-    """Contents of each mesh that is to be read, in this process; the parameters are those of `read_usd`."""
-    name = f'"{path}"'
     require_usd(name)
+    rules = rules or {}
     with usd_errors_at(name), usd_messages_of(name):
         stage = open_stage(path, name)
         meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
@@ -108,7 +91,7 @@ def read_meshes(path: str | Path, prim: str | None, time: float | None, rules: M
         # When the cage is validated, numbers that are not finite become errors that name their location.
         with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
             found.append(MeshReader(mesh, location, time, skinning, rules).contents())
-    return found
+    return joined(found, name)
 
 
 class MeshReader:

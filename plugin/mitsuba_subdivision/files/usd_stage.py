@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from ..cage.errors import CageError, shortened, warn
 from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
 from .usd_values import value_at
-from .usdc_sizes import require_plausible_sizes
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -67,7 +66,6 @@ def open_stage(
     """
     from pxr import Tf, Usd
 
-    require_plausible_sizes(path, name)
     try:
         stage = Usd.Stage.Open(str(path))
         if completed is not None:

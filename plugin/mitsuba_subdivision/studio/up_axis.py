@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..cage.errors import warn
 from ..files.formats import FORMATS
 
 
@@ -15,19 +14,10 @@ def up_axis_of(path: Path) -> str:
     ------
     CageError
         If a USD file cannot be opened.
-
-    Warns
-    -----
-    CageWarning
-        If USD files are read in a process of their own, which does not read the axis.
     """
     found = FORMATS.get(path.suffix.lower())
     if found is not None and found.up is not None:
         return found.up
-    from ..files.usd_process import ENVIRONMENT_VARIABLE, seconds_in_process
     from ..files.usd_stage import stage_up_axis
 
-    if seconds_in_process() is not None:
-        warn(f'"{path}": the up axis is not read while {ENVIRONMENT_VARIABLE} is set; y is used')
-        return "y"
     return stage_up_axis(path)

@@ -1,6 +1,6 @@
 """A whole USD file as a scene of Mitsuba.
 
-stage_reader.py, stage_walk.py, stage_*.py, polygons.py   read a stage to plain data, maybe in a process of its own
+stage_reader.py, stage_walk.py, stage_*.py, polygons.py   read a stage to plain data
 materialx_layers.py, materialx_library.py   the USD layers and the node library of MaterialX
 contents.py                  the plain data
 surface_models.py            models of surfaces, by the inputs that all share

@@ -304,16 +304,3 @@ class SceneContents:
     def has_surfaces(self) -> bool:
         """Whether there are meshes to be subdivided."""
         return any(shape.cage.scheme is not None for shape in self.all_shapes)
-
-
-TYPES = (
-    SceneContents,
-    CameraContents,
-    LightContents,
-    InstanceContents,
-    ShapeContents,
-    MaterialContents,
-    TextureContents,
-    PrimvarContents,
-    NodeContents,
-)

@@ -69,7 +69,6 @@ def usd_scene(
     ------
     CageError
         If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing is visible.
-        If ``MITSUBA_SUBDIVISION_USD_PROCESS`` is set, also if reading crashes or takes longer.
     ValueError
         If the time, the size, the samples or the texture size are none, or ``mi`` is no variant.
     OSError

@@ -7,20 +7,19 @@ import warnings
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..cage.errors import CageWarning, warn
-from ..files.usd_process import call_in_process, seconds_in_process
-from .contents import TYPES, SceneContents
+from .contents import SceneContents
 from .materialx_library import library
-from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage, read_stage
+from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage
 
 if TYPE_CHECKING:
     from pxr import Usd
 
 
 class StageReader:
-    """Reads a stage in this process, or at each time in a process of its own; see `files.usd_process`.
+    """Reads a stage at several times.
 
     Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
 
@@ -42,7 +41,6 @@ class StageReader:
         with Path(path).open("rb"):
             pass  # So that a missing file is an OSError, as for other formats.
         self._path, self._camera = path, camera
-        self._seconds = seconds_in_process()
         self._stage: Usd.Stage | None = None
         # The first contents, and, from the second time on, whether they stay but for the camera.
         self._first: SceneContents | None = None
@@ -57,7 +55,7 @@ class StageReader:
         Raises
         ------
         CageError
-            As `read_stage`; also if the process crashes or takes longer.
+            As `read_stage`.
         ValueError
             If the time is not finite.
         """
@@ -68,7 +66,7 @@ class StageReader:
         try:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", CageWarning)
-                return self._read(code)
+                return self._contents(f'"{self._path}"', code)
         finally:
             for each in caught:
                 self._pass_on(each)
@@ -83,12 +81,6 @@ class StageReader:
         if what not in self._warned:
             self._warned.add(what)
             warn(message)
-
-    def _read(self, time: float | None) -> SceneContents:
-        if self._seconds is None:
-            return self._contents(f'"{self._path}"', time)
-        arguments: dict[str, Any] = {"time": time, "camera": self._camera}
-        return call_in_process(read_stage, self._path, arguments, self._seconds, TYPES)
 
     def _contents(self, name: str, time: float | None) -> SceneContents:
         self._stage = self._stage or open_checked(self._path)
