@@ -42,7 +42,7 @@ def coarse(monkeypatch):
         creases: {"RATE": 3},
         normal_error: {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
         displacement: {"COLUMNS": 96, "ROWS": 96},
-        zebra: {"RATE": 8, "STRIPE_PIXELS": 256},
+        zebra: {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
     }.items():
         for name, value in names.items():
             monkeypatch.setattr(module, name, value)
@@ -159,7 +159,7 @@ def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
-@pytest.mark.parametrize("name", ["artifact", "error", "creases", "subdivision", "curvature"])
+@pytest.mark.parametrize("name", ["artifact", "error", "creases", "subdivision", "curvature", "zebra"])
 def test_figures_take_cages_of_users(name, options, own_cage):
     from mitsuba_subdivision.figures import FIGURES
 

@@ -58,7 +58,7 @@ FIGURES: dict[str, Figure] = {
     "shading": Figure("shading", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     "displacement": Figure("displacement", "a jar before and after it is displaced, and its triangles", ("spp",)),
     "zoom": Figure("zoom", "an extraordinary vertex, magnified up to a million times", ("spp",)),
-    "zebra": Figure("zebra", "reflection lines, with exact normals and with others", ("spp",)),
+    "zebra": Figure("zebra", "reflection lines, with exact normals and with others", ("spp", "cage")),
     "curvature": Figure("curvature", "curvature around extraordinary vertices", ("cage",)),
     "fit": Figure("fit", "cages fitted to pictures, and how near they come", ("spp",)),
     "hero": Figure("hero", "a human figure and its control cage", ("spp",)),

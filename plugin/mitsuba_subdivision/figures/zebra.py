@@ -19,6 +19,7 @@ from ..regression.scene import render_pixels
 from ..surface import LimitSurface
 from .figure_scenes import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
+from .own_cage import around_vertices, frame
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .projection import project
 
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3
-# Level of all other surfaces, so that they differ only in points and normals at the vertices.
-FINE_LEVEL = 7
-RATE = 2**FINE_LEVEL
+# Level of all other surfaces, so that they differ only in points and normals at the vertices; of a user's cage, whose
+# faces around a vertex are as many as a hundred, the second one.
+FINE_LEVEL, OWN_LEVEL = 7, 5
 # Dark and light bands from pole to pole of the environment, and the angle of their axis to the x axis of the image.
 STRIPES = 84
 AXIS_ANGLE = 38
@@ -54,11 +55,15 @@ def draw(options: FigureOptions) -> list[Path]:
 
     These are the exact normals; a mesh of level 3 with averaged normals; and, where their programs are found,
     OpenSubdiv's surface with its own normals and the mesh of Blender's modifier, both as fine as the exact surface. The
-    row below shows the angles between their normals and the exact ones.
+    row below shows the angles between their normals and the exact ones. With a user's cage, an extraordinary vertex of
+    it is where the cube's corner is.
     """
     stage = load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
-    surface = LimitSurface(cube())
-    shapes, titles = _shapes(surface.cage)
+    surface, level, at = LimitSurface(cube()), FINE_LEVEL, (CORNER_FACE, CORNER)
+    if options.cage:
+        (cage,) = around_vertices(options.cage, 1, frame(surface, *at)).values()
+        surface, level, at = LimitSurface(cage), OWN_LEVEL, (0, 0)
+    shapes, titles = _shapes(surface.cage, level)
     stripes = _stripes(stage.sensors()[0], STRIPES)
     pixels, normals = {}, {}
     for name, shape in shapes.items():
@@ -75,7 +80,7 @@ def draw(options: FigureOptions) -> list[Path]:
     largest = max(float(angle.max()) for angle in angles.values())
     for name, angle in angles.items():
         options.report(f"{' '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
-    tip = surface.evaluate(CORNER_FACE, np.zeros((1, 2)), CORNER).p
+    tip = surface.evaluate(at[0], np.zeros((1, 2)), at[1]).p
 
     figure, axes = panels(options, 2, len(shapes))
     for axis, name in zip(axes[0], shapes, strict=True):
@@ -89,25 +94,27 @@ def draw(options: FigureOptions) -> list[Path]:
         axis.plot(*corner, "o", markersize=5, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=1)
     written = write_plot(options, "zebra", figure)
     strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
-    metadata = {"pictures": titles, "level": LEVEL, "rate": RATE, "stripes": STRIPES, "spp": options.spp}
+    metadata = {"pictures": titles, "level": LEVEL, "rate": 2**level, "stripes": STRIPES, "spp": options.spp}
     return written + write_pixels(options, "zebra", strip, metadata)
 
 
-def _shapes(cage: ControlCage) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
+def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
     """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
-    exact = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": MIRROR})
+    properties = {**cage.as_properties(mi), "tessellation_rate": 2**level}
+    exact = mi.load_dict({"type": "subdivision", **properties, "bsdf": MIRROR})
     shapes = {"exact": exact, "mesh": _refined_mesh(cage)}
     titles = {
         "exact": ("This package", "exact\nnormals"),
         "mesh": ("Refined mesh", f"level {LEVEL},\naveraged normals"),
     }
     if program := osd_peer():
-        shapes["opensubdiv"] = _opensubdiv_mesh(program, cage)
+        shapes["opensubdiv"] = _opensubdiv_mesh(program, cage, 2**level)
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
-    if program := blender():
-        found = blender_mesh(program, cage, FINE_LEVEL)
+    # Blender has no holes.
+    if not len(cage.holes) and (program := blender()):
+        found = blender_mesh(program, cage, level)
         shapes["blender"] = make_mesh(found.positions, split_quads(found.quads), MIRROR, normals=found.normals)
-        titles["blender"] = (f"Blender {found.version}", f"level {FINE_LEVEL},\naveraged normals")
+        titles["blender"] = (f"Blender {found.version}", f"level {level},\naveraged normals")
     return shapes, titles
 
 
@@ -134,28 +141,32 @@ def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
 
     stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
     scene = staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
-    show(axis, on_white(render(scene, options, "whole surface")), caption="whole surface")
+    show(
+        axis,
+        on_white(render(scene, options, "whole surface")),
+        caption="around the vertex" if options.cage else "whole surface",
+    )
     half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * options.resolution / 2
     middle = options.resolution / 2
-    frame = (middle - half, middle - half), 2 * half, 2 * half
-    axis.add_patch(Rectangle(*frame, facecolor="none", edgecolor=RING, linewidth=1))
+    corner = (middle - half, middle - half)
+    axis.add_patch(Rectangle(corner, 2 * half, 2 * half, facecolor="none", edgecolor=RING, linewidth=1))
 
 
 def _refined_mesh(cage: ControlCage) -> mi.Mesh:
     """The cage refined `LEVEL` times, as triangles; Mitsuba averages their normals at the vertices."""
     for _ in range(LEVEL):
         cage = cage.refined()
-    return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)), MIRROR)
+    return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)[~cage.is_hole]), MIRROR)
 
 
-def _opensubdiv_mesh(program: Path, cage: ControlCage) -> mi.Mesh:
+def _opensubdiv_mesh(program: Path, cage: ControlCage, rate: int) -> mi.Mesh:
     """OpenSubdiv's points and normals, on a grid as fine as that of the exact surface, for each face alone."""
-    u, v = np.meshgrid(np.linspace(0, 1, RATE + 1), np.linspace(0, 1, RATE + 1))
-    uv = np.stack([u.ravel(), v.ravel()], axis=1)
-    element = np.repeat(np.arange(cage.face_count), len(uv))
-    points, normals = osd_samples(program, cage, element, np.tile(uv, (cage.face_count, 1)), "bfr", OPENSUBDIV_LEVEL)
-    first = (len(uv) * np.arange(cage.face_count))[:, None, None]
-    return make_mesh(points, (grid_triangles(RATE) + first).reshape(-1, 3), MIRROR, normals=normals)
+    u, v = np.meshgrid(np.linspace(0, 1, rate + 1), np.linspace(0, 1, rate + 1))
+    uv, shown = np.stack([u.ravel(), v.ravel()], axis=1), np.flatnonzero(~cage.is_hole)
+    element, parameters = np.repeat(shown, len(uv)), np.tile(uv, (len(shown), 1))
+    points, normals = osd_samples(program, cage, element, parameters, "bfr", OPENSUBDIV_LEVEL)
+    first = (len(uv) * np.arange(len(shown)))[:, None, None]
+    return make_mesh(points, (grid_triangles(rate) + first).reshape(-1, 3), MIRROR, normals=normals)
 
 
 def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:
