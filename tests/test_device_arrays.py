@@ -2,6 +2,7 @@
 
 import ast
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import drjit as dr
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.device_arrays import take_over
+from mitsuba_subdivision.device_arrays import CACHE_LINE, mapped, take_over
 
 ROOT = Path(mitsuba_subdivision.__file__).parent
 # Classes of arrays of Dr.Jit and Mitsuba by the last part of their names, and what variables that hold one are called.
@@ -57,10 +58,28 @@ def test_memory_is_not_that_of_numpy(variant_llvm_ad_rgb):  # noqa: ARG001
     values = np.arange(20, dtype=np.float32)
     found = upload(mi.Float, values)
     assert address(found) != values.ctypes.data
-    # In packets of any size.
-    assert address(found) % 64 == 0
+    # For packets of any size.
+    assert address(found) % CACHE_LINE == 0
+    table = mapped(mi.Float, values)
+    assert address(table) not in (values.ctypes.data, address(found))
+    assert address(table) % CACHE_LINE == 0
     values[:] = 7
-    np.testing.assert_array_equal(np.array(found), np.arange(20))
+    for copy in (found, table):
+        np.testing.assert_array_equal(np.array(copy), np.arange(20))
+
+
+def test_what_is_uploaded_is_there_for_other_threads(variant_llvm_ad_rgb):  # noqa: ARG001
+    """Shapes that are loaded in parallel read tensors that they are given: a pending copy had other numbers."""
+    values = np.arange(1 << 16, dtype=np.float32)
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(100):
+            # A kernel before, which the copy waits for.
+            busy = dr.arange(mi.Float, 1 << 18)
+            for _ in range(20):
+                busy = dr.sin(busy)
+            dr.eval(busy)
+            found = upload(mi.Float, values)
+            assert np.array_equal(pool.submit(found.numpy).result(), values)
 
 
 def test_a_user_s_array_is_taken_over_in_place_unless_it_has_derivatives(variant_llvm_ad_rgb):  # noqa: ARG001

@@ -2,8 +2,11 @@
 
 ``mi.Float(array)`` takes NumPy's memory without a copy in LLVM variants. That has two dangers: kernels load whole
 packets, so the last load may reach beyond the array, where the process ends if no page is mapped; and a frozen function
-that drops such an array ends the process, too. The arrays that `upload` returns are in Dr.Jit's own memory, which is
-aligned and padded.
+that drops such an array while it is recorded ends the process, too.
+
+- `mapped` maps a copy in NumPy's memory that reaches two packets beyond its values. All threads may read it at once,
+  so that shapes share such tables.
+- `upload` copies into Dr.Jit's own memory, and waits for that: for arrays that users hold and give away.
 """
 
 from __future__ import annotations
@@ -15,6 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .llvm import require_llvm
+
+# Bytes of two packets of the widest numbers that kernels load, and of what is aligned for kernels: Dr.Jit compiles
+# one kernel for aligned arrays and another one for others.
+PACKETS, CACHE_LINE = 256, 64
 
 
 def upload(kind: type, *parts: ArrayLike) -> Any:
@@ -38,21 +45,36 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
     RuntimeError
         If Dr.Jit has loaded an LLVM library whose kernels end the process.
     """
+    found = mapped(kind, *parts)
+    if dr.is_jit_v(kind):
+        found = dr.opaque(found)
+        # Another thread, such as one that loads a shape of this tensor, would not wait for the copy.
+        dr.sync_thread()
+    return found
+
+
+def mapped(kind: type, *parts: ArrayLike) -> Any:
+    """Make an array of Dr.Jit as `upload` does, in a copy of NumPy's that ends two packets beyond the values.
+
+    For arrays that no frozen function drops. Parameters and errors are those of `upload`.
+    """
     if dr.backend_v(kind) == dr.JitBackend.LLVM:
         require_llvm()
     if dr.is_tensor_v(kind):
         (values,) = parts
-        return kind(upload(dr.array_t(kind), values), np.shape(values))
+        return kind(mapped(dr.array_t(kind), values), np.shape(values))
     if not dr.is_array_v(kind):
         (value,) = parts
         return kind(np.asarray(value).item())
-    array: NDArray = np.concatenate(parts, axis=None, dtype=dr.type_v(kind).name.lower(), casting="unsafe")
+    dtype = np.dtype(dr.type_v(kind).name.lower())
     if not dr.is_jit_v(kind):
-        return kind(array)
+        return kind(np.concatenate(parts, axis=None, dtype=dtype, casting="unsafe"))
     if dr.depth_v(kind) > 1:
-        return dr.unravel(kind, upload(dr.array_t(dr.value_t(kind)), array))
-    # A copy by Dr.Jit: it reads no more than the array has, and is complete before NumPy's memory is freed.
-    return dr.opaque(kind(array))
+        return dr.unravel(kind, mapped(dr.array_t(dr.value_t(kind)), *parts))
+    size = dtype.itemsize * sum(np.size(part) for part in parts)
+    memory = np.empty(size + CACHE_LINE + PACKETS, dtype=np.uint8)
+    array: NDArray = memory[-memory.ctypes.data % CACHE_LINE :][:size].view(dtype)
+    return kind(np.concatenate(parts, axis=None, out=array, casting="unsafe"))
 
 
 def take_over(array: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from .contents import CageContents
 
 
@@ -16,11 +16,11 @@ def shape_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
         indices["holes"] = contents.holes
     return {
         # In double precision: far from the origin, single precision would change the normals visibly.
-        "positions": upload(mi.TensorXd, contents.positions),
-        **{name: upload(mi.TensorXu, array) for name, array in indices.items()},
+        "positions": mapped(mi.TensorXd, contents.positions),
+        **{name: mapped(mi.TensorXu, array) for name, array in indices.items()},
         **contents.rules,
         **({"scheme": contents.scheme} if contents.scheme else {}),
-        **{name: upload(mi.TensorXf, table) for name, table in tables.items() if len(table)},
+        **{name: mapped(mi.TensorXf, table) for name, table in tables.items() if len(table)},
         **_attribute_properties(contents, mi),
     }
 
@@ -34,6 +34,6 @@ def _attribute_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
     if contents.texcoords is not None:
         name = "varying_texcoords" if contents.texcoords.interpolation == "varying" else "texcoords"
         named.append((name, "texcoord_indices", contents.texcoords))
-    values = {name: upload(mi.TensorXf, each.values) for name, _, each in named}
-    indices = {name: upload(mi.TensorXu, each.indices) for _, name, each in named if each.indices is not None}
+    values = {name: mapped(mi.TensorXf, each.values) for name, _, each in named}
+    indices = {name: mapped(mi.TensorXu, each.indices) for _, name, each in named if each.indices is not None}
     return values | indices

@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..llvm import require_llvm
 from ..mesh.shared import Content, Shared, SharedArray
 from .types import Float, FloatBuffer, Index, IndexBuffer, Mask, Vector3
@@ -101,21 +101,22 @@ class ArrayTypes:
     def indices(self, *parts: NDArray[np.integer]) -> IndexBuffer:
         """Upload integer arrays, flattened and concatenated."""
         if self.is_jit:
-            return upload(self.index, *parts)
+            return mapped(self.index, *parts)
         return np.concatenate(parts, axis=None, dtype=np.uint32, casting="unsafe")
 
     def floats(self, values: NDArray[np.floating]) -> FloatBuffer:
         """Upload an array of numbers, flattened."""
-        return upload(self.float, values) if self.is_jit else np.array(values, dtype=np.float64).ravel()
+        return mapped(self.float, values) if self.is_jit else np.array(values, dtype=np.float64).ravel()
 
     def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
         """Upload an array of numbers, flattened; equal ones share their memory while one is referenced."""
-        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(self.floats(values)))
+        # In Dr.Jit's own memory, as frozen functions replace such values.
+        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(dr.opaque(self.floats(values))))
 
     def given(self, kind: type, values: Any) -> Any:
         """A user's values as an array of one of these types; vectors of NumPy have a row for each component."""
         if self.is_jit and isinstance(values, np.ndarray):
-            return upload(kind, values.T)
+            return mapped(kind, values.T)
         return kind(values)
 
     def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:

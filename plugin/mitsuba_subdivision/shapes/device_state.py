@@ -35,10 +35,15 @@ class DeviceState:
     ----------
     shape : mi.Shape
         Not kept alive.
+
+    Attributes
+    ----------
+    is_frozen : bool
+        Whether a frozen function has seen the arrays. Dr.Jit goes on reading its tables, which are in NumPy's memory.
     """
 
     def __init__(self, shape: Any) -> None:
-        self._shape = weakref.ref(shape)
+        self._shape, self.is_frozen = weakref.ref(shape), False
 
     # A scene that the garbage collector frees while a frozen function is called ends the process.
     @paused_collection()
@@ -50,7 +55,7 @@ class DeviceState:
         dr.detail.traverse_py_cb_rw(self._arrays(), callback)
 
     def _arrays(self) -> SimpleNamespace:
-        shape = self._shape()
+        self.is_frozen, shape = True, self._shape()
         return SimpleNamespace(arrays=[] if shape is None else list(_arrays_in(vars(shape), {id(self)})))
 
 

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..kernels.array_types import ArrayTypes
 from ..kernels.displacement import displaced
@@ -252,7 +252,7 @@ class HostDisplacement:
 
 def _columns(rows: NDArray) -> list[Float]:
     """Columns of an array, the vector components that `displaced` takes."""
-    return [upload(dr.scalar.ArrayXf64, column) for column in rows.T]
+    return [mapped(dr.scalar.ArrayXf64, column) for column in rows.T]
 
 
 def _rows(columns: list[Float]) -> FloatArray:

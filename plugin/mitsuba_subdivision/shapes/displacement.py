@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..kernels.channel_kernel import channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.displacement import Displacement
@@ -177,7 +177,7 @@ class ShapeDisplacement:
 
     def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
-        columns = [upload(float_type, column) for column in self.channel.evaluate(start, uv).T]
+        columns = [mapped(float_type, column) for column in self.channel.evaluate(start, uv).T]
         heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
         # A texture of one value has one number for all samples.
         return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..kernels.displacement import Heights
 from ..kernels.types import Float, Mask, Value, Vector2
 from ..variants import Variant
@@ -151,7 +151,7 @@ class TextureHeights:
             return HeightRange(float(values.min()), float(values.max()))
         along = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
         float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
-        s, t = (upload(float_type, each) for each in np.meshgrid(along, along))
+        s, t = (mapped(float_type, each) for each in np.meshgrid(along, along))
         values = np.array(self.height((s, t)))
         return HeightRange(float(values.min()), float(values.max()))
 

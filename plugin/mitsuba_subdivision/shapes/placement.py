@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..kernels.types import FloatBuffer, Matrix4
 
 if TYPE_CHECKING:
@@ -76,9 +76,9 @@ class RecentredPoints:
         centre = ((low + high) / 2).astype(np.float32).astype(np.float64)
         if recentres and np.abs(centre).max() > FAR * (high - low).max() / 2:
             self.centre, self.positions = centre, positions - centre
-            self._loaded = upload(float_type, positions)
-            self._relative = upload(float_type, self.positions)
-            self._centres = upload(float_type, np.tile(centre, len(positions)))
+            self._loaded = mapped(float_type, positions)
+            self._relative = mapped(float_type, self.positions)
+            self._centres = mapped(float_type, np.tile(centre, len(positions)))
 
     def __call__(self, control_points: FloatBuffer) -> FloatBuffer:
         """Flat control points relative to the centre."""

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
 from ..llvm import require_llvm
 from ..surface import TEXCOORDS
@@ -139,7 +139,10 @@ def make_subdivision(variant: Variant) -> type:
                     )
             attributes = mesh_attributes(surface.cage)
             self._cage = self._cage_attributes(attributes)
-            self.control_points = upload(kind, surface.cage.positions)
+            self.control_points = mapped(kind, surface.cage.positions)
+            if is_jit:
+                # In Dr.Jit's own memory, as frozen functions replace it.
+                self.control_points = dr.opaque(self.control_points)
             # Of numbers: whether NumPy's memory is aligned would decide which kernel is compiled.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
             self._take_to_world(parameters.to_world)
@@ -218,8 +221,7 @@ def make_subdivision(variant: Variant) -> type:
             Afterwards, call ``parameters_changed()`` of a scene that holds the shape. An update of the parameter that
             limits the tessellation does both.
             """
-            if is_recording():
-                raise RuntimeError("triangles cannot be chosen while a frozen function is recorded; choose them before")
+            self._require_unfrozen()
             self._require_control_points()
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
@@ -253,11 +255,7 @@ def make_subdivision(variant: Variant) -> type:
                     scale = self._displacement.checked_scale()
             tessellation = self._tessellation
             if not _CHOOSING.isdisjoint(keys) and isinstance(tessellation, AdaptiveTessellation):
-                if is_recording():
-                    raise RuntimeError(
-                        f'parameter "{tessellation.limit}" chooses new triangles, which a frozen function cannot; '
-                        "update it outside"
-                    )
+                self._require_unfrozen()
                 tessellation = tessellation.with_error(np.array(self._error).ravel())
             if "faces" in keys:
                 # Mitsuba discards its silhouette edges.
@@ -302,6 +300,14 @@ def make_subdivision(variant: Variant) -> type:
             for name, values in self._get_buffers(*names).items():
                 if len(values) != self._lengths[name]:
                     raise ValueError(f'parameter "{name}": {len(values)} numbers; expected {self._lengths[name]}')
+
+        def _require_unfrozen(self) -> None:
+            """Check that no frozen function reads the tables that new triangles replace."""
+            if self._device_state is not None and self._device_state.is_frozen:
+                raise RuntimeError(
+                    f"{self._parameters.source}: a frozen function has read the triangles of this shape; choose others "
+                    "before it is called first, or load the scene anew"
+                )
 
         def _require_control_points(self) -> None:
             with errors_about("control_points"):
@@ -395,7 +401,7 @@ def make_subdivision(variant: Variant) -> type:
         def _turned_faces(self) -> IndexBuffer:
             """Triangles with reversed orientation."""
             turned = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)[:, [0, 2, 1]]
-            return upload(variant.UInt32, turned) if is_jit else turned.ravel()
+            return mapped(variant.UInt32, turned) if is_jit else turned.ravel()
 
         def surface_area(self) -> Float:
             """Area of the triangles, with derivatives, which Mitsuba's own method does not have."""

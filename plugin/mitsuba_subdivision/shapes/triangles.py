@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.shared import Content, Shared, SharedArray
 from ..variants import Variant
@@ -58,7 +58,7 @@ class Triangles:
             triangles = triangles[:, [0, 2, 1]] if are_turned else triangles
             if not self._is_jit:
                 return SharedArray(triangles.ravel())
-            return SharedArray(upload(self._variant.UInt32, triangles))
+            return SharedArray(mapped(self._variant.UInt32, triangles))
 
         return self._shared("faces", (self.layout, self._variant, are_turned, self._name), make)
 
@@ -68,7 +68,7 @@ class Triangles:
 
         def make() -> SharedArray:
             element = self.table.element[self._kept]
-            return SharedArray(upload(self._variant.Float, element) if self._is_jit else element.astype(np.float32))
+            return SharedArray(mapped(self._variant.Float, element) if self._is_jit else element.astype(np.float32))
 
         return self._shared("element", (self.table, self._variant, self._name), make)
 
@@ -78,7 +78,7 @@ class Triangles:
 
         def make() -> SharedArray:
             found = split_weld_targets(self.table, self._attributes)
-            return SharedArray(None if found is None else upload(self._variant.UInt32, found))
+            return SharedArray(None if found is None else mapped(self._variant.UInt32, found))
 
         return self._shared("weld_target", (self.table, self.layout, self._variant), make)
 

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import upload
+from ..device_arrays import mapped
 from ..kernels.types import FloatBuffer
 from ..llvm import llvm_problem
 from ..mesh.shared import Shared
@@ -95,7 +95,7 @@ def _evaluators(
     kernel_type = float_type or dr.llvm.Float
     kernel = _KERNELS.get((table, kernel_type), lambda: WeightKernel(table, kernel_type))
     if not is_jit:
-        return lambda points: kernel(upload(kernel_type, np.array(points))), None
+        return lambda points: kernel(mapped(kernel_type, np.array(points))), None
     return kernel, kernel.evaluated if dr.is_diff_v(kernel_type) else None
 
 
@@ -114,7 +114,7 @@ def _sampled(
     positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
     # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
     found = positions.ravel(), np.nan_to_num(normals).ravel()
-    return found if float_type is None else (upload(float_type, found[0]), upload(float_type, found[1]))
+    return found if float_type is None else (mapped(float_type, found[0]), mapped(float_type, found[1]))
 
 
 def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
