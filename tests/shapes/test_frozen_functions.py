@@ -158,6 +158,8 @@ def test_triangles_that_a_frozen_function_has_read_are_not_replaced():
     dr.freeze(lambda scene: mi.render(scene, spp=1))(scene)
     with pytest.raises(RuntimeError, match="a frozen function has read the triangles of this shape; choose others"):
         shape.retessellate()
-    parameters["shape.chord_error"] = 0.1
-    with pytest.raises(RuntimeError, match="or load the scene anew"):
-        parameters.update()
+    mirrored = mi.Transform4f().scale([-1, 1, 1])
+    for key, value in (("chord_error", 0.1), ("to_world", mirrored)):
+        parameters[f"shape.{key}"] = value
+        with pytest.raises(RuntimeError, match="or load the scene anew"):
+            parameters.update()

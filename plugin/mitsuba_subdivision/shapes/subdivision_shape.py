@@ -249,6 +249,8 @@ def make_subdivision(variant: Variant) -> type:
             if "control_points" in keys:
                 self._require_control_points()
             to_world = checked_matrix(self.to_world) if "to_world" in keys and not is_recording() else None
+            if to_world is not None and bool(np.linalg.det(to_world[:3, :3]) < 0) != self._has_turned_faces:
+                self._require_unfrozen()
             scale = None
             if "displacement_scale" in keys and self._displacement is not None:
                 with errors_about("displacement_scale"):
@@ -302,7 +304,7 @@ def make_subdivision(variant: Variant) -> type:
                     raise ValueError(f'parameter "{name}": {len(values)} numbers; expected {self._lengths[name]}')
 
         def _require_unfrozen(self) -> None:
-            """Check that no frozen function reads the tables that new triangles replace."""
+            """Check that no frozen function reads the arrays that other triangles replace."""
             if self._device_state is not None and self._device_state.is_frozen:
                 raise RuntimeError(
                     f"{self._parameters.source}: a frozen function has read the triangles of this shape; choose others "
