@@ -68,7 +68,7 @@ WRITTEN = {
     "figures": {"creases.png"},
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
     "fitting": {"found.obj", "fit.npz"},
-    "python": {"barrel.obj", "cube-creased.obj"},
+    "python": {"barrel.obj"},
     "render": {"human.png", "jar.png", "rook.xml", "edited.png", "warm.png", "turn_0003.png", "turn.gif"},
 }
 SCENE = """<scene version="3.0.0">
