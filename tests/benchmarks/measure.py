@@ -63,7 +63,7 @@ def stages(obj, binary, rate, repeats, _variant):
     """Each step by itself."""
     import drjit as dr
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
+    from mitsuba_subdivision.evaluation.element import stencils_by_signature
     from mitsuba_subdivision.files.obj_reader import read_obj
     from mitsuba_subdivision.kernels import WeightKernel
     from mitsuba_subdivision.mesh.connectivity import Topology

@@ -9,7 +9,7 @@ from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
 from mitsuba_subdivision.evaluation.ring_symmetry import LEAST_VALENCE, fan_ring, ring_orbits, symmetric_eigenbasis
-from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
+from mitsuba_subdivision.evaluation.element import stencils_by_signature
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import NEAR_FACES, Signature, TaggedFan

@@ -11,7 +11,7 @@ from mitsuba_subdivision.evaluation import sample_stencils as module
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.sample_stencils import stencils_by_signature
+from mitsuba_subdivision.evaluation.element import stencils_by_signature
 from mitsuba_subdivision.schemes import SchemeError
 from reference.refined_cages import tagged
 

@@ -11,13 +11,11 @@ import numpy as np
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
+from .equations import MOST_MULTIPLICATIONS
 from .polynomial_basis import polynomial_basis
 
 # Sums of Bernstein coefficients, differences and halvings have entries of small fractions; rounding leaves these.
 NO_ENTRY = 1e-12
-# In one product of matrices. For more, OpenBLAS starts threads, and where those of Dr.Jit wait for work in a loop, each
-# product then takes up to fifteen times as long.
-MOST_MULTIPLICATIONS = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)

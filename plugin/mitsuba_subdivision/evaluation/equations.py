@@ -82,6 +82,9 @@ Evaluator = Literal["power", "stam", "stabilized", "limit"]
 EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 # The level reported at the extraordinary point itself, which no finite number of refinements reaches.
 AT_EXTRAORDINARY_POINT = -1
+# In one product of matrices. For more, OpenBLAS starts threads, and where those of Dr.Jit wait for work in a loop, each
+# product then takes up to fifteen times as long.
+MOST_MULTIPLICATIONS = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +150,23 @@ def child_rows(
     rows = np.empty((*values.shape[:2], tables.shape[2]), dtype=tables.dtype)
     for k, table in enumerate(tables):
         at = np.flatnonzero(child == k)
-        rows[:, at] = values[:, at] @ table
+        rows[:, at] = times(values[:, at], table)
         # 2 s_k: the child's parameters run twice as fast, and backwards in a triangle's middle child.
         speed = scheme.domain.children[k + 1].matrix[0, 0].astype(tables.dtype)
         rows[1:3, at] *= speed
         rows[3:, at] *= speed**2
     return level, rows
+
+
+def times(rows: FloatArray, matrix: FloatArray, out: FloatArray | None = None) -> FloatArray:
+    """Rows ``(d, n, K)`` times a matrix, in runs for which OpenBLAS starts no threads, see `MOST_MULTIPLICATIONS`."""
+    if out is None:
+        out = np.empty((*rows.shape[:2], matrix.shape[1]), dtype=np.result_type(rows, matrix))
+    length = max(1, MOST_MULTIPLICATIONS // max(1, matrix.size))
+    for own, found in zip(rows, out, strict=True):
+        for begin in range(0, len(own), length):
+            np.matmul(own[begin : begin + length], matrix, out=found[begin : begin + length])
+    return out
 
 
 def power_rows(rows: FloatArray, level: NDArray[np.int64], matrix: FloatArray) -> FloatArray:

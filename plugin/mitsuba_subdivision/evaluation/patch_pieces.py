@@ -66,11 +66,12 @@ class Piece:
     @property
     def coordinates(self) -> FloatArray:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
-        return self.scattered(self.irregular_patch.basis.inverse) if self.weights.ndim == 1 else self._coordinates
+        return self._coordinates
 
     @cached_property
     def _coordinates(self) -> FloatArray:
-        return self.irregular_patch.basis.inverse @ self.weights
+        inverse = self.irregular_patch.basis.inverse
+        return self.scattered(inverse) if self.weights.ndim == 1 else inverse @ self.weights
 
     def over_controls(self, rows: FloatArray) -> FloatArray:
         """Rows over the piece's eigen-coordinates, or its control points if it is regular, as weights ``(.., K)``."""

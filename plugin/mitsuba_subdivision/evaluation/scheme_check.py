@@ -17,10 +17,11 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 from ..schemes.scheme_members import has_phantom_points, in_brief, optional_member, require_members, unsupported_parts
 from ..schemes.stencil_table import StencilTable
+from .divided_element import element_of
 from .irregular_patch import irregular_patch
-from .occupied_pieces import OccupiedPieces
 from .patch_pieces import MAX_REFINEMENTS, irregular_structure, isolated_signature, lattice_stencils, regular_signature
 from .refined_rings import refined_children
+from .sample_weights import LocatedSamples
 
 # Valences at which a scheme is tried. Others are checked when a cage has them.
 TRIED_VALENCES = range(3, 9)
@@ -94,7 +95,7 @@ def _require_separation(scheme: Scheme, signature: Signature) -> None:
     for _ in range(MAX_REFINEMENTS):
         uv = np.concatenate([child.inverse()(uv) for child in scheme.domain.children])
     nought = np.zeros(len(uv), dtype=np.int64)
-    OccupiedPieces.of(scheme, signature).locate(nought, uv, nought)
+    LocatedSamples(scheme, [element_of(scheme, signature)], nought, uv, nought)
 
 
 def _border_signatures(scheme: Scheme) -> Iterator[Signature]:

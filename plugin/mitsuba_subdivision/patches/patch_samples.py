@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..evaluation.element import ElementSamples, evaluate_elements
+from ..evaluation.divided_element import element_of
+from ..evaluation.element import ElementSamples, evaluate_samples
 from ..evaluation.equations import Evaluator
+from ..evaluation.sample_weights import LocatedSamples
 from ..mesh.connectivity import IntArray
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 
-# Samples are evaluated in runs of this many, which bounds temporary memory to some tens of megabytes.
-CHUNK = 32768
-# And of at most this many classes, whose pieces are prepared at once; of fewer in fans of very many faces, where the
-# weights of a part over the one-ring are many.
-CLASSES = 512
-WEIGHTS = 1 << 24
-# Of tips; that leaves a 64th of each to eigen-coordinates.
-PIECE_LEVELS = 3
+# Samples are evaluated in runs of so many weights of each kind, which bounds temporary memory to some tens of megabytes.
+WEIGHTS = 1 << 19
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,21 +56,24 @@ class PatchSampler:
         evaluator, dtype, derivatives
             As for `LimitSurface.evaluate`.
         """
-        class_index, patch, patch_corner = self.patches.patch_at(half_edge)
+        scheme, classes = self.patches.scheme, self.patches.classes
+        class_index, patch, corner = self.patches.patch_at(half_edge)
         samples = ElementSamples.empty(len(uv), self.control_values.shape[1], dtype, derivatives)
-        # Second derivatives, and single precision, have no bits to lose; and the other forms are about these levels.
-        is_usual = evaluator == "stabilized" and derivatives == 1 and np.dtype(dtype) == np.float64
-        piece_levels = PIECE_LEVELS if is_usual else 0
-        # Sorted by class, a run of samples has few new classes, and few control points.
-        order = np.argsort(class_index.astype(np.min_scalar_type(len(self.patches.classes))), kind="stable")
-        for at in counted(_runs(class_index[order], order, self.patches.control_counts), "Evaluated patches"):
-            of_class = class_index[at]
-            pieces, element = self.patches.elements_of(of_class, piece_levels)
-            last = self.patches.control_counts[of_class] - 1
-            controls = partial(self._controls, self.patches.first_controls[of_class] + patch[at] * (last + 1), last)
-            evaluate_elements(
-                pieces, element, controls, uv.take(at, axis=0), patch_corner[at], self._extent, evaluator, samples, at
-            )
+        # Sorted by class, a run of samples has few classes, and few control points.
+        order = np.argsort(class_index.astype(np.min_scalar_type(len(classes))), kind="stable")
+        ends = np.cumsum(self.patches.control_counts[class_index[order]]) // WEIGHTS
+        runs = np.split(order, np.flatnonzero(np.diff(ends)) + 1) if len(order) else []
+        for at in counted(runs, "Evaluated patches"):
+            used, element = np.unique(class_index[at], return_inverse=True)
+            own = [classes[index] for index in used.tolist()]
+            elements = [element_of(scheme, each.signature) for each in own]
+            located = LocatedSamples(scheme, elements, element, uv[at], corner[at])
+            controls = [
+                each.controls.take(patch[at[of_element]], axis=0)
+                for each, of_element in zip(own, located.slices(), strict=True)
+            ]
+            points = [self._values.take(indices, axis=0) for indices in controls]
+            samples.put(at, evaluate_samples(located, points, self._extent, evaluator, dtype, derivatives))
         return samples
 
     @cached_property
@@ -84,35 +83,5 @@ class PatchSampler:
 
     @cached_property
     def _values(self) -> FloatArray:
-        """Control values of the mesh's vertices, three with a fourth of zero."""
-        # Rows of 32 bytes are gathered in half the time of rows of 24.
-        width = self.control_values.shape[1]
-        values = np.zeros((len(self.control_of_vertex), 4 if width == 3 else width))
-        values[:, :width] = self.control_values[self.control_of_vertex]
-        return values
-
-    def _controls(self, first: IntArray, last: IntArray, which: IntArray, columns: IntArray) -> FloatArray:
-        """Control values of the patches that samples lie in: ``(K, m, k)``, or a fourth column more.
-
-        Parameters
-        ----------
-        first, last : (s,) int64
-            Of each sample's patch: index of its first control in `PatchTable.rings`, and how far after it the last is.
-        which : (m,) int64
-            Some of the samples.
-        columns : (K,) int64
-            Some control points of a one-ring; the last one in place of those that a patch has not.
-        """
-        index = np.minimum(columns[:, None], last.take(which))
-        index += first.take(which)
-        return self._values.take(self.patches.rings.take(index), axis=0)
-
-
-def _runs(class_index: IntArray, order: IntArray, control_counts: IntArray) -> list[IntArray]:
-    """Samples in runs of at most `CHUNK`, of at most `CLASSES` classes; given in the order of these."""
-    weights = np.maximum(control_counts[class_index] ** 2, WEIGHTS // CLASSES)
-    weights[1:][class_index[1:] == class_index[:-1]] = 0
-    # The number of the run in which each sample's class begins.
-    number = (np.cumsum(weights) - 1) // WEIGHTS
-    runs = np.split(order, np.flatnonzero(np.diff(number)) + 1) if len(order) else []
-    return [part for run in runs for part in np.split(run, range(CHUNK, len(run), CHUNK))]
+        """``(n_v, k)`` control values of the mesh's vertices."""
+        return self.control_values[self.control_of_vertex]

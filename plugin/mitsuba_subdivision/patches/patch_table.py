@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.occupied_pieces import OccupiedPieces
 from ..mesh import ragged
 from ..mesh.chunks import gathered
 from ..mesh.connectivity import IndexArray, IntArray, Topology
@@ -29,10 +28,6 @@ if TYPE_CHECKING:
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
-# Number of weights of pieces that are kept: those of a cage with 600 classes take 7 MB.
-KEPT_BYTES = 1 << 25
-# The number of their columns is a multiple of this.
-COLUMN_STEP = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,16 +126,6 @@ class PatchTable:
         return self._classes[1]
 
     @cached_property
-    def rings(self) -> IndexArray:
-        """`controls`, those of each patch together, for samples that jump from patch to patch."""
-        return np.concatenate([each.controls.ravel() for each in self.classes])
-
-    @cached_property
-    def first_controls(self) -> IntArray:
-        """``(c,)`` `PatchClass.first_control` of each class."""
-        return np.array([each.first_control for each in self.classes], dtype=np.int64)
-
-    @cached_property
     def control_counts(self) -> IntArray:
         """``(c,)`` K of each class."""
         return np.array([each.controls.shape[1] for each in self.classes], dtype=np.int64)
@@ -233,25 +218,6 @@ class PatchTable:
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             controls = gathered(control_of_vertex.astype(np.int32), controls)
         return controls.view(np.uint32), None
-
-    def elements_of(self, class_index: IntArray, piece_levels: int) -> tuple[OccupiedPieces, IntArray]:
-        """Pieces of some patches, given by their classes ``(s,)``, and the number of each in them.
-
-        Pieces are kept for the next samples, if they do not take too much memory.
-        """
-        if piece_levels not in self._pieces or self._pieces[piece_levels][0].byte_count > KEPT_BYTES:
-            none = np.full(len(self.classes), -1)
-            self._pieces[piece_levels] = OccupiedPieces(self.scheme, piece_levels, COLUMN_STEP), none
-        pieces, numbers = self._pieces[piece_levels]
-        with pieces.lock:
-            new = np.flatnonzero(np.bincount(class_index, minlength=len(numbers)) * (numbers < 0))
-            numbers[new] = pieces.add([self.classes[index].signature for index in new.tolist()])
-        return pieces, numbers[class_index]
-
-    @cached_property
-    def _pieces(self) -> dict[int, tuple[OccupiedPieces, IntArray]]:
-        """By their `OccupiedPieces.piece_levels`, those of classes in which samples have lain; and these' numbers."""
-        return {}
 
     def patch_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """The class, the patch in it, and which of the patch's corners it is, for some half-edges of `elements`."""

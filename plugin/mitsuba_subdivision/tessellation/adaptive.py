@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.sample_stencils import stencils_of_samples
+from ..evaluation.element import stencils_of_samples
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable

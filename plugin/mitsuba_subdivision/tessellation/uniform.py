@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.element import stencils_by_signature
 from ..evaluation.product_patch import product_patch
-from ..evaluation.sample_stencils import stencils_by_signature
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
