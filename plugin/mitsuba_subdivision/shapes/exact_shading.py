@@ -268,16 +268,25 @@ class ExactShading:
         start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
         to_world, wi = self._map, dr.detach(si.wi)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
-        location = self.kernel.line_hits(
-            hit, to_world.inverse_direction(self._direction(si, wi)), start, active
-        ).location
+        along, mirrored = self._direction(si, wi), self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
+        hits = self.kernel.line_hits(hit, to_world.inverse_direction(along), start, active)
         with dr.suspend_grad():
-            u, v = self._parameters(location, active)
+            u, v = self._parameters(hits.location, active)
         is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
-        mirrored = to_world.inverse_direction(self._direction(si, type(wi)(wi.x, wi.y, -wi.z)))
-        location = location.chosen(is_other, self.kernel.line_hits(hit, mirrored, start, is_other).location)
+        others = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_other)
+        location = hits.location.chosen(is_other, others.location)
+        if dr.grad_enabled(si.p):
+            # The hit stays on that line. Along it, the interaction's point may be that of the triangle.
+            is_held = dr.select(is_other, others.kind, hits.kind) == ON_LINE
+            location = self._following(location, si.p, dr.select(is_other, mirrored, along), is_held, active)
         value = self._attributes[name](location, active)[0]
         return self._upsampling(value) if self._upsampling and name in self._colors else value
+
+    def _following(self, location: Location, p: Vector3, d: Vector3, is_held: Mask, active: Mask) -> Location:
+        """A location with the derivatives of the hit of a line, given in the world by a point and a direction."""
+        to_world = AffineMap.of(self.to_world) if dr.grad_enabled(self.to_world) else self._map
+        lines = Lines(to_world.inverse_point(self.kernel.types.vector3(p)), to_world.inverse_direction(d), is_held)
+        return self.kernel.at(location, active, lines=lines).location
 
     def texcoords_of_corners(self, face_count: int) -> FloatArray:
         """Texture coordinates ``(3 n, 2)`` at the corners of all triangles, in their order in the mesh."""
