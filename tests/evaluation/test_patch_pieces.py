@@ -3,7 +3,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.evaluation.occupied_pieces import OccupiedPieces
+from mitsuba_subdivision.evaluation.divided_element import element_of
+from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.mesh.connectivity import Topology
@@ -30,11 +31,15 @@ def isolated(valence, corner=0):
 
 @lru_cache
 def pieces(signature, scheme=SCHEME):
-    """All pieces of an element that a few refinements separate: those in which some of many samples lie."""
-    places = (np.arange(32) + 0.5) / 32
-    uv = np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2)
-    nought, found = np.zeros(len(uv), dtype=int), OccupiedPieces.of(scheme, signature)
-    return [found.piece(part) for part in np.unique(found.locate(nought, uv, nought))]
+    """All pieces of an element."""
+    element = element_of(scheme, signature)
+    if element.piece is not None:
+        return [element.piece]
+    return [
+        piece.inside(domain, stencils)
+        for domain, (child, stencils) in zip(element.domains, element.children, strict=True)
+        for piece in pieces(child.signature, scheme)
+    ]
 
 
 def all_signatures():
@@ -176,7 +181,7 @@ class NeverIsolates(CatmullClark):
 
 def test_scheme_that_isolates_nothing_is_refused():
     with pytest.raises(SchemeError, match="catmull_clark: refinement leaves a face with fans"):
-        pieces(Signature("face", ((5,) * 3,) * 5), NeverIsolates())
+        element_stencils(NeverIsolates(), Signature("face", ((5,) * 3,) * 5), np.zeros((1, 2)))
 
 
 def test_refined_children_run_the_rules_of_the_scheme():

@@ -7,11 +7,10 @@ import pytest
 from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.evaluation import sample_stencils as module
 from mitsuba_subdivision.evaluation.divided_element import element_of
-from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.evaluation.element import element_stencils, stencils_by_signature, stencils_of_samples
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.element import stencils_by_signature
+from mitsuba_subdivision.evaluation.sample_weights import LocatedSamples
 from mitsuba_subdivision.schemes import SchemeError
 from reference.refined_cages import tagged
 
@@ -38,19 +37,12 @@ def grid(scheme, rate):
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 4, 7])
-def test_stencils_of_all_signatures_are_those_of_each(name, rate, np_rng):
+def test_stencils_of_all_signatures_are_those_of_each(name, rate):
     scheme, signatures = classes(surface_named(name))
     uv = grid(scheme, rate)
     for signature, found in zip(signatures, stencils_by_signature(scheme, signatures, uv), strict=True):
         expected = element_stencils(scheme, signature, uv)
-        np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=ROUNDED)
-        tangents = [found[1:], expected[1:]]
-        if name.endswith(HIGH_VALENCE):
-            # Others of the same plane, beside the point and at it.
-            points = np_rng.standard_normal((found.shape[2], 3))
-            normals = [np.cross(*(each @ points)) for each in tangents]
-            tangents = [each / np.linalg.norm(each, axis=1)[:, None] for each in normals]
-        np.testing.assert_allclose(*tangents, rtol=0, atol=ROUNDED * np.abs(tangents[1]).max())
+        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDED * np.abs(expected).max())
         np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
 
 
@@ -69,15 +61,15 @@ def test_samples_in_equal_parts_go_on_as_one():
     scheme, signatures = classes(surface)
     uv = grid(scheme, 8)
     elements = [element_of(scheme, each) for each in signatures]
-    element = np.repeat(np.arange(len(elements)), len(uv))
-    depths = module._depths(scheme, elements, element, np.tile(uv, (len(elements), 1)))
-    for depth in depths:
-        element = np.repeat(np.arange(len(depth.elements)), np.diff(depth.first))
-        rows = np.column_stack([element, depth.uv])
-        assert len(np.unique(rows, axis=0)) == len(rows)
-        assert len(set(depth.elements)) == len(depth.elements)
+    every = scheme, elements, np.repeat(np.arange(len(elements)), len(uv)), np.tile(uv, (len(elements), 1))
+    corner = np.zeros(len(every[2]), dtype=np.int64)
+    apart, merged = (LocatedSamples(*every, corner, merge=merge) for merge in (False, True))
+    counts = [sum(len(leaves.uv) for leaves in each.leaves) for each in (apart, merged)]
+    assert counts[0] == len(corner)
     # Many of those that were asked for lie beside each other along the same crease.
-    assert 4 * len(depths[3].uv) < len(depths[0].uv)
+    assert 2 * counts[1] < counts[0]
+    np.testing.assert_array_equal(merged.leaf_uv, apart.leaf_uv)
+    np.testing.assert_array_equal(merged.jacobian, apart.jacobian)
 
 
 def test_small_stencils_are_kept_and_large_ones_are_not():
@@ -109,6 +101,6 @@ def test_elements_may_have_samples_of_their_own():
     surface = LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING]))
     scheme, signatures = classes(surface)
     uv = [grid(scheme, rate) for rate in range(1, len(signatures) + 1)]
-    found = module.stencils_of_samples(scheme, signatures, [len(own) for own in uv], np.concatenate(uv))
+    found = stencils_of_samples(scheme, signatures, [len(own) for own in uv], np.concatenate(uv))
     for own, signature, stencils in zip(uv, signatures, found, strict=True):
         np.testing.assert_allclose(stencils, stencils_by_signature(scheme, [signature], own)[0], rtol=0, atol=1e-14)

@@ -3,15 +3,10 @@ from itertools import product
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
-from mitsuba_subdivision.mesh import one_ring as one_ring_module
-from mitsuba_subdivision.mesh.connectivity import VertexRule
-from mitsuba_subdivision.mesh.one_ring import FEW_ELEMENTS, LongRing, one_ring
+from mitsuba_subdivision.mesh.one_ring import FEW_ELEMENTS, one_ring
 from mitsuba_subdivision.mesh.signature import (
-    NEAR_FACES,
     Signature,
-    TaggedFan,
     fan_half_edges,
-    fan_points,
     half_edges_around,
     signature_at,
 )
@@ -264,29 +259,3 @@ def test_a_face_is_named_by_the_first_walk_that_arrives_there():
     below, right = (list(ring.topology.face_vertices.reshape(-1, 4)[face]) for face in (3, 5))
     assert {0, 1} <= {*below}
     assert {1, 2} <= {*right}
-
-
-@pytest.mark.parametrize("rule", [VertexRule.AUTOMATIC, VertexRule.DART])
-@pytest.mark.parametrize("behind", [1, 2, 3, 30, NEAR_FACES])
-@pytest.mark.parametrize("rest", [((4,) * 4, (4,) * 3, (4,) * 5), ((4, 4), (4,) * 5, (4, 4))])
-def test_a_long_fan_is_unfolded_as_its_window_and_then_the_rest(rule, behind, rest, monkeypatch):
-    beyond = (3, 4, 5) * NEAR_FACES
-    fan = TaggedFan((4, 4, 4, *beyond[:NEAR_FACES]), (4, 4, *beyond)[:behind], rule)
-    for corner in range(4):
-        signature = Signature("face", (fan, *rest)).rotated(corner)
-        ring = one_ring(signature)
-        assert isinstance(ring, LongRing)
-        assert signature_at(ring.topology, 0, "face") == signature
-        every = np.arange(ring.vertex_count)
-        np.testing.assert_array_equal(ring.gather(ring.topology, np.zeros(1, dtype=np.int32))[0], every)
-        np.testing.assert_array_equal(ring.topology.face_vertices[:4], every[:4])
-        around = half_edges_around([fan_half_edges(ring.topology, 0, "face")[-corner % 4]])
-        np.testing.assert_array_equal(fan_points(ring.topology, around.tolist())[0], ring.ring)
-        with monkeypatch.context() as patch:
-            patch.setattr(one_ring_module, "long_fan", lambda _: None)
-            unfolded = one_ring.__wrapped__(signature)
-        assert len(unfolded.topology.face_sizes) == len(ring.topology.face_sizes)
-        there = unfolded.gather(ring.topology, np.zeros(1, dtype=np.int32))[0]
-        np.testing.assert_array_equal(np.sort(there), every)
-        if not corner:
-            np.testing.assert_array_equal(there[unfolded.edge_neighbours()], ring.edge_neighbours())

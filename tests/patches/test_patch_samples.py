@@ -7,8 +7,7 @@ import pytest
 from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
-from mitsuba_subdivision.evaluation import element
-from mitsuba_subdivision.patches import patch_samples, patch_table
+from mitsuba_subdivision.patches import patch_samples
 from patches.closed_cages import bumpy, cage_of
 
 pytestmark = pytest.mark.core
@@ -64,18 +63,11 @@ def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
         close(found.p, expected.p[chosen], size)
         close(found.n, expected.n[chosen], 1, NORMAL)
         np.testing.assert_array_equal(found.level, expected.level[chosen])
-    # In short runs, and with nothing kept from one to the next.
-    for module, limit, most in (
-        (patch_samples, "CHUNK", 7),
-        (patch_samples, "CLASSES", 1),
-        (element, "RUN", 5),
-        (element, "GATHERED", 3),
-        (patch_table, "KEPT_BYTES", -1),
-    ):
-        monkeypatch.setattr(module, limit, most)
-        found = surface.evaluate(*where)
-        close(found.p, expected.p, size)
-        close(found.n, expected.n, 1, NORMAL)
+    # In short runs.
+    monkeypatch.setattr(patch_samples, "WEIGHTS", 70)
+    found = surface.evaluate(*where)
+    close(found.p, expected.p, size)
+    close(found.n, expected.n, 1, NORMAL)
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])

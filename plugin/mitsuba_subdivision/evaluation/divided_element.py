@@ -33,16 +33,12 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from ..schemes.scheme_members import optional_member
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_fans import RefinedFace, child_domains, refined_element, window
-from .refined_rings import RefinedRing, RingMesh, refined_together
+from .refined_rings import RefinedRing, RingMesh, refined_ring, refined_together, ring_pattern
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 # After this many refinements an element consists of pieces.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
-# Stencils of children with more weights are not kept, but made anew: around vertices of high valence each face has its
-# own.
-KEPT_WEIGHTS = 1 << 14
 
 
 class PartKind(IntEnum):
@@ -69,7 +65,7 @@ class DividedElement:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature.smoothed).vertex_count
         self._steady = _steady_refinements(scheme, signature)
-        self._refined: RefinedRing | RefinedFace | None = None
+        self._refined: RefinedRing | None = None
         self._children: dict[int, DividedElement] = {}
         self._stencils: dict[int, FloatArray] = {}
 
@@ -101,7 +97,7 @@ class DividedElement:
         SchemeError
             If the scheme divides domains in a way of its own.
         """
-        found = child_domains(self.scheme, self.signature)
+        found = ring_pattern(self.scheme, self.signature.smoothed).domains
         expected = (IDENTITY,) if len(found) == 1 else self.scheme.domain.children
         if len(found) != len(expected) or not all(a.is_same(b) for a, b in zip(found, expected, strict=True)):
             raise SchemeError(
@@ -112,21 +108,9 @@ class DividedElement:
 
     def child(self, number: int) -> tuple[DividedElement, FloatArray]:
         """One of the children, and its control points over those of the element: ``(K_child, K)`` float64."""
-        element = self.child_element(number)
-        if number in self._stencils:
-            return element, self._stencils[number]
-        stencils = self.base._ring.stencils(number)
-        if stencils.size <= KEPT_WEIGHTS:
-            self._stencils[number] = stencils
-        return element, stencils
-
-    def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
-        """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element."""
-        ring = self.base._ring
-        # Nearly all weights of very many are zero.
-        if isinstance(ring, RefinedFace) or self.control_count * rows.shape[2] > KEPT_WEIGHTS:
-            return ring.over_controls(rows, number)
-        return rows @ self.child(number)[1]
+        if number not in self._stencils:
+            self._stencils[number] = self.base._ring.stencils(number)
+        return self.child_element(number), self._stencils[number]
 
     def child_element(self, number: int) -> DividedElement:
         """One of the children."""
@@ -151,10 +135,10 @@ class DividedElement:
         return element_of(self.scheme, self.signature.sharpened(-self._steady)) if self._steady else self
 
     @property
-    def _ring(self) -> RefinedRing | RefinedFace:
+    def _ring(self) -> RefinedRing:
         """The refined one-ring."""
         if self._refined is None:
-            self._refined = refined_element(self.scheme, self.signature)
+            self._refined = RefinedRing(refined_ring(self.scheme, self.signature), 0)
         return self._refined
 
     @cached_property
@@ -247,7 +231,7 @@ class DividedElement:
             rows = known[child]
             begin, end = end, end + len(rows)
             if len(rows):
-                found[begin:end] = self.over_controls(rows, number)
+                found[begin:end] = rows @ self.child(number)[1]
         return found
 
 
@@ -286,12 +270,10 @@ def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMe
         The result of the last call, as in `refined_together`.
     """
     bases = dict.fromkeys(element.base for element in elements if element.piece is None)
-    new = [(base, window(scheme, base.signature)) for base in bases if base._refined is None]
-    found, mesh = refined_together(scheme, dict.fromkeys(near or base.signature for base, near in new), mesh)
-    for base, near in new:
-        refined = found.get(near or base.signature)
-        if refined is not None:
-            base._refined = refined if near is None else RefinedFace(scheme, base.signature, refined)
+    new = {base.signature: base for base in bases if base._refined is None}
+    found, mesh = refined_together(scheme, new, mesh)
+    for signature, refined in found.items():
+        new[signature]._refined = refined
     return mesh
 
 

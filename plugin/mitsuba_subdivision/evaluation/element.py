@@ -82,8 +82,8 @@ def evaluate_samples(
     points = [own.astype(dtype, copy=False) for own in points]
     if has_origin:
         origin = np.concatenate([own[:, 0] for own in points]).T
-        for own in points:
-            own -= own[:, :1].copy()
+        for of_element in points:
+            of_element -= of_element[:, :1].copy()
     rows = located.rows(evaluator, dtype, derivatives)
     values = _times_points(located.weights([each.rows for each in rows], power=evaluator == "power"), points)
     curvature = np.full((2, count), np.nan, dtype=dtype)

@@ -11,11 +11,10 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature, TaggedFan
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from ..schemes.stencil_table import StencilTable
 from .bernstein import regular_bernstein
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .equations import (
@@ -30,15 +29,6 @@ from .equations import (
     stam_rows,
     times_powers,
 )
-from .ring_symmetry import (
-    LEADING,
-    fan_eigenbasis,
-    fan_ring,
-    leading_of_fan,
-    leading_of_symmetric,
-    ring_orbits,
-    symmetric_eigenbasis,
-)
 from .tangent_frame import limit_frame, uneven_frame
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
@@ -46,22 +36,8 @@ PARALLEL = 1e-6
 # Eigenvalues of Jordan blocks are at most a half, times some rounding: after so many levels their powers are below all
 # before.
 GROWING_LEVELS = 16
-# Control points from which on a product with sparse stencils takes less time than a dense one.
-MANY_CONTROLS = 256
 # Single precision does not distinguish points as near as this, in parameters and sizes of the patch, from the point.
 FLOAT32_SIZE = 2.0**-24
-
-
-class SharedLimit:
-    """The limit at a point that many faces have in common, once it has been found for one of them.
-
-    Attributes
-    ----------
-    of_ring : ((3, r) float64, (2, r) float64), or None
-        `IrregularPatch.limit_in_ring` over the points of the ring, in the order of `fan_ring`.
-    """
-
-    of_ring: tuple[FloatArray, FloatArray] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +50,7 @@ class IrregularStructure:
         Of the one-ring; child 0 has the same.
     slots : (K,) int64
         The vertices of the one-ring that are control points: all of them, but at a dart one that equals another.
-    table : StencilTable
+    matrix : (K, K) float64
         A: control points of child 0 from those of the parent.
     children : (3, R, K) float64
         P_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's lattice.
@@ -82,23 +58,8 @@ class IrregularStructure:
 
     signature: Signature
     slots: IntArray
-    table: StencilTable
+    matrix: FloatArray
     children: FloatArray
-
-    @property
-    def shared_limit(self) -> SharedLimit | None:
-        """The limit at the point, if others have the same."""
-        return None
-
-    @property
-    def matrix(self) -> FloatArray:
-        """``(K, K)`` float64, A: made anew, as each face beside a border has its own, and nearly all of it is zero."""
-        return self.table.dense(np.arange(self.table.row_count))
-
-    def order_of(self, ring: IntArray) -> IntArray:
-        """Control points at some vertices of the one-ring."""
-        # At a dart, one of the vertices is no control point, as it equals another.
-        return np.searchsorted(self.slots, ring[np.isin(ring, self.slots)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,15 +85,19 @@ class IrregularPatch:
         SchemeError
             If the rules do not contract the one-ring to a point.
         """
+        structure = self.structure
         try:
-            return _oriented(self.scheme, self.structure, _basis(self.structure))
+            found = eigenbasis(structure.matrix)
         except EigenbasisError as error:
-            raise _no_basis(self.scheme, self.structure, error) from error
+            ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
+            raise SchemeError(f"{self.scheme.name}: subdivision matrix of {ring}: {error}") from error
+        jacobian = characteristic_jacobian(self.scheme, structure.children, found.vectors)
+        return found.turned_over() if jacobian < 0 else found
 
     @cached_property
     def eigen_children(self) -> FloatArray:
         """``(3, R, K)`` float64, ``P_k Ā V``: control points of the regular children of each eigenvector."""
-        return _times_sparse(self.structure.children, self.basis.vectors)
+        return self.structure.children @ self.basis.vectors
 
     @cached_property
     def limit_frame(self) -> FloatArray:
@@ -159,43 +124,6 @@ class IrregularPatch:
         tangents[:, 1:3] = ends
         return tangents
 
-    @cached_property
-    def limit_in_ring(self) -> tuple[FloatArray, FloatArray] | None:
-        """The point and the `limit_frame` as weights of control points, without the `basis`.
-
-        Returns
-        -------
-        stencils : (3, K) float64
-        magnitude : (2, K) float64
-            Absolute weights that the frame is a sum of.
-        None if the valence is small, and at corners amid faces.
-        """
-        shared = self.structure.shared_limit
-        if shared is None or (ring := fan_ring(self.structure.signature)) is None:
-            return self._own_limit()
-        order = self.structure.order_of(ring)
-        if shared.of_ring is None:
-            found = self._own_limit()
-            if found is None:
-                return None
-            shared.of_ring = found[0][:, order], found[1][:, order]
-        stencils, magnitude = np.zeros((3, len(self.structure.slots))), np.zeros((2, len(self.structure.slots)))
-        stencils[:, order], magnitude[:, order] = shared.of_ring
-        return stencils, magnitude
-
-    def _own_limit(self) -> tuple[FloatArray, FloatArray] | None:
-        """`limit_in_ring`, found for this face."""
-        try:
-            leading = _leading(self.structure)
-        except EigenbasisError as error:
-            raise _no_basis(self.scheme, self.structure, error) from error
-        if leading is None:
-            return None
-        leading = _oriented(self.scheme, self.structure, leading)
-        frame = limit_frame(self.scheme, self.structure.signature, leading)
-        stencils = np.concatenate([leading.inverse[:1], frame @ leading.inverse])
-        return stencils, np.abs(frame) @ np.abs(leading.inverse)
-
     @property
     def has_own_frame(self) -> bool:
         """Whether normals need other tangents than the derivatives: on borders, creases, and at sharp vertices."""
@@ -206,13 +134,6 @@ class IrregularPatch:
     def contracts_unevenly(self) -> bool:
         """Whether one direction contracts more slowly than all others, as on borders."""
         return self.basis.moduli[2] < self.basis.moduli[1] * (1 - CLUSTER_WIDTH)
-
-    def regular_child(self, number: int, level: int) -> FloatArray:
-        """``(R, K)`` control points of a regular child at a level, ``P_k Ā Aⁿ``, without the `basis`."""
-        found, step = self.structure.children[number - 1].T, self.structure.table.matrix.T
-        for _ in range(level):
-            found = step @ found
-        return found.T
 
     def coordinates(self, control_points: FloatArray, evaluator: Evaluator) -> FloatArray:
         """The factors of `rows`: control points C of ``(.., K, 3)``, or their eigen-coordinates ``V⁻¹ C``."""
@@ -284,54 +205,9 @@ def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularP
         If the rules do not contract the one-ring to a point.
     """
     patch = IrregularPatch(scheme, structure)
-    if patch.limit_in_ring is None:
-        # Raises if there is none.
-        _ = patch.basis
+    # Raises if there is none.
+    _ = patch.basis
     return patch
-
-
-def _oriented(scheme: Scheme, structure: IrregularStructure, basis: Eigenbasis) -> Eigenbasis:
-    """Give the eigenvectors the sign with which the normal of (13) is along the cross product of its tangents."""
-    return basis.turned_over() if characteristic_jacobian(scheme, structure.children, basis.vectors) < 0 else basis
-
-
-def _no_basis(scheme: Scheme, structure: IrregularStructure, error: EigenbasisError) -> SchemeError:
-    ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
-    return SchemeError(f"{scheme.name}: subdivision matrix of {ring}: {error}")
-
-
-def _times_sparse(stencils: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Stencils ``(n, R, K)``, most of whose weights are zero, times ``(K, K)``."""
-    if len(vectors) < MANY_CONTROLS:
-        return stencils @ vectors
-    # A first picture needs no SciPy.
-    from scipy import sparse
-
-    return (sparse.csr_array(stencils.reshape(-1, len(vectors))) @ vectors).reshape(stencils.shape)
-
-
-def _basis(structure: IrregularStructure) -> Eigenbasis:
-    """The eigenbasis, by the symmetry or the ring of a high valence if there is one."""
-    found = None
-    if (orbits := ring_orbits(structure.signature)) is not None:
-        found = symmetric_eigenbasis(structure.table.matrix, orbits)
-    elif (ring := fan_ring(structure.signature)) is not None:
-        found = fan_eigenbasis(structure.matrix, structure.order_of(ring))
-    return eigenbasis(structure.matrix) if found is None else found
-
-
-def _leading(structure: IrregularStructure) -> Eigenbasis | None:
-    """The part of the `_basis` that matters at the point, if the valence is high."""
-    fan = structure.signature.fans[0]
-    rule = fan.rule if isinstance(fan, TaggedFan) else VertexRule.AUTOMATIC
-    if (orbits := ring_orbits(structure.signature)) is not None:
-        # At a corner, the frame is made of all eigenvectors.
-        return None if rule == VertexRule.CORNER else leading_of_symmetric(structure.table.matrix, orbits)
-    if (ring := fan_ring(structure.signature)) is None:
-        return None
-    order = structure.order_of(ring)
-    # Frames are made of three eigenvectors where a crease ends, and of all elsewhere.
-    return leading_of_fan(structure.table.matrix, order, LEADING if rule == VertexRule.DART else len(order))
 
 
 @lru_cache(maxsize=4096)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +14,8 @@ from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from ..schemes.scheme_members import optional_member
-from ..schemes.stencil_table import StencilTable
-from .irregular_patch import IrregularPatch, IrregularStructure, SharedLimit, irregular_patch
-from .refined_fans import RefinedFace, child_domains, refined_element
-from .refined_rings import RefinedRing
+from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
+from .refined_rings import RefinedRing, refined_ring, ring_pattern
 
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
@@ -33,18 +30,15 @@ class Piece:
     ----------
     domain : AffineMap
         From the element's parameters to the piece's own, which have the extraordinary point at (0, 0).
-    weights : (K_piece, K) float64, or (K_piece,) int64
-        The piece's control points over the element's one-ring; or which of the element's control points they are.
+    stencils : (K_piece, K) float64
+        The piece's control points over the element's one-ring.
     patch : IrregularPatch or None
         None for a regular piece, whose control points are in the order of the scheme's lattice.
-    control_count : int
-        K.
     """
 
     domain: AffineMap
-    weights: NDArray[Any]
+    stencils: FloatArray
     patch: IrregularPatch | None
-    control_count: int
 
     @property
     def irregular_patch(self) -> IrregularPatch:
@@ -53,39 +47,15 @@ class Piece:
             raise ValueError("a regular piece; expected one with an extraordinary point")
         return self.patch
 
-    @property
-    def stencils(self) -> FloatArray:
-        """``(K_piece, K)`` control points over the element's one-ring."""
-        return self.weights if self.weights.ndim == 2 else self.scattered(np.eye(len(self.weights)))
-
-    @property
+    @cached_property
     def absolute_sums(self) -> FloatArray:
         """``(K_piece,)`` sums of the absolute weights of each control point."""
-        return np.ones(len(self.weights)) if self.weights.ndim == 1 else np.abs(self.weights).sum(axis=1)
-
-    @property
-    def coordinates(self) -> FloatArray:
-        """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
-        return self._coordinates
+        return np.abs(self.stencils).sum(axis=1)
 
     @cached_property
-    def _coordinates(self) -> FloatArray:
-        inverse = self.irregular_patch.basis.inverse
-        return self.scattered(inverse) if self.weights.ndim == 1 else inverse @ self.weights
-
-    def over_controls(self, rows: FloatArray) -> FloatArray:
-        """Rows over the piece's eigen-coordinates, or its control points if it is regular, as weights ``(.., K)``."""
-        if self.weights.ndim == 1:
-            return self.scattered(rows @ self.irregular_patch.basis.inverse)
-        return rows @ (self.weights if self.patch is None else self._coordinates)
-
-    def scattered(self, weights: FloatArray) -> FloatArray:
-        """Weights ``(.., K_piece)`` over the piece's control points, as weights ``(.., K)``."""
-        if self.weights.ndim == 2:
-            return weights @ self.weights
-        found = np.zeros((*weights.shape[:-1], self.control_count))
-        found[..., self.weights] = weights
-        return found
+    def coordinates(self) -> FloatArray:
+        """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
+        return self.irregular_patch.basis.inverse @ self.stencils
 
     def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
         """The same piece as a part of a larger element.
@@ -97,8 +67,7 @@ class Piece:
         stencils : (K, K_larger) float64
             The element's control points over the larger element's one-ring.
         """
-        weights = stencils[self.weights] if self.weights.ndim == 1 else self.weights @ stencils
-        return Piece(self.domain @ domain, weights, self.patch, stencils.shape[1])
+        return Piece(self.domain @ domain, self.stencils @ stencils, self.patch)
 
 
 @lru_cache(maxsize=4096)
@@ -109,14 +78,14 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
         return None
     lattice = lattice_stencils(scheme, signature)
     if lattice is not None:
-        return Piece(IDENTITY, lattice, None, lattice.shape[1])
+        return Piece(IDENTITY, lattice, None)
     for corner in range(rotation_count(scheme, signature)):
         structure = irregular_structure(scheme, signature.rotated(corner))
         if structure is not None:
             order = rotation_order(signature, corner)
             turned = scheme.domain.rotation(corner).inverse()
             patch = irregular_patch(scheme, structure)
-            return Piece(turned, order[structure.slots], patch, len(order))
+            return Piece(turned, np.eye(len(order))[order[structure.slots]], patch)
     return None
 
 
@@ -172,90 +141,24 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     # Its other corners are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
         return None
-    if len(child_domains(scheme, signature)) != len(scheme.domain.children):
+    if len(ring_pattern(scheme, signature.smoothed).domains) != len(scheme.domain.children):
         return None
-    rings = refined_element(scheme, signature)
-    if rings.signature(0) != signature:
+    ring = RefinedRing(refined_ring(scheme, signature), 0)
+    if ring.signature(0) != signature:
         return None
-    lattices = []
-    for number in range(1, len(scheme.domain.children)):
-        lattice = lattice_stencils(scheme, rings.signature(number))
-        if lattice is None:
-            return None
-        lattices.append(lattice)
-    children = _RegularChildren(signature, rings, lattices)
-    if isinstance(rings, RefinedFace):
-        return SharedStructure(children, rings)
-    return IrregularStructure(signature, children.slots, children.table, children.stencils)
-
-
-class _RegularChildren:
-    """What `IrregularStructure` has of a refined one-ring.
-
-    Parameters
-    ----------
-    signature : Signature
-    rings : RefinedRing or RefinedFace
-    lattices : list of (R, K_child) float64
-        `lattice_stencils` of the regular children.
-    """
-
-    def __init__(self, signature: Signature, rings: RefinedRing | RefinedFace, lattices: list[FloatArray]) -> None:
-        self.signature, self._rings, self._lattices = signature, rings, lattices
-        self._merged = _merged_slots(signature)
-        self.slots = np.arange(one_ring(signature.smoothed).vertex_count)
-        if self._merged is not None:
-            self.slots = np.delete(self.slots, self._merged[1])
-
-    @property
-    def stencils(self) -> FloatArray:
-        lattices = enumerate(self._lattices, start=1)
-        found = np.stack([lattice @ self._rings.stencils(number) for number, lattice in lattices])
-        if self._merged is None:
-            return found
-        kept, dropped = self._merged
-        found[..., kept] += found[..., dropped]
-        return found[..., self.slots]
-
-    @property
-    def table(self) -> StencilTable:
-        found, slots = self._rings.table(0), self.slots
-        if self._merged is None:
-            return found
-        kept, dropped = self._merged
-        number_of = np.searchsorted(slots, np.arange(found.row_count))
-        columns = number_of[np.where(found.columns == dropped, kept, found.columns)]
-        own = found.rows != dropped
-        return StencilTable(len(slots), len(slots), number_of[found.rows[own]], columns[own], found.weights[own])
-
-
-class SharedStructure(IrregularStructure):
-    """Subdivision matrices of a face at a large fan that is refined for all faces together.
-
-    They are made anew each time: kept, those of all faces would take memory that grows with the square of their number.
-
-    Parameters
-    ----------
-    children : _RegularChildren
-    rings : RefinedFace
-    """
-
-    def __init__(self, children: _RegularChildren, rings: RefinedFace) -> None:
-        vars(self).update(signature=children.signature, slots=children.slots)
-        self._children, self._rings = children, rings
-
-    @property
-    def table(self) -> StencilTable:
-        return self._children.table
-
-    @property
-    def children(self) -> FloatArray:
-        return self._children.stencils
-
-    @property
-    def shared_limit(self) -> SharedLimit | None:
-        fan = self.signature.fans[0]
-        return self._rings.limit if isinstance(fan, TaggedFan) and fan.rule == VertexRule.DART else None
+    lattices = [lattice_stencils(scheme, ring.signature(k)) for k in range(1, len(scheme.domain.children))]
+    if any(lattice is None for lattice in lattices):
+        return None
+    matrix = ring.stencils(0)
+    children = np.stack([lattice @ ring.stencils(k) for k, lattice in enumerate(lattices, start=1)])
+    slots = np.arange(len(matrix))
+    if (merged := _merged_slots(signature)) is not None:
+        kept, dropped = merged
+        slots = np.delete(slots, dropped)
+        for columns in (matrix, children):
+            columns[..., kept] += columns[..., dropped]
+        matrix, children = matrix[np.ix_(slots, slots)], children[..., slots]
+    return IrregularStructure(signature, slots, matrix, children)
 
 
 def _merged_slots(signature: Signature) -> tuple[int, int] | None:

@@ -197,7 +197,7 @@ def _tips(element: DividedElement, piece_levels: int) -> list[_Tip]:
     if element.piece is not None:
         return [] if element.piece.patch is None else [_tip(element.scheme, element.piece, piece_levels)]
     return [
-        tip._replace(rows=element.over_controls(tip.rows, number))
+        tip._replace(rows=tip.rows @ element.child(number)[1])
         for number, child in enumerate(element.child_elements)
         if child.tip_count
         for tip in _tips(child, piece_levels)

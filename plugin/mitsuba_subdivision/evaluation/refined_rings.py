@@ -52,18 +52,6 @@ class RefinedRing(NamedTuple):
         """Control points of a child over those of the element, ``(K_child, K)``."""
         return self.rings.stencils(self.ring, number)
 
-    def table(self, number: int) -> StencilTable:
-        """`stencils` of a child of an element that was refined alone."""
-        return self.rings.table(number)
-
-    def over_controls(self, rows: FloatArray, number: int) -> FloatArray:
-        """Weights ``(n, s, K_child)`` over the control points of a child, as weights over those of the element.
-
-        The element must have been refined alone, as those of very many control points are.
-        """
-        found = self.rings.table(number).matrix.T @ rows.reshape(-1, rows.shape[2]).T
-        return found.T.reshape(*rows.shape[:2], -1)
-
 
 class RingPattern:
     """The refinement of a one-ring without its semi-sharp features.
@@ -92,15 +80,6 @@ class RingPattern:
         self.domains = tuple(domain for domain, _ in children)
         self.half_edges = [half_edge for _, half_edge in children]
         self._children: dict[int, tuple[Signature, IndexArray, IndexArray]] = {}
-        if self.is_large:
-            # Most refined vertices lie around, in no child.
-            vertices = np.concatenate([self.child(number)[1] for number in range(len(self.domains))])
-            self.refinement = self.refinement._replace(stencils=self.refinement.stencils.only(vertices))
-
-    @property
-    def is_large(self) -> bool:
-        """Whether one-rings have so many control points that they are refined alone."""
-        return one_ring(self.smooth).vertex_count > MOST_CONTROLS_TOGETHER
 
     def child(self, number: int) -> tuple[Signature, IndexArray, IndexArray]:
         """Signature, control points and half-edges of a child in the refined one-ring.
@@ -156,15 +135,6 @@ class RefinedRings:
         self._stencils, self._rows_sum_to_one = stencils, rows_sum_to_one
         # By the numbers of the children.
         self._sharpness: dict[int, FanSharpnessRows] = {}
-        self._tables: dict[int, StencilTable] = {}
-        self._signatures: dict[int, Signature] = {}
-
-    def keep_children(self) -> None:
-        """Find all children of an element that was refined alone, and drop the rest, which takes far more memory."""
-        for number in range(len(self._pattern.domains)):
-            self._signatures[number], _ = self.signature(0, number), self.table(number)
-        self._sharpness.clear()
-        del self._topology, self._half_edges, self._stencils
 
     def child(self, ring: int, number: int) -> tuple[Signature, FloatArray]:
         """`signature` and `stencils` of a child of one of the elements."""
@@ -172,8 +142,6 @@ class RefinedRings:
 
     def signature(self, ring: int, number: int) -> Signature:
         """Signature of a child of one of the elements."""
-        if number in self._signatures:
-            return self._signatures[number]
         signature, _, around = self._pattern.child(number)
         semi = self._topology.semi_sharpness
         if semi is None:
@@ -190,23 +158,14 @@ class RefinedRings:
         SchemeError
             If weights of a control point do not sum to one.
         """
-        if number in self._tables or isinstance(self._stencils, StencilTable):
-            return self.table(number).dense(np.arange(self.table(number).row_count))
-        stencils = self._stencils[ring, self._pattern.child(number)[1]]
+        vertices = self._pattern.child(number)[1]
+        if isinstance(self._stencils, StencilTable):
+            stencils = self._stencils.dense(vertices)
+        else:
+            stencils = self._stencils[ring, vertices]
         if not self._rows_sum_to_one:
             _require_rows_to_one(self._pattern, stencils.sum(axis=1))
         return stencils
-
-    def table(self, number: int) -> StencilTable:
-        """`stencils` of a child of an element that was refined alone."""
-        if number not in self._tables:
-            if not isinstance(self._stencils, StencilTable):
-                raise TypeError("one-rings that were refined together; expected one refined alone")
-            found = self._stencils.chosen(self._pattern.child(number)[1])
-            sums = np.bincount(found.rows, found.weights, minlength=found.row_count)
-            _require_rows_to_one(self._pattern, sums.astype(np.float64))
-            self._tables[number] = found
-        return self._tables[number]
 
 
 @lru_cache(maxsize=1024)
@@ -219,10 +178,7 @@ def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRings:
         # Connectivity is computed once for all that differ in semi-sharp features only.
         topology = topology.with_rules(refined.rules, refined.semi_sharpness)
     half_edges = np.arange(topology.half_edge_count, dtype=np.int32)[None]
-    found = RefinedRings(pattern, topology, half_edges, stencils, False)
-    if pattern.is_large:
-        found.keep_children()
-    return found
+    return RefinedRings(pattern, topology, half_edges, stencils, False)
 
 
 def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:

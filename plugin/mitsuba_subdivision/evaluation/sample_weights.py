@@ -37,8 +37,8 @@ class _Depth:
 
     elements: list[DividedElement]
     first: IntArray  # (n + 1,) the first sample of each element; then the number of samples
-    # Samples in the same child of an element, for all but those in leaves: the element, the child's number, the samples;
-    # the child's index among the elements of the next depth, and the samples there.
+    # Samples in the same child of an element, for all but those in leaves: the element, the child's number, the
+    # samples; the child's index among the elements of the next depth, and the samples there.
     groups: list[tuple[int, int, IntArray, int, IntArray]]
 
     def samples(self, element: int) -> slice:
@@ -114,7 +114,7 @@ class LocatedSamples:
     def _descend(
         self, elements: list[DividedElement], element: IntArray, uv: FloatArray, turn: IntArray, merge: bool
     ) -> list[tuple[int, IntArray, IntArray]]:
-        """Fill the depths and the leaves; give the depth, the samples and the turns of leaves' samples, in their order."""
+        """Fill the depths and the leaves; the depth, the samples and the turns of each part of leaves, in their order."""
         scheme, domain = self.scheme, self.scheme.domain
         mesh: RingMesh | None = None
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray, FloatArray, IntArray]]] = {}
@@ -272,7 +272,7 @@ def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:
 
 
 def without_collapsed(tangents: FloatArray, magnitude: FloatArray) -> None:
-    """Set weights ``(2, s, K)`` of tangents to zero where they cancel, as on the fold between two faces back to back."""
+    """Set weights ``(2, s, K)`` of tangents to zero where they cancel, as on the fold between faces back to back."""
     tangents[np.abs(tangents).sum(axis=2) <= TANGENT_ROUNDING[64] * magnitude] = 0
 
 

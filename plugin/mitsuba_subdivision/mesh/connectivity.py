@@ -245,24 +245,6 @@ class Topology:
         return offsets, half_edges
 
     @cached_property
-    def large_fans(self) -> dict[int, tuple[list[int], bool]]:
-        """Half-edges around vertices of very many faces, counter-clockwise, and whether they go all around.
-
-        As far as `fan_half_edges` has been around.
-        """
-        return {}
-
-    @cached_property
-    def long_fan_rings(self) -> dict[int, IntArray]:
-        """`fan_points` of fans that are not closed, by their most clockwise half-edge, as far as they were needed."""
-        return {}
-
-    @cached_property
-    def large_fan_signatures(self) -> dict[int, Any]:
-        """The `Signature` of such a vertex, as far as `signature_at` has needed it."""
-        return {}
-
-    @cached_property
     def vertex_rules(self) -> NDArray[np.int8]:
         """``(n_v,)`` a `VertexRule` for each vertex."""
         return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules

@@ -20,7 +20,6 @@ from .connectivity import IntArray, Topology
 from .glued_faces import GluedFaces
 from .semi_sharpness import SemiSharpness
 from .signature import (
-    BESIDE,
     NEAR_FACES,
     ElementKind,
     FanHalfEdges,
@@ -28,10 +27,7 @@ from .signature import (
     TaggedFan,
     fan_face_count,
     fan_half_edges,
-    fan_points,
     half_edges_around,
-    long_fan,
-    window_of,
 )
 
 # Elements up to which walks around one after the other take less time than steps of all together.
@@ -65,10 +61,6 @@ class OneRing:
     def vertex_count(self) -> int:
         """K, the number of control points."""
         return len(self.slots)
-
-    def with_sharpness(self, signature: Signature) -> OneRing:
-        """The one-ring of a signature that differs from this one's in its semi-sharp features."""
-        return replace(self, topology=_with_sharpness(self.topology, signature))
 
     def edge_neighbours(self) -> list[int]:
         """Neighbours of the first vertex along edges, counter-clockwise, from border to border if it is on one."""
@@ -162,108 +154,6 @@ class OneRing:
                 topology.face_vertices.take(current, out=columns[slot], mode="clip")
 
 
-class LongRing(OneRing):
-    """The one-ring of a face at a long fan (`long_fan`): that of its window, and after it the rest of the fan's points.
-
-    Each face of the fan has one, and only its window is unfolded.
-
-    Parameters
-    ----------
-    signature : Signature
-        Without semi-sharp features.
-    corner : int
-        Of the fan.
-
-    Attributes
-    ----------
-    corner : int
-    near : OneRing
-        Of the window.
-    ring : (r,) int64
-        The fan's ring, as `fan_points` has it: from border to border, for all faces alike.
-    """
-
-    def __init__(self, signature: Signature, corner: int) -> None:
-        fan = signature.fans[corner]
-        if not isinstance(fan, TaggedFan):
-            raise TypeError("a closed fan; expected a long one between two borders")
-        fans = list(signature.fans)
-        fans[corner] = window_of(fan)
-        self._fan, self.corner = fan, corner
-        self.near, self._own, of_window = _window_ring(Signature("face", tuple(fans)), corner)
-        counts = np.array(fan.behind[::-1] + fan.ahead) - 2
-        self._first = len(fan.behind[BESIDE:])
-        self._end = self._first + fan_face_count(fans[corner])
-        # Points of the ring before those of the window, and after these.
-        self._before, self._after = int(counts[: self._first].sum()), int(counts[self._end :].sum())
-        count = self.near.vertex_count
-        before, after = count + np.arange(self._before), count + self._before + np.arange(self._after)
-        self.ring: IntArray = np.concatenate([of_window[:1], before, of_window[1:], after])
-
-    @property
-    def vertex_count(self) -> int:
-        return self.near.vertex_count + self._before + self._after
-
-    @cached_property
-    def topology(self) -> Topology:
-        near, sizes = self.near.topology, np.array(self._fan.behind[::-1] + self._fan.ahead)
-        begins = 1 + ragged.starts(sizes - 2)
-        faces = np.delete(np.arange(len(sizes)), slice(self._first, self._end))
-        face, steps = np.repeat(faces, sizes[faces]), ragged.index_in_row(sizes[faces])
-        polygons = self.ring[np.where(steps == 0, 0, begins[face] + steps - 1)]
-        # The last edge of a face of the fan is the first one of the next.
-        first = np.empty(len(sizes), dtype=np.int64)
-        first[faces] = near.half_edge_count + ragged.starts(sizes[faces])
-        first[self._first : self._end] = self._own
-        last = first + sizes - 1
-        last[self._first : self._end] = near.preceding(first[self._first : self._end])
-        names = np.concatenate([near.edge_names, near.half_edge_count + np.arange(len(polygons))])
-        names[first[1:]] = names[last[:-1]]
-        rules = np.zeros(self.vertex_count, dtype=np.int8)
-        rules[: near.vertex_count] = near.vertex_rules
-        rules[self.ring[0]] = self._fan.rule
-        every = np.concatenate([near.face_sizes, sizes[faces]]), np.concatenate([near.face_vertices, polygons])
-        return Topology(self.vertex_count, *every, names, rules)
-
-    def edge_neighbours(self) -> list[int]:
-        if self.corner:
-            return super().edge_neighbours()
-        begins = 1 + ragged.starts(np.array(self._fan.behind[::-1] + self._fan.ahead) - 2)
-        return self.ring[np.append(begins, -1)].tolist()
-
-    def with_sharpness(self, signature: Signature) -> OneRing:
-        same = LongRing(signature.smoothed, self.corner)
-        vars(same)["topology"] = _with_sharpness(self.topology, signature)
-        return same
-
-    def gather(
-        self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32] | None = None
-    ) -> NDArray[np.int32]:
-        if columns is None:
-            columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        for number, half_edge in enumerate(half_edges.tolist()):
-            columns[:, number] = self.vertices_around(topology, fan_half_edges(topology, half_edge, "face"))
-        return columns.T
-
-    def vertices_around(self, topology: Topology, fans: list[FanHalfEdges]) -> NDArray[np.int32]:
-        behind, ahead = fans[self.corner]
-        near, first = fans.copy(), behind[-1] if behind else ahead[0]
-        if first not in topology.long_fan_rings:
-            topology.long_fan_rings[first], _ = fan_points(topology, behind[::-1] + ahead)
-        ring = topology.long_fan_rings[first]
-        near[self.corner] = behind[:BESIDE], ahead[: 1 + BESIDE]
-        rest = ring[1 : 1 + self._before], ring[len(ring) - self._after :]
-        return np.concatenate([self.near.vertices_around(topology, near), *rest])
-
-
-@lru_cache(maxsize=1024)
-def _window_ring(signature: Signature, corner: int) -> tuple[OneRing, list[int], IntArray]:
-    """The one-ring of a window, and in it the half-edges of the fan at a corner, and the ring there."""
-    near = one_ring(signature)
-    around = half_edges_around([fan_half_edges(near.topology, 0, "face")[corner]]).tolist()
-    return near, around, fan_points(near.topology, around)[0]
-
-
 def _slots_by_face(slots: tuple[tuple[int, int], ...]) -> list[list[int]]:
     """Local vertices grouped by the local face that leads to them, in order of their steps along it."""
     groups: dict[int, list[int]] = {}
@@ -281,9 +171,8 @@ def one_ring(signature: Signature) -> OneRing:
     """
     smooth = signature.smoothed
     if smooth != signature:
-        return one_ring(smooth).with_sharpness(signature)
-    if (corner := long_fan(signature)) is not None:
-        return LongRing(signature, corner)
+        ring = one_ring(smooth)
+        return replace(ring, topology=_with_sharpness(ring.topology, signature))
     glued = GluedFaces(signature)
     half_edges = [glued.half_edges(face) for face in glued.faces]
     sizes = np.array([len(own) for own in half_edges])

@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from . import ragged
 from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
 from .semi_sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
 
@@ -24,11 +23,6 @@ Number = TypeVar("Number", int, IntArray)
 
 # Faces of a fan between two borders that matter to any one of them, see `TaggedFan.near`.
 NEAR_FACES = 64
-# Fans of so many faces are walked around once for all of these.
-LARGE_FAN = 32
-# Faces on each side of an element in the *window* of a fan: no refined vertex of the element's children depends on
-# others, but for the vertex of the fan and those around it.
-BESIDE = 2
 
 
 class TaggedFan(NamedTuple):
@@ -101,55 +95,6 @@ def fan_size(fan: Fan, turns: int) -> int:
     if isinstance(fan, TaggedFan):
         return fan.ahead[turns] if turns >= 0 else fan.behind[-1 - turns]
     return fan[turns]
-
-
-def window_of(fan: Fan) -> TaggedFan:
-    """A large fan cut down to the faces beside an element, whose outer edges become borders."""
-    if not isinstance(fan, TaggedFan):
-        return TaggedFan(fan[: 1 + BESIDE], fan[: -1 - BESIDE : -1])
-    if fan.is_closed:
-        ahead, behind = fan.ahead[: 1 + BESIDE], fan.ahead[: -1 - BESIDE : -1]
-    else:
-        ahead, behind = fan.ahead[: 1 + BESIDE], fan.behind[:BESIDE]
-    sharpness = fan.sharpness
-    if sharpness is not None:
-        every = sharpness.edges
-        first = 0 if fan.is_closed else len(fan.behind)
-        edges = tuple(every[first + turns] for turns in range(-len(behind), len(ahead)))
-        sharpness = None if set(edges) == {SMOOTH_EDGE} else FanSharpness(edges, 0.0, ())
-    return TaggedFan(ahead, behind, sharpness=sharpness)
-
-
-def long_fan(signature: Signature) -> int | None:
-    """The corner of a face at a fan of very many faces that is not closed, where all of these matter; None if not one.
-
-    Such fans are those of darts, and semi-sharp ones.
-    """
-    if signature.kind != "face":
-        return None
-    found = [
-        corner
-        for corner, fan in enumerate(signature.fans)
-        if isinstance(fan, TaggedFan) and not fan.is_closed and fan_face_count(fan) > NEAR_FACES
-    ]
-    return found[0] if len(found) == 1 else None
-
-
-class TurnedEdges(tuple[tuple[float, float, float], ...]):
-    """`FanSharpness.edges` of a closed fan as one of its faces sees them, which remember the fan.
-
-    Faces of a large fan have signatures of their own. So they find what they share.
-
-    Attributes
-    ----------
-    vertex : Signature
-        Of the vertex of the fan.
-    turn : int
-        Number of turns counter-clockwise from the first face of that signature to this one.
-    """
-
-    vertex: Signature
-    turn: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,9 +200,7 @@ class Signature:
             raise TypeError("a vertex on a border; expected one amid faces, as another has a first and a last face")
         sharpness = fan.sharpness
         if sharpness is not None:
-            edges = TurnedEdges(sharpness.edges[corner:] + sharpness.edges[:corner])
-            edges.vertex, edges.turn = self, corner
-            sharpness = sharpness._replace(edges=edges)
+            sharpness = sharpness._replace(edges=sharpness.edges[corner:] + sharpness.edges[:corner])
         return Signature("vertex", (fan._replace(ahead=fan.ahead[corner:] + fan.ahead[:corner], sharpness=sharpness),))
 
 
@@ -268,21 +211,7 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     semi = topology.semi_sharpness
     if semi is None:
         return smooth
-    is_large = [kind == "face" and fan_is_closed(fan) and fan_face_count(fan) >= LARGE_FAN for fan in smooth.fans]
-    if not any(is_large):
-        return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
-    found = list(smooth.fans)
-    for corner, large in enumerate(is_large):
-        if large:
-            found[corner] = _turned_fan(topology, fans[corner][1])
-    small = [corner for corner, large in enumerate(is_large) if not large]
-    if small:
-        rest = Signature(kind, tuple(smooth.fans[corner] for corner in small))
-        around = half_edges_around([fans[corner] for corner in small])
-        sharp = with_sharpness(rest, FanSharpnessRows(topology, around[None], semi), 0)
-        for corner, fan in zip(small, sharp.fans, strict=True):
-            found[corner] = fan
-    return _with_fans(smooth, found)
+    return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
 
 
 # The half-edges at which the faces of a `TaggedFan` begin: those behind, then those ahead.
@@ -296,7 +225,7 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
     if kind == "face":
         while (corner := int(following(corners[-1]))) != half_edge:
             corners.append(corner)
-    return [_fan_half_edges(topology, turn, turn_back, corner) for corner in corners]
+    return [_fan_half_edges(turn, turn_back, corner) for corner in corners]
 
 
 def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
@@ -304,13 +233,7 @@ def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
     return np.concatenate([np.array(behind[::-1] + ahead, dtype=np.int32) for behind, ahead in fans])
 
 
-def _fan_half_edges(topology: Topology, turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges:
-    vertex = int(topology.face_vertices[half_edge])
-    around, closed = topology.large_fans.get(vertex, ([], False))
-    if half_edge in around:
-        at = around.index(half_edge)
-        return ([], around[at:] + around[:at]) if closed else (around[:at][::-1], around[at:])
-
+def _fan_half_edges(turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges:
     def half_edges(current: int, step: Walk) -> list[int]:
         found: list[int] = []
         while current >= 0 and not (found and current == half_edge):
@@ -320,26 +243,7 @@ def _fan_half_edges(topology: Topology, turn: Walk, turn_back: Walk, half_edge: 
 
     ahead = half_edges(half_edge, turn)
     closed = int(turn(ahead[-1])) >= 0
-    behind = [] if closed else half_edges(int(turn_back(half_edge)), turn_back)
-    if len(behind) + len(ahead) >= LARGE_FAN:
-        topology.large_fans[vertex] = behind[::-1] + ahead, closed
-    return behind, ahead
-
-
-def fan_points(topology: Topology, half_edges: list[int]) -> tuple[IntArray, IntArray]:
-    """The *ring* of the vertex of a fan, given its half-edges, counter-clockwise, and the first point of each face.
-
-    The ring is the vertex, and then the points of each face, from the end of its first edge to before that of its last.
-    In a fan that is not closed, the end of its last edge follows.
-    """
-    around = np.array(half_edges)
-    faces = topology.face_of(around)
-    first, counts = topology.face_offsets[faces], topology.face_sizes[faces] - 2
-    face = np.repeat(np.arange(len(faces)), counts)
-    steps = 1 + ragged.index_in_row(counts)
-    at = first[face] + (around[face] - first[face] + steps) % (counts[face] + 2)
-    last = topology.preceding(around[-1:]) if int(topology.turn(half_edges[-1])) < 0 else around[:0]
-    return topology.face_vertices[np.concatenate([around[:1], at, last])], 1 + ragged.starts(counts)
+    return [] if closed else half_edges(int(turn_back(half_edge)), turn_back), ahead
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
@@ -415,33 +319,18 @@ class FanSharpnessRows:
 def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
     """Signature of one of the elements of ``rows``, given its signature without semi-sharp features."""
     fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
-    return _with_fans(smooth, [fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans])
-
-
-def _with_fans(smooth: Signature, fans: list[Fan]) -> Signature:
-    """The signature of some fans, given that without semi-sharp features."""
-    found = Signature(smooth.kind, tuple(fans))
+    found = Signature(
+        smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
+    )
     # Caches the result of `smoothed`.
     vars(found)["_smoothed"] = smooth
     return found
-
-
-def _turned_fan(topology: Topology, ahead: list[int]) -> Fan:
-    """A large closed fan as the face of the first of some half-edges around sees it, made of that of the vertex."""
-    vertex = int(topology.face_vertices[ahead[0]])
-    around, _ = topology.large_fans[vertex]
-    if vertex not in topology.large_fan_signatures:
-        topology.large_fan_signatures[vertex] = signature_at(topology, around[0], "vertex")
-    return topology.large_fan_signatures[vertex].rotated(around.index(ahead[0])).fans[0]
 
 
 def _sharpened(fan: Fan, by: int) -> Fan:
     """The same fan with everything sharp made sharper."""
     if not isinstance(fan, TaggedFan) or fan.sharpness is None:
         return fan
-    edges = fan.sharpness.edges
-    if isinstance(edges, TurnedEdges):
-        return edges.vertex.sharpened(by).rotated(edges.turn).fans[0]
     return _fan_with(fan, fan.sharpness.sharpened(by))
 
 

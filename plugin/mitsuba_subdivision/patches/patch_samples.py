@@ -17,7 +17,7 @@ from ..progress import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 
-# Samples are evaluated in runs of so many weights of each kind, which bounds temporary memory to some tens of megabytes.
+# Samples are evaluated in runs of so many weights of each kind, which bounds temporary memory to tens of megabytes.
 WEIGHTS = 1 << 19
 
 

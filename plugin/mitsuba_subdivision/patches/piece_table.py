@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -92,8 +91,6 @@ class PieceTable:
         control_of_vertex: IntArray,
         control_count: int,
         piece_levels: int = PIECE_LEVELS,
-        *,
-        require_memory: Callable[[], None] = lambda: None,
     ) -> PieceTable:
         """Prepare the evaluation of some patches; equal arguments share the object while it is referenced.
 
@@ -105,20 +102,14 @@ class PieceTable:
         control_count : int
         piece_levels : int
             Number of levels of tips that are pieces, if these do not take too much memory.
-        require_memory : callable
-            Called before an object is made; raises if it would not fit into memory.
 
         Raises
         ------
         SchemeError
             As `piece_tree`.
         """
-
-        def make() -> PieceTable:
-            require_memory()
-            return cls._build(patches, control_of_vertex, control_count, piece_levels)
-
-        return _TABLES.get((patches, Content(control_of_vertex), control_count, piece_levels), make)
+        key = patches, Content(control_of_vertex), control_count, piece_levels
+        return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))
 
     @classmethod
     def _build(

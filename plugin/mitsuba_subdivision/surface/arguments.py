@@ -7,9 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..cage.errors import in_digits
+from ..cage import ControlCage
+from ..cage.errors import CageError, in_digits
 from ..evaluation.equations import EVALUATORS, Evaluator
+from ..mesh.connectivity import VertexRule
 from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
+from ..schemes.scheme_members import optional_member
 
 if TYPE_CHECKING:
     from ..patches import PatchTable
@@ -79,3 +83,39 @@ def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str)
         raise ValueError(
             f"{name} of sample {first} is {in_digits(values[first])}; expected {expected} ({wrong.sum()} such samples)"
         )
+
+
+# Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Bases of their one-rings take 3 seconds.
+MOST_FACES = 511
+# The same where each face around has a one-ring of its own, at the end of a crease and where something is semi-sharp:
+# then so many bases take as long.
+MOST_DIFFERENT_FACES = 64
+
+
+def require_valences(cage: ControlCage, scheme: Scheme) -> None:
+    """Check that no vertex and no face of a cage has more neighbours than are evaluated.
+
+    Raises
+    ------
+    CageError
+        Names the vertex or the face, and the limit.
+    """
+    t = cage.cut_mesh.topology
+    is_different = np.zeros(t.vertex_count, dtype=bool)
+    if scheme.element == "face":
+        is_dart = t.vertex_rules == VertexRule.DART
+        # Of a border only near faces matter, see `TaggedFan.near`.
+        is_near = t.is_border_vertex & ~is_dart & bool(optional_member(scheme, "has_local_borders"))
+        is_different = t.is_semi_sharp_vertex | (t.is_border_vertex & ~is_near)
+    else:
+        is_near = is_different
+    most = np.where(is_different, MOST_DIFFERENT_FACES, np.where(is_near, t.vertex_face_count, MOST_FACES))
+    above = np.flatnonzero(t.vertex_face_count > most)
+    if len(above):
+        vertex = int(above[0])
+        where, count = cage.source.at_vertex(int(cage.cut_mesh.vertex[vertex])), t.vertex_face_count[vertex]
+        why = " at the end of a crease, or with something semi-sharp," if is_different[vertex] else ""
+        raise CageError(f"{where} has {count} faces; expected at most {most[vertex]}{why} around a vertex")
+    if t.face_sizes.max(initial=0) > MOST_FACES:
+        face = int(t.face_sizes.argmax())
+        raise CageError(f"{cage.source.at_face(face)} has {t.face_sizes[face]} corners; expected at most {MOST_FACES}")

@@ -20,8 +20,7 @@ from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
 from ..schemes.domain import FloatArray
 from ..variants import variant_name
-from .arguments import checked_elements, checked_form, checked_samples, require_derivatives
-from .high_valence import require_memory_for_pieces, require_moderate_valences
+from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 from .samples import SurfaceSamples
 
 if TYPE_CHECKING:
@@ -108,7 +107,7 @@ class LimitSurface:
         return _PATCHES.get((self.cage.structure, self.scheme), self._make_patches)
 
     def _make_patches(self) -> PatchTable:
-        require_moderate_valences(self.cage, self.scheme)
+        require_valences(self.cage, self.scheme)
         topology = self.cage.cut_mesh.topology
         if self.scheme.element == "face":
             return patches.PatchTable(topology, self.scheme, self.cage.is_hole)
@@ -409,7 +408,6 @@ class LimitSurface:
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
-        require_moderate_valences(self.cage, self.scheme, needs_bases=True)
         return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
@@ -461,7 +459,6 @@ class LimitSurface:
                 self.patches,
                 self.cage.cut_mesh.vertex,
                 self.cage.vertex_count,
-                require_memory=lambda: require_memory_for_pieces(self.cage, self.patches),
                 **levels,
             )
         return self._pieces[evaluator]
@@ -541,7 +538,6 @@ class LimitSurface:
             If parts of the surface need more than ``max_rate`` for the criterion, and are coarser. A criterion for
             outlines causes none.
         """
-        require_moderate_valences(self.cage, self.scheme, needs_bases=True)
         points, shape = self.cage.positions, self.cage.positions.shape
         if control_points is not None:
             points = np.asarray(control_points, dtype=np.float64)
