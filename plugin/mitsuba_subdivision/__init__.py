@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .device_arrays import upload
     from .evaluation.limit_stencil import limit_stencil
-    from .evaluation.scheme_check import register_scheme
+    from .evaluation.scheme_laws import check_scheme
     from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
@@ -52,6 +52,7 @@ __all__ = [
     "SurfaceSamples",
     "Tessellation",
     "VertexMatrices",
+    "check_scheme",
     "example_file",
     "limit_stencil",
     "loss_of_views",
@@ -81,11 +82,12 @@ _MODULES = {
     "SurfaceSamples": "surface",
     "Tessellation": "tessellation",
     "VertexMatrices": "tessellation",
+    "check_scheme": "evaluation.scheme_laws",
     "example_file": "examples",
     "limit_stencil": "evaluation.limit_stencil",
     "loss_of_views": "shapes.views",
     "pixel_error_for": "shapes.tessellation_parameters",
-    "register_scheme": "evaluation.scheme_check",
+    "register_scheme": "schemes",
     "render_denoised": "studio",
     "studio_scene": "studio",
     "upload": "device_arrays",

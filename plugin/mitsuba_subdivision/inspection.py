@@ -14,7 +14,6 @@ from .cage import ControlCage
 from .cage.rules import RULES
 from .mesh.connectivity import IntArray, VertexRule
 from .mesh.seams import seams
-from .schemes.scheme_members import optional_member
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
@@ -262,7 +261,7 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         cut = cage.cut_mesh.topology
         border = cut.is_border_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
         # Schemes without rules at borders have no such number, and no cages with borders.
-        limit = optional_member(scheme, "regular_border_faces") if border.any() else 0
+        limit = scheme.regular_border_faces if border.any() else 0
         crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))
         if crowded:
             yield (

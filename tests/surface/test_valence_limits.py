@@ -49,7 +49,7 @@ def test_a_polygon_above_the_limit_is_refused_at_once(scheme):
     count, i = 512, np.arange(512)
     sides = np.stack([i, (i + 1) % count, (i + 1) % count + count, i + count], axis=1).tolist()
     prism = ControlCage(
-        np.concatenate([circle(count), circle(count) + [0, 0, 1]]), [*sides, [*range(count, 2 * count)]]
+        np.concatenate([circle(count), circle(count) + np.array([0, 0, 1])]), [*sides, [*range(count, 2 * count)]]
     )
     with pytest.raises(CageError, match="face 512 has 512 corners; expected at most 511"):
         LimitSurface(prism, scheme).tessellate(1)

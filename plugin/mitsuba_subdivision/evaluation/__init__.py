@@ -14,5 +14,5 @@ From the ground up:
 - `irregular_patch` puts these together for a patch with one extraordinary point, `element` for a whole element, and
   `stencils_by_signature` for the same samples on many elements.
 - `limit_stencil` has limit stencils of vertices, `product_patch` regular patches whose weights are products, and
-  `scheme_check` the checks that a user's scheme must pass.
+  `scheme_laws` the laws that the rules of every scheme keep.
 """

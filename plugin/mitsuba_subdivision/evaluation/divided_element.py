@@ -31,7 +31,6 @@ from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from ..schemes.scheme_members import optional_member
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
 from .refined_rings import RefinedRing, RingMesh, refined_ring, refined_together, ring_pattern
 
@@ -292,6 +291,6 @@ def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeErr
 
 def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
     """Number by which a signature is lowered; 0 where Chaikin's method mixes sharpness, as no two levels are alike."""
-    if optional_member(scheme, "crease_method") == "chaikin" and not signature.has_equal_creases:
+    if scheme.crease_method == "chaikin" and not signature.has_equal_creases:
         return 0
     return signature.steady_refinements

@@ -83,7 +83,7 @@ def evaluate_samples(
     if has_origin:
         origin = np.concatenate([own[:, 0] for own in points]).T
         for of_element in points:
-            of_element -= of_element[:, :1].copy()
+            np.subtract(of_element, of_element[:, :1].copy(), out=of_element)
     rows = located.rows(evaluator, dtype, derivatives)
     values = _times_points(located.weights([each.rows for each in rows], power=evaluator == "power"), points)
     curvature = np.full((2, count), np.nan, dtype=dtype)

@@ -13,7 +13,6 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from ..schemes.scheme_members import optional_member
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
 from .refined_rings import RefinedRing, refined_ring, ring_pattern
 
@@ -146,11 +145,13 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
     ring = RefinedRing(refined_ring(scheme, signature), 0)
     if ring.signature(0) != signature:
         return None
-    lattices = [lattice_stencils(scheme, ring.signature(k)) for k in range(1, len(scheme.domain.children))]
-    if any(lattice is None for lattice in lattices):
-        return None
-    matrix = ring.stencils(0)
-    children = np.stack([lattice @ ring.stencils(k) for k, lattice in enumerate(lattices, start=1)])
+    matrix, regular = ring.stencils(0), []
+    for number in range(1, len(scheme.domain.children)):
+        lattice = lattice_stencils(scheme, ring.signature(number))
+        if lattice is None:
+            return None
+        regular.append(lattice @ ring.stencils(number))
+    children = np.stack(regular)
     slots = np.arange(len(matrix))
     if (merged := _merged_slots(signature)) is not None:
         kept, dropped = merged
@@ -206,7 +207,7 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
 
 def _phantom_point(scheme: Scheme, rows: dict, point: tuple[float, float]) -> FloatArray | None:
     """Stencil of a lattice point beyond the border, if the scheme makes it of points whose stencils are known."""
-    for phantom in optional_member(scheme, "phantom_points") or ():
+    for phantom in scheme.phantom_points or ():
         others = [(point[0] + x, point[1] + y) for x, y in phantom.offsets]
         if all(other in rows for other in others):
             return sum(weight * rows[other] for weight, other in zip(phantom.weights, others, strict=True))
@@ -218,7 +219,7 @@ def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
         return fan == _regular_fan(scheme)
     if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
         return False
-    regular = 1 if fan.rule == VertexRule.CORNER else optional_member(scheme, "regular_border_faces")
+    regular = 1 if fan.rule == VertexRule.CORNER else scheme.regular_border_faces
     return fan.ahead + fan.behind == (scheme.regular_face_size,) * regular
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -114,7 +115,7 @@ class LocatedSamples:
     def _descend(
         self, elements: list[DividedElement], element: IntArray, uv: FloatArray, turn: IntArray, merge: bool
     ) -> list[tuple[int, IntArray, IntArray]]:
-        """Fill the depths and the leaves; the depth, the samples and the turns of each part of leaves, in their order."""
+        """Fill the depths and the leaves; the depth, the samples and the turns of each part of the leaves, in order."""
         scheme, domain = self.scheme, self.scheme.domain
         mesh: RingMesh | None = None
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray, FloatArray, IntArray]]] = {}
@@ -147,9 +148,9 @@ class LocatedSamples:
             key = np.array(below)[pair], turn[inner], in_child
             element_below, turn_below, uv_below, at_below = _distinct(*key) if merge else _sorted(*key)
             in_pairs = np.split(np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))[:-1])
-            groups = [
-                (key // 4, key % 4, inner[own], own_below, at_below[own])
-                for key, own, own_below in zip(pairs.tolist(), in_pairs, below, strict=True)
+            groups: list[tuple[int, int, IntArray, int, IntArray]] = [
+                (number // 4, number % 4, inner[own], own_below, at_below[own])
+                for number, own, own_below in zip(pairs.tolist(), in_pairs, below, strict=True)
             ]
             self._depths.append(_Depth(elements, first, groups))
             elements, element, uv, turn = list(numbers), element_below, uv_below, turn_below
@@ -239,7 +240,7 @@ class LocatedSamples:
             by_depth[depth + 1] = []
         return [over(0, number, size) for number in range(len(self._depths[0].elements))]
 
-    def per_sample(self, of_leaves: Sequence[FloatArray]) -> FloatArray:
+    def per_sample(self, of_leaves: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Numbers ``(.., n)`` of the samples of all leaves, for the samples ``(.., s)``."""
         return np.concatenate(of_leaves, axis=-1)[..., self.leaf_sample]
 

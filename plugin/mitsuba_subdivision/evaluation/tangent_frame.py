@@ -20,7 +20,6 @@ from ..mesh.one_ring import OneRing, one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from ..schemes.scheme_members import optional_member
 from .eigenbasis import Eigenbasis
 from .equations import limit_rows, times_powers
 
@@ -79,7 +78,7 @@ class _Point:
 
 def limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> FloatArray:
     """Frame at the extraordinary point: ``(2, K)`` coefficients over the eigen-coordinates."""
-    border_faces = optional_member(scheme, "regular_border_faces")
+    border_faces = scheme.regular_border_faces
     return _Point(signature.fans[0], one_ring(signature), basis, border_faces).frame()
 
 

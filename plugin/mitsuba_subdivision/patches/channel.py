@@ -16,7 +16,6 @@ from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
-from ..schemes.scheme_members import has_phantom_points
 from .patch_samples import PatchSampler
 from .patch_table import PatchTable
 from .stencil_matrices import value_matrix
@@ -290,11 +289,11 @@ def _layout_of(
         row[patches.topology.face_vertices] = indices
         return ChannelLayout(SubdividedChannel, patches, row)
     if is_linear or (
-        has_phantom_points(scheme) and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
+        scheme.has_phantom_points and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
     ):
         return ChannelLayout(LinearChannel, patches, indices, seam)
     topology, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
-    if not has_phantom_points(scheme) and ((topology.twin < 0).any() or topology.vertex_rules.any()):
+    if not scheme.has_phantom_points and ((topology.twin < 0).any() or topology.vertex_rules.any()):
         raise SchemeError(
             f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '
             'states no phantom_points; expected an attribute without seams, or face_varying "all"'

@@ -12,7 +12,6 @@ from ..evaluation.irregular_patch import level_at_size
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from ..schemes.scheme_members import optional_member
 from .box_tree import BoxTree, squared_gaps
 from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
 from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike
@@ -81,7 +80,7 @@ class ClosestPointSearch:
     def __init__(self, pieces: SurfacePieces) -> None:
         from scipy.spatial import cKDTree
 
-        if not optional_member(pieces.scheme, "has_convex_rules"):
+        if not pieces.scheme.has_convex_rules:
             pieces = pieces.divided()
         self._tips, self._first_levels, self._undivided = pieces.tips, _first_levels(pieces), pieces.undivided
         parts = [pieces.regular]

@@ -17,7 +17,6 @@ from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
 from ..schemes.scheme import Scheme
-from ..schemes.scheme_members import optional_member
 from .one_ring_codes import fan_codes, row_codes
 
 if TYPE_CHECKING:
@@ -175,7 +174,7 @@ class PatchTable:
         """Patches of the cage refined once, if that saves many classes, see `RefinedPatches`; else None."""
         if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
             return None
-        if self._is_kept is not None or not optional_member(self.scheme, "splits_corners"):
+        if self._is_kept is not None or not self.scheme.splits_corners:
             return None
         refinement = self.scheme.refine(self.topology)
         table = PatchTable(refinement.topology, self.scheme, may_turn=False)
@@ -261,7 +260,7 @@ class PatchTable:
 
     @property
     def _has_local_borders(self) -> bool:
-        return bool(optional_member(self.scheme, "has_local_borders"))
+        return self.scheme.has_local_borders
 
     def _fan_codes(self) -> IntArray:
         """``(n_h,)`` code of the fan around the mesh's vertex at each corner of `elements`, see `one_ring_codes`."""

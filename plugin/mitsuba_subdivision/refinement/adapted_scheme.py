@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..cage.control_cage import ControlCage
 from ..cage.errors import warn
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules
-from ..schemes.scheme_members import has_phantom_points, optional_member, require_members, unsupported_parts
+from ..schemes.scheme_table import require_scheme
 
 
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
@@ -29,7 +29,7 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
         )
     if scheme.element == "face" and cage.is_hole.all():
         raise SchemeError(f'{cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary')
-    found = unsupported_parts(scheme, cut.topology)
+    found = scheme.unsupported(cut.topology)
     if found is not None:
         source, first = cage.source, int(found.indices[0])
         first = first if found.kind == "face" else int(cut.vertex[first])
@@ -48,20 +48,18 @@ def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
         scheme = scheme_named(chosen)
     else:
         scheme = chosen
-        if isinstance(scheme, type) or not (hasattr(scheme, "element") or hasattr(scheme, "refine")):
-            raise SchemeError(f"scheme {scheme!r}; expected a scheme's name, or an object that states its rules")
-        require_members(scheme)
+        require_scheme(scheme)
     if cage.scheme not in (None, scheme.name):
         warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
     cut = cage.cut_mesh.topology
     semi_sharp = cut.semi_sharpness is not None
     lacking = {
         "creases and corners": scheme.element == "vertex" and cage.tags.any,
-        "semi-sharp creases and corners": semi_sharp and optional_member(scheme, "crease_method") is None,
+        "semi-sharp creases and corners": semi_sharp and scheme.crease_method is None,
         "holes": scheme.element == "vertex" and len(cage.holes) > 0,
         "borders, nor for infinitely sharp creases and corners, as it states no phantom_points; expected a closed "
         "cage without such features": scheme.element == "face"
-        and not has_phantom_points(scheme)
+        and not scheme.has_phantom_points
         and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
     }
     for what, asked in lacking.items():

@@ -17,7 +17,6 @@ from ..mesh.refinement_differences import differences
 from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
-from ..schemes.scheme_members import has_phantom_points
 from .refined_corners import RefinedCorners
 
 if TYPE_CHECKING:
@@ -154,7 +153,7 @@ class _RefinedValues:
         new_indices: IntArray,
     ) -> _RefinedValues:
         t, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
-        if not has_phantom_points(scheme) and ((t.twin < 0).any() or t.vertex_rules.any()):
+        if not scheme.has_phantom_points and ((t.twin < 0).any() or t.vertex_rules.any()):
             raise SchemeError(
                 f"{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "
                 f'"{shortened(name)}"; expected an attribute without seams, or face_varying "all"'

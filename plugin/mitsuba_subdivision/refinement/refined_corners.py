@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from ..cage.control_cage import ControlCage
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes import Scheme, SchemeError
-from ..schemes.scheme_members import optional_member
 
 # Origins of a refined vertex.
 VERTEX, EDGE, FACE = range(3)
@@ -51,7 +50,7 @@ class RefinedCorners:
         """
         t, cut = cage.topology, cage.cut_mesh.topology
         h = np.arange(t.half_edge_count)
-        if optional_member(scheme, "splits_corners"):
+        if scheme.splits_corners:
             kind = np.tile([VERTEX, EDGE, FACE, EDGE], len(h))
             half_edge = np.stack([h, h, h, t.prev], axis=1).ravel()
         else:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..deferred import deferred
-from .scheme import OptionalMembers, PhantomPoint, Refinement, Scheme, SchemeError, Unsupported
-from .scheme_table import SCHEME_CLASSES, add_scheme, scheme_named, with_rules
+from .scheme import PhantomPoint, Refinement, Scheme, SchemeError, Unsupported
+from .scheme_table import SCHEME_CLASSES, register_scheme, scheme_named, with_rules
 from .stencil_table import StencilTable
 
 if TYPE_CHECKING:
@@ -18,14 +18,13 @@ __all__ = [
     "CatmullClark",
     "DooSabin",
     "Loop",
-    "OptionalMembers",
     "PhantomPoint",
     "Refinement",
     "Scheme",
     "SchemeError",
     "StencilTable",
     "Unsupported",
-    "add_scheme",
+    "register_scheme",
     "scheme_named",
     "with_rules",
 ]

@@ -11,11 +11,10 @@ from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
 from .scheme import (
-    OptionalMembers,
     PhantomPoint,
     Refinement,
+    Scheme,
     TriangleRule,
-    described,
     kept_rules,
     kept_sharpness,
     tensor_basis,
@@ -23,7 +22,7 @@ from .scheme import (
 from .stencil_table import StencilTable
 
 
-class CatmullClark(OptionalMembers):
+class CatmullClark(Scheme):
     """Catmull-Clark subdivision of polygon meshes.
 
     Face points are centroids, edge points the mean of the edge's ends and the two face points, and a vertex of valence
@@ -43,7 +42,6 @@ class CatmullClark(OptionalMembers):
     triangle_rule: TriangleRule = "catmull_clark"
     name = "catmull_clark"
     element: ElementKind = "face"
-    __repr__ = described
     # Refined face ``h`` is the corner at half-edge ``h`` and begins there.
     splits_corners = True
     has_convex_rules = True
@@ -59,10 +57,6 @@ class CatmullClark(OptionalMembers):
     phantom_points = tuple(
         PhantomPoint(((x, y), (2 * x, 2 * y)), (2, -1)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1))
     )
-
-    def unsupported(self, topology: Topology) -> None:  # noqa: ARG002
-        """Every polygon and every valence is supported."""
-        return None
 
     def refine(self, topology: Topology) -> Refinement:
         """Split every n-gon into n quads; quad ``h`` is the corner at half-edge ``h``, listed from the old vertex on.

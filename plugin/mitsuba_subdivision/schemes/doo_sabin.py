@@ -8,11 +8,11 @@ from ..mesh import ragged
 from ..mesh.connectivity import Topology
 from ..mesh.signature import ElementKind
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import OptionalMembers, Refinement, Unsupported, described, low_valence, tensor_basis
+from .scheme import Refinement, Scheme, Unsupported, low_valence, tensor_basis
 from .stencil_table import StencilTable
 
 
-class DooSabin(OptionalMembers):
+class DooSabin(Scheme):
     """Doo-Sabin subdivision of polygon meshes. Patches belong to vertices, extraordinary points lie in faces.
 
     Each corner of an n-gon becomes a vertex with the weights ``(n + 5) / 4n`` on itself and ``(3 + 2 cos(2 pi j / n)) /
@@ -21,7 +21,6 @@ class DooSabin(OptionalMembers):
 
     name = "doo_sabin"
     element: ElementKind = "vertex"
-    __repr__ = described
     domain = SQUARE
     regular_face_size = 4
     regular_valence = 4

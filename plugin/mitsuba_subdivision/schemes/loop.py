@@ -12,7 +12,7 @@ from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import OptionalMembers, PhantomPoint, Refinement, Unsupported, described, kept_rules, kept_sharpness
+from .scheme import PhantomPoint, Refinement, Scheme, Unsupported, kept_rules, kept_sharpness
 from .stencil_table import StencilTable
 
 # The three kinds of basis function of the quartic box spline over a triangle, times 12, as coefficients of monomials in
@@ -29,7 +29,7 @@ _ACROSS_EDGE = {
 _BESIDE_CORNER = {(4, 0, 0): 1, (3, 1, 0): 2}
 
 
-class Loop(OptionalMembers):
+class Loop(Scheme):
     """Loop subdivision of triangle meshes.
 
     A vertex of valence ``n`` keeps ``1 - n beta`` of itself and takes ``beta`` of each neighbour, with ``beta = (5/8 -
@@ -45,7 +45,6 @@ class Loop(OptionalMembers):
     crease_method: CreaseMethod = "uniform"
     name = "loop"
     element: ElementKind = "face"
-    __repr__ = described
     domain = TRIANGLE
     regular_face_size = 3
     regular_valence = 6

@@ -1,8 +1,9 @@
-"""The protocol of a subdivision scheme: refinement rules, regular basis and parameter domain."""
+"""The base class of a subdivision scheme, and what the rules of several schemes share."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +20,6 @@ TriangleRule = Literal["catmull_clark", "smooth"]
 
 class SchemeError(ValueError):
     """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover a cage."""
-
-
-def described(scheme: Scheme) -> str:
-    """A scheme's class, with the rules that a cage has set in place of the scheme's own."""
-    rules = [f'{name}="{vars(scheme)[name]}"' for name in ("crease_method", "triangle_rule") if name in vars(scheme)]
-    return f"{type(scheme).__name__}({', '.join(rules)})"
 
 
 class Refinement(NamedTuple):
@@ -83,13 +78,12 @@ class Unsupported(NamedTuple):
     expected: str
 
 
-@runtime_checkable
-class Scheme(Protocol):
-    """Members of every stationary subdivision scheme. Everything else is derived by running `refine` on local meshes.
+class Scheme(ABC):
+    """Base class of every stationary subdivision scheme: refinement rules, regular basis and parameter domain.
 
-    A scheme may also have the members of `OptionalMembers`. It need not inherit from either class: any object with the
-    members is a scheme. `register_scheme` checks them all, as far as they show on the one-rings of vertices of few
-    faces. Scheme objects are keys of caches of derived data, so they must have a hash and never change.
+    Everything else is derived by running `refine` on local meshes. Scheme objects are keys of caches of derived data,
+    so they must have a hash and never change; a copy gets the ``crease_method`` and the ``triangle_rule`` of a cage.
+    `check_scheme` tries the rules of a scheme.
 
     Attributes
     ----------
@@ -106,6 +100,27 @@ class Scheme(Protocol):
         Lattice points at the two ends of the half-edge that names the regular element.
     edge_turn : (2, 2) float64
         Matrix that turns a lattice edge of a regular face into the edge that follows it.
+    phantom_points : tuple of PhantomPoint, or None
+        How a regular patch's control points beyond the border follow from those within; empty if none lie there. With
+        None, the default, a scheme whose elements are faces refuses open cages and infinitely sharp creases and
+        corners.
+    regular_border_faces : int
+        Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
+        corner it is one. A scheme with phantom points must state it.
+    splits_corners : bool
+        Whether refined face ``h`` is a quadrilateral at the face corner ``h`` of the mesh before, and begins there. If
+        so, cages with many classes of patches are refined once, which saves time. False by default.
+    has_convex_rules : bool
+        Whether no weight of the rules, or of the regular basis, is negative: then the surface over an element lies in
+        the convex hull of its one-ring, which saves time where adaptive tessellations are chosen. False by default.
+    has_local_borders : bool
+        Whether a vertex on a border, or a corner, takes weights of its neighbours on the border only, and no weight
+        depends on its valence. If so, faces that lie far away in its fan are left out (`TaggedFan.near`), which saves
+        time. False by default.
+    crease_method : "uniform" or "chaikin", or None
+        Decay of semi-sharp features in `refine`. With None, the default, the scheme refuses semi-sharp features.
+    triangle_rule : "catmull_clark" or "smooth", or None
+        Rule of `refine` for triangles. With None, the default, a cage with "smooth" is an error.
     """
 
     name: str
@@ -116,15 +131,29 @@ class Scheme(Protocol):
     regular_lattice: FloatArray
     first_edge: FloatArray
     edge_turn: FloatArray
+    phantom_points: tuple[PhantomPoint, ...] | None = None
+    regular_border_faces: int = 0
+    splits_corners: bool = False
+    has_convex_rules: bool = False
+    has_local_borders: bool = False
+    crease_method: CreaseMethod | None = None
+    triangle_rule: TriangleRule | None = None
 
-    def __hash__(self) -> int:
-        """Scheme objects are keys of caches."""
-        ...
+    def __repr__(self) -> str:
+        # With the rules that a cage has set in place of the scheme's own.
+        rules = [f'{name}="{vars(self)[name]}"' for name in ("crease_method", "triangle_rule") if name in vars(self)]
+        return f"{type(self).__name__}({', '.join(rules)})"
 
-    def unsupported(self, topology: Topology) -> Unsupported | None:
-        """Say which faces or vertices of a mesh the rules do not cover; None if they cover all."""
-        ...
+    @property
+    def has_phantom_points(self) -> bool:
+        """Whether there are rules at borders and sharp features: for open cages, and cages with creases or corners."""
+        return self.element == "face" and self.phantom_points is not None
 
+    def unsupported(self, topology: Topology) -> Unsupported | None:  # noqa: ARG002
+        """Say which faces or vertices of a mesh the rules do not cover; None, the default, if they cover all."""
+        return None
+
+    @abstractmethod
     def refine(self, topology: Topology) -> Refinement:
         """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
 
@@ -133,8 +162,8 @@ class Scheme(Protocol):
         sharpness it leaves of the others. In a mesh of unconnected parts the refined faces should come in the same
         order as in each part alone; that saves time.
         """
-        ...
 
+    @abstractmethod
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
         """Parts of the element named by a half-edge after one refinement.
 
@@ -142,8 +171,8 @@ class Scheme(Protocol):
         that names it. There are four, the copies of the domain, or one, with the identity, where an element has
         another number of corners than the domain (a corner of an n-gon under Catmull-Clark).
         """
-        ...
 
+    @abstractmethod
     def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
         """Weights of the regular patch's control points, in the order of `regular_lattice`.
 
@@ -158,48 +187,6 @@ class Scheme(Protocol):
         (1, s, R), (3, s, R) or (6, s, R)
             Value; d/du, d/dv; d2/du2, d2/dudv, d2/dv2.
         """
-        ...
-
-
-class OptionalMembers:
-    """Members that a scheme may have besides those of `Scheme`, and the defaults of a scheme that lacks them.
-
-    A scheme can inherit from this class, to have the defaults among its own members. One that does not inherit, and
-    lacks some of the members, is treated as if it had the defaults.
-
-    Attributes
-    ----------
-    phantom_points : tuple of PhantomPoint, or None
-        How a regular patch's control points beyond the border follow from those within; empty if none lie there. With
-        None a scheme whose elements are faces refuses open cages and infinitely sharp creases and corners.
-    regular_border_faces : int
-        Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
-        corner it is one. A scheme with phantom points must state it.
-    splits_corners : bool
-        Whether refined face ``h`` is a quadrilateral at the face corner ``h`` of the mesh before, and begins there. If
-        so, cages with many classes of patches are refined once, which saves time.
-    has_convex_rules : bool
-        Whether no weight of the rules, or of the regular basis, is negative: then the surface over an element lies in
-        the convex hull of its one-ring, which saves time where adaptive tessellations are chosen.
-    has_local_borders : bool
-        Whether a vertex on a border, or a corner, takes weights of its neighbours on the border only, and no weight
-        depends on its valence. If so, faces that lie far away in its fan are left out (`TaggedFan.near`), which saves
-        time.
-    crease_method : "uniform" or "chaikin", or None
-        Decay of semi-sharp features in `Scheme.refine`. A copy of the scheme gets the value of a cage. With
-        None the scheme refuses semi-sharp features.
-    triangle_rule : "catmull_clark" or "smooth", or None
-        Rule of `Scheme.refine` for triangles. A copy of the scheme gets the value of a cage. With None, a cage with
-        "smooth" is an error.
-    """
-
-    phantom_points: tuple[PhantomPoint, ...] | None = None
-    regular_border_faces: int = 0
-    splits_corners: bool = False
-    has_convex_rules: bool = False
-    has_local_borders: bool = False
-    crease_method: CreaseMethod | None = None
-    triangle_rule: TriangleRule | None = None
 
 
 def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:

@@ -7,7 +7,6 @@ from copy import copy
 from functools import lru_cache
 
 from .scheme import Scheme, SchemeError
-from .scheme_members import optional_member
 
 # The module and the class of each scheme of this package; the scheme is made when it is first used.
 SCHEME_CLASSES = {"catmull_clark": "CatmullClark", "doo_sabin": "DooSabin", "loop": "Loop"}
@@ -46,10 +45,10 @@ def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme
             ("crease_method", crease_method, "uniform"),
             ("triangle_rule", triangle_rule, "catmull_clark"),
         )
-        if rule != (optional_member(scheme, name) or usual)
+        if rule != (getattr(scheme, name) or usual)
     }
     for name, rule in changed.items():
-        if optional_member(scheme, name) is None:
+        if getattr(scheme, name) is None:
             raise SchemeError(f'the scheme {scheme.name} has no {name} "{rule}"')
     if not changed:
         return scheme
@@ -58,6 +57,27 @@ def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme
     return scheme
 
 
-def add_scheme(scheme: Scheme) -> None:
-    """Add a scheme under its name, in place of any other of that name. Use `register_scheme`, which checks it."""
+def register_scheme(scheme: Scheme) -> None:
+    """Register a scheme under its name, for `LimitSurface` and scenes, in place of any other of that name.
+
+    Parameters
+    ----------
+    scheme : Scheme
+        Its methods must not change between calls; data derived from them is kept. `check_scheme` tries its rules.
+
+    Raises
+    ------
+    SchemeError
+        If it is no `Scheme`, or has no name.
+    """
+    require_scheme(scheme)
     _SCHEMES[scheme.name] = scheme
+
+
+def require_scheme(scheme: object) -> None:
+    """Check that an object is a scheme, with a name."""
+    if not isinstance(scheme, Scheme):
+        what = f"the class {scheme.__name__}" if isinstance(scheme, type) else repr(scheme)
+        raise SchemeError(f"scheme {what}; expected a scheme's name, or an object of a class derived from Scheme")
+    if not isinstance(getattr(scheme, "name", None), str) or not scheme.name:
+        raise SchemeError(f"{type(scheme).__name__} has no name; expected a string of one or more characters")

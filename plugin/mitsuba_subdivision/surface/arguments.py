@@ -13,7 +13,6 @@ from ..evaluation.equations import EVALUATORS, Evaluator
 from ..mesh.connectivity import VertexRule
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from ..schemes.scheme_members import optional_member
 
 if TYPE_CHECKING:
     from ..patches import PatchTable
@@ -105,7 +104,7 @@ def require_valences(cage: ControlCage, scheme: Scheme) -> None:
     if scheme.element == "face":
         is_dart = t.vertex_rules == VertexRule.DART
         # Of a border only near faces matter, see `TaggedFan.near`.
-        is_near = t.is_border_vertex & ~is_dart & bool(optional_member(scheme, "has_local_borders"))
+        is_near = t.is_border_vertex & ~is_dart & scheme.has_local_borders
         is_different = t.is_semi_sharp_vertex | (t.is_border_vertex & ~is_near)
     else:
         is_near = is_different

@@ -12,7 +12,6 @@ from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
-from ..schemes.scheme_members import optional_member
 from .cones import NormalCone, cross, dot
 from .criterion import Measure
 from .tile_extents import TileParts, fit_within
@@ -88,7 +87,7 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray
         return fit_within(rates.scheme, limit, groups)
     parts = [TileParts(each.tile, dot(each.values, axis[:, each.owner])[:, None], each.owner) for each in groups]
     # A tile without a normal, or that may be folded, is tested by its size only.
-    fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & bool(optional_member(rates.scheme, "has_convex_rules"))
+    fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & rates.scheme.has_convex_rules
     has_normal = axis.any(axis=0)
     found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
     folded = _are_folded(rings, axis, found & ~fits)

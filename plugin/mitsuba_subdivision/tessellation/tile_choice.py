@@ -17,7 +17,6 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
-from ..schemes.scheme_members import optional_member
 from . import HIGHEST_RATE
 from .criterion import Criterion
 from .feature_edges import feature_edges, sides_on
@@ -172,7 +171,7 @@ def _cut(
     parts: list[_Undecided] = []
     for tiles, patches in blocks:
         rest = patches
-        if optional_member(rates.scheme, "has_convex_rules"):
+        if rates.scheme.has_convex_rules:
             is_flat = have_flat_rings(rates, tiles, patches)
             yield tiles[is_flat], None
             rest = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]

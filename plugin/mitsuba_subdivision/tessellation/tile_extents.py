@@ -20,7 +20,6 @@ from ..evaluation.divided_tile import DividedTile
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from ..schemes.scheme_members import optional_member
 
 # Parts left after so many divisions are bounded by control points or, if the rules are not convex, as small as the
 # rounding of single precision.
@@ -95,7 +94,7 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
     """
     if not tiles:
         return np.zeros(len(limit), dtype=bool)
-    is_convex, axis_count = bool(optional_member(scheme, "has_convex_rules")), tiles[0].values.shape[1]
+    is_convex, axis_count = scheme.has_convex_rules, tiles[0].values.shape[1]
     points, hulls = _Extents(axis_count, len(limit)), _Extents(axis_count, len(limit))
     waiting = []
     limit = limit.copy()

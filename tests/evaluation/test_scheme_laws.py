@@ -1,14 +1,17 @@
-"""Schemes of users: a worked example, and what is refused."""
+"""Laws of schemes, and schemes of users: a worked example, and what is refused."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface, SchemeError, register_scheme
-from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
-from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, StencilTable, scheme_named
+import scipy.sparse
+from mitsuba_subdivision import LimitSurface, SchemeError, check_scheme, register_scheme
+from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, Scheme, StencilTable, scheme_named
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.schemes.scheme import tensor_basis
+from mitsuba_subdivision.schemes.scheme import PhantomPoint, tensor_basis
+from reference.refined_cages import sheet, tagged
 
 # Rounding over some levels of refinement of the unit ball.
 POINT = 1e-12
@@ -23,7 +26,7 @@ class Warren(Loop):
         return np.where(valence == 3, 3 / 16, 3 / (8 * valence))
 
 
-class Bilinear:
+class Bilinear(Scheme):
     """The simplest scheme that states every rule itself: quads split at midpoints, whose limit is the cage itself."""
 
     name = "bilinear"
@@ -34,9 +37,6 @@ class Bilinear:
     regular_lattice = np.array([(0, 0), (1, 0), (0, 1), (1, 1)], dtype=float)
     first_edge = np.array([(0, 0), (1, 0)], dtype=float)
     edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
-
-    def unsupported(self, topology):
-        return CatmullClark().unsupported(topology)
 
     def refine(self, topology):
         t = topology
@@ -136,16 +136,6 @@ class Leaking(CatmullClark):
         return refinement._replace(stencils=StencilTable.from_matrix(1.001 * refinement.stencils.matrix))
 
 
-class Turned(CatmullClark):
-    """Rows and columns of the matrix are exchanged."""
-
-    name = "turned"
-
-    def refine(self, topology):
-        refinement = super().refine(topology)
-        return refinement._replace(stencils=StencilTable.from_matrix(refinement.stencils.matrix.T))
-
-
 class OtherBasis(DooSabin):
     name = "other_basis"
 
@@ -170,29 +160,143 @@ class Standing(CatmullClark):
         return refinement._replace(stencils=StencilTable.from_matrix(matrix))
 
 
+class WrongDerivatives(CatmullClark):
+    name = "wrong_derivatives"
+
+    def regular_basis(self, uv, derivatives):
+        rows = super().regular_basis(uv, derivatives)
+        rows[1:] *= 1.01
+        return rows
+
+
+def with_row(topology, row, changed):
+    """Catmull-Clark's refinement with one row of its matrix changed."""
+    refinement = CatmullClark().refine(topology)
+    matrix = refinement.stencils.matrix.toarray()
+    changed(matrix[row])
+    return Refinement(refinement.topology, StencilTable.from_matrix(scipy.sparse.csr_array(matrix)))
+
+
+class Sharpened(CatmullClark):
+    """The first vertex moves away from the others."""
+
+    name = "sharpened"
+    phantom_points = None
+
+    def refine(self, topology):
+        def changed(row):
+            row[:2] += 0.9, -0.9
+
+        regular = (topology.vertex_face_count[~topology.is_border_vertex] == 4).all()
+        return super().refine(topology) if regular else with_row(topology, 0, changed)
+
+
+class FarBorder(CatmullClark):
+    """Vertices on borders of more than three faces take from one within."""
+
+    name = "far_border"
+
+    def refine(self, topology):
+        def changed(row):
+            row[[0, topology.face_vertices[2]]] += -0.01, 0.01
+
+        far = topology.is_border_vertex[0] and topology.vertex_face_count[0] > 3
+        return with_row(topology, 0, changed) if far else super().refine(topology)
+
+
+class ByValence(CatmullClark):
+    """Edge points beside such vertices depend on their valence."""
+
+    name = "by_valence"
+
+    def refine(self, topology):
+        count = topology.vertex_face_count[0]
+
+        def changed(row):
+            row[[0, topology.face_vertices[1]]] += -0.01 * count, 0.01 * count
+
+        far = topology.is_border_vertex[0] and count > 3
+        return (
+            with_row(topology, topology.vertex_count + topology.edge[0], changed) if far else super().refine(topology)
+        )
+
+
+class OtherBorder(CatmullClark):
+    name = "other_border"
+    phantom_points = tuple(PhantomPoint(each.offsets, (1.9, -0.9)) for each in CatmullClark.phantom_points)
+
+
 @pytest.mark.parametrize(
     ("scheme", "message"),
     [
-        (object(), "object is no scheme: it has no name, element, domain"),
         (Leaking(), "leaking: .* has weights that sum to 1.001; expected 1"),
-        (Turned(), r"stencils of (\d+) vertices over (\d+); expected stencils of \2 refined vertices over \1"),
-        (OtherBasis(), "other_basis: the regular basis does not fit the rules: child 0 of a regular patch is"),
-        (TooWide(), r"too_wide: "),
-        (
-            Standing(),
-            "standing: subdivision matrix of a face .*: the second eigenvalue has modulus 1; expected below 1",
-        ),
+        (OtherBasis(), "other_basis: row 1 of the regular basis is wrong by"),
+        (OtherBorder(), "other_border: the regular basis does not fit the rules"),
+        (WrongDerivatives(), "wrong_derivatives: row 1 of the regular basis is wrong by"),
+        (TooWide(), "too_wide: "),
+        (Standing(), "standing: subdivision matrix of .*: the second eigenvalue has modulus 1; expected below 1"),
+        (Sharpened(), "sharpened: has_convex_rules, but a weight of -"),
+        (FarBorder(), "far_border: has_local_borders, but an inner vertex has a weight"),
+        (ByValence(), "by_valence: has_local_borders, but weights beside a border depend on a valence"),
     ],
+    ids=lambda value: getattr(value, "name", ""),
 )
-@pytest.mark.usefixtures("known")
-def test_rules_that_make_no_surface_are_refused(scheme, message):
+def test_rules_that_break_a_law_are_told(scheme, message):
     with pytest.raises(SchemeError, match=message):
-        register_scheme(scheme)
+        check_scheme(scheme)
 
 
-@pytest.mark.parametrize("scheme", [CatmullClark(), DooSabin(), Loop()])
-def test_the_packages_own_schemes_pass_the_check(scheme, known):  # noqa: ARG001
-    register_scheme(scheme)
+@pytest.mark.parametrize("scheme", [CatmullClark(), DooSabin(), Loop(), Warren(), Bilinear()], ids=lambda s: s.name)
+def test_schemes_keep_the_laws(scheme):
+    check_scheme(scheme)
+
+
+class WithoutPhantomPoints(CatmullClark):
+    name = "closed"
+    phantom_points = None
+
+
+@pytest.mark.parametrize(
+    "cage",
+    [sheet(2, 2), tagged(cube(), creases=[(0, 1, np.inf)]), tagged(cube(), corners=[(0, np.inf)])],
+    ids=["border", "crease", "corner"],
+)
+def test_without_phantom_points_open_cages_and_sharp_features_are_refused(cage):
+    with pytest.raises(SchemeError, match=r"closed has no rules for borders, .* states no phantom_points; expected"):
+        LimitSurface(cage, WithoutPhantomPoints())
+
+
+def test_without_phantom_points_seams_of_texture_coordinates_are_refused(np_rng):
+    texcoords = Attribute(np_rng.random((24, 2)), "face_varying", np.arange(24))
+    surface = LimitSurface(tagged(cube(), texcoords=texcoords), WithoutPhantomPoints())
+    with pytest.raises(SchemeError, match='no rules for seams, as of the attribute "texcoords"'):
+        surface.evaluate_attribute("texcoords", 0, [[0.5, 0.5]])
+
+
+def test_without_a_crease_method_semi_sharp_features_are_refused():
+    scheme = CatmullClark()
+    scheme.crease_method = None
+    with pytest.raises(SchemeError, match="the scheme catmull_clark has no rules for semi-sharp creases and corners"):
+        LimitSurface(tagged(cube(), creases=[(0, 1, 1.5)]), scheme)
+
+
+@pytest.mark.parametrize("scheme", [CatmullClark, object(), 3])
+def test_what_is_no_scheme_is_refused(scheme):
+    for use in (register_scheme, lambda s: LimitSurface(cube(), s)):
+        with pytest.raises(SchemeError, match="expected a scheme's name, or an object of a class derived from Scheme"):
+            use(scheme)
+
+
+def test_a_scheme_states_its_rules():
+    class Silent(Scheme):
+        name = "silent"
+
+    with pytest.raises(TypeError, match="abstract methods"):
+        Silent()
+    silent = CatmullClark()
+    silent.name = ""
+    with pytest.raises(SchemeError, match="CatmullClark has no name"):
+        register_scheme(silent)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,142 @@
+"""Laws that the rules of every scheme keep, for tests of a scheme of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..mesh.connectivity import VertexRule
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Fan, Signature, TaggedFan
+from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme, SchemeError
+from .divided_element import element_of
+from .irregular_patch import irregular_patch
+from .patch_pieces import irregular_structure, isolated_signature, lattice_stencils, regular_signature
+from .refined_rings import refined_children
+from .sample_weights import LocatedSamples
+
+# Valences, and numbers of corners, at which a scheme is tried where it supports them.
+VALENCES, SIZES = range(3, 9), (3, 4, 5)
+# Rounding error of weights in double precision.
+SAME_WEIGHTS = 1e-12
+# Derivatives are compared with central differences over this step, whose error goes with its square.
+STEP, SAME_SLOPE = 1e-4, 1e-5
+# Each derivative of the regular basis: its row, the row that it is the derivative of, and the parameter.
+DIFFERENCES = ((1, 0, 0), (2, 0, 1), (3, 1, 0), (4, 1, 1), (5, 2, 1))
+
+
+def check_scheme(scheme: Scheme) -> None:
+    """Try the rules of a scheme on small meshes.
+
+    Raises
+    ------
+    SchemeError
+        If weights do not sum to one, or are negative although ``has_convex_rules`` is true; if the regular basis is not
+        the limit of the rules, inside or beside a border, or its derivatives are not those of its values; if refinement
+        does not isolate extraordinary points, or does not contract their one-rings; or if weights on a border depend on
+        more than ``has_local_borders`` says.
+    """
+    _check_basis(scheme)
+    for signature in (regular_signature(scheme), *_border_signatures(scheme)):
+        _check_basis_fits(scheme, signature)
+    inside = np.full((1, 2), 1 / 3)
+    for signature in _irregular_signatures(scheme):
+        found = scheme.unsupported(one_ring(signature).topology)
+        # The first face and the first vertices of a one-ring are the element's own.
+        own = 1 if found is None or found.kind == "face" else len(signature.fans)
+        if found is not None and np.min(found.indices) < own:
+            continue
+        for _, _, stencils in refined_children(scheme, signature):
+            _check_signs(scheme, stencils)
+        LocatedSamples(scheme, [element_of(scheme, signature)], np.zeros(1, int), inside, np.zeros(1, int))
+        structure = irregular_structure(scheme, signature)
+        if structure is not None:
+            irregular_patch(scheme, structure)
+    if scheme.has_phantom_points and scheme.has_local_borders:
+        _check_local_borders(scheme)
+
+
+def _check_basis(scheme: Scheme) -> None:
+    uv = _inner(scheme)
+    rows = scheme.regular_basis(uv, 2)
+    error = np.abs(rows.sum(axis=2) - np.eye(len(rows), 1)).max()
+    _require(error < SAME_WEIGHTS, scheme, f"the regular basis and its derivatives have sums wrong by {error:.1e}")
+    _check_signs(scheme, rows[0])
+    for derivative, of, by in DIFFERENCES:
+        ahead, behind = (scheme.regular_basis(uv + step * np.eye(2)[by], 1)[of] for step in (STEP, -STEP))
+        error = np.abs((ahead - behind) / (2 * STEP) - rows[derivative]).max()
+        scale = max(1.0, np.abs(rows[derivative]).max())
+        _require(error <= SAME_SLOPE * scale, scheme, f"row {derivative} of the regular basis is wrong by {error:.1e}")
+
+
+def _check_basis_fits(scheme: Scheme, signature: Signature) -> None:
+    """Check that a regular patch and its refinement are the same surface."""
+    lattice, uv = lattice_stencils(scheme, signature), _inner(scheme)
+    for number, (domain, child, stencils) in enumerate(refined_children(scheme, signature)):
+        fine = lattice_stencils(scheme, child)
+        if lattice is None or fine is None:
+            raise SchemeError(f"{scheme.name}: child {number} of a regular face with fans {signature.fans} is not")
+        coarse = scheme.regular_basis(domain.inverse()(uv), 0)[0] @ lattice
+        error = np.abs(coarse - scheme.regular_basis(uv, 0)[0] @ fine @ stencils).max()
+        message = f"the regular basis does not fit the rules: child {number} of a patch is another surface"
+        _require(error < SAME_WEIGHTS, scheme, f"{message}, by {error:.1e}; the patch has fans {signature.fans}")
+
+
+def _check_local_borders(scheme: Scheme) -> None:
+    """Check that weights on a border depend neither on inner vertices nor on the valence."""
+    faces, (_, *others) = (scheme.regular_face_size,), regular_signature(scheme).fans
+    for rule in (VertexRule.AUTOMATIC, VertexRule.CORNER):
+        weights = []
+        for behind in (3, 5):
+            signature = Signature("face", (TaggedFan(faces * 3, faces * behind, rule), *others))
+            _, _, stencils = refined_children(scheme, signature)[0]
+            first, *_, last = one_ring(signature).edge_neighbours()
+            inner = np.abs(np.delete(stencils[0], [0, first, last])).max()
+            _require(inner == 0, scheme, "has_local_borders, but an inner vertex has a weight for one on a border")
+            weights.append(set(stencils.round(9).ravel().tolist()))
+        _require(weights[0] == weights[1], scheme, "has_local_borders, but weights beside a border depend on a valence")
+
+
+def _check_signs(scheme: Scheme, weights: FloatArray) -> None:
+    is_right = not scheme.has_convex_rules or weights.min() >= -SAME_WEIGHTS
+    _require(is_right, scheme, f"has_convex_rules, but a weight of {weights.min():.1e}")
+
+
+def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
+    """Signatures of elements on a border that must be regular patches."""
+    size, count = scheme.regular_face_size, scheme.regular_border_faces
+    inner = list(regular_signature(scheme).fans)
+    if not scheme.has_phantom_points:
+        return
+    if count == 1:
+        yield Signature("face", (TaggedFan((size,), ()),) * size)
+        return
+    first, last = TaggedFan((size,) * count, ()), TaggedFan((size,), (size,) * (count - 1))
+    yield Signature("face", (first, last, *inner[2:]))
+    for behind in range(1, count - 1):
+        yield Signature("face", (TaggedFan((size,) * (count - behind), (size,) * behind), *inner[1:]))
+    yield Signature("face", (TaggedFan((size,), (), VertexRule.CORNER), last, *inner[2:-1], first))
+
+
+def _irregular_signatures(scheme: Scheme) -> Iterator[Signature]:
+    """Signatures of elements with an extraordinary point, and of those that do not fit the domain."""
+    yield from (isolated_signature(scheme, valence) for valence in VALENCES)
+    for size in SIZES:
+        fan: Fan = (scheme.regular_face_size,) * size
+        if scheme.element == "face":
+            fan = (size, *(scheme.regular_face_size,) * (scheme.regular_valence - 1))
+        if size != scheme.domain.corner_count:
+            yield Signature(scheme.element, (fan,) * (size if scheme.element == "face" else 1))
+
+
+def _inner(scheme: Scheme) -> FloatArray:
+    """Some parameters inside the domain."""
+    inner = 0.25 + 0.5 * scheme.domain.corners
+    return inner[scheme.domain.inside(inner) > 0]
+
+
+def _require(is_right: bool | np.bool_, scheme: Scheme, problem: str) -> None:
+    if not is_right:
+        raise SchemeError(f"{scheme.name}: {problem}")
