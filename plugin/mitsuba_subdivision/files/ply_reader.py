@@ -7,6 +7,7 @@ import re
 import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,6 @@ from ..cage.contents import CageContents
 from ..cage.errors import CageError, shortened, warn
 from ..cage.source import CageSource
 from ..mesh.connectivity import IntArray
-from .ply_header import EXPECTED, PlyHeader
-from .ply_lists import lists_of_rows
 from .ply_names import MATERIAL, NORMAL, POSITION, TEXCOORDS, color_of, grouped
 
 if TYPE_CHECKING:
@@ -67,49 +66,82 @@ def read_ply(path: str | Path) -> CageContents:
         If faces have other data, or vertices have lists, which are not read.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
-    header = PlyHeader.read(content, name)
+    header = content[: max(0, content.find(b"end_header"))]
+    lines: dict[str, IntArray] = {}
+    first = 2 + len(header.splitlines())
+    for word, digits in re.findall(rb"\nelement\s+(\S+)\s+(\d+)", header):
+        # Plyfile makes an array of as many rows as the header announces.
+        if int(digits) > len(content):
+            rows = shortened(f"{int(digits)} rows of {word.decode('ascii', 'replace')}", 200)
+            raise CageError(f"{name}: {rows} do not fit into the file; expected fewer")
+        if b"\nformat ascii" in header:
+            # A row is a line.
+            lines[word.decode("ascii", "replace")] = first + np.arange(int(digits))
+            first += int(digits)
     # When the cage is validated, numbers that are not finite become errors that name their place.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _contents(content, header)
+        return _contents(_elements(content, name, lines), name, lines)
 
 
-def _contents(content: bytes, header: PlyHeader) -> CageContents:
-    name = header.name
-    lists = [each for each in _FACE_LISTS if "face" in header.elements and each in header.lists("face")]
-    integers = [
-        each.name
-        for each in (header.elements["face"].properties if lists else [])
-        if each.items is None and each.type.kind in "iu"
-    ]
-    owner = next((each for each in MATERIAL if each in integers), None)
-    polygons = lists_of_rows(header, content, "face", lists[0], owner) if lists else None
-    if polygons is not None:
-        header, content = PlyHeader.read(polygons.rest, name), polygons.rest
-    elements = _elements(content, header)
-    vertex = _element(elements, "vertex", name)
-    face = _element(elements, "face", name) if polygons is None else elements["face"]
-    numbers = [other for other in vertex.data.dtype.names if other not in header.lists("vertex")]
+def _elements(content: bytes, name: str, lines: dict[str, IntArray]) -> dict[str, PlyElement]:
+    try:
+        from plyfile import PlyData, PlyParseError
+    except ImportError:
+        raise CageError(
+            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[ply]"'
+        ) from None
+    with tempfile.TemporaryFile() as file, warnings.catch_warnings():
+        # For elements without rows NumPy warns, and plyfile then raises an error.
+        warnings.simplefilter("ignore", UserWarning)
+        # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
+        warnings.simplefilter("error", DeprecationWarning)
+        # Plyfile maps lists of one known length, and reads all others row by row, in a hundred times as long. It maps
+        # a file of our own, as the process would end if another program cut a mapped file.
+        file.write(content)
+        for corners in () if lines else (3, 4):
+            file.seek(0)
+            lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
+            with suppress(PlyParseError, ValueError):
+                return {element.name: element for element in PlyData.read(file, known_list_len=lengths)}
+        try:
+            return {element.name: element for element in PlyData.read(io.BytesIO(content), mmap=False)}
+        except UnicodeDecodeError:
+            raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
+        except (PlyParseError, ValueError, OverflowError, MemoryError, DeprecationWarning) as error:
+            cut = " (is the file cut short?)" if "early end" in str(error) else ""
+            row, element, line = (getattr(error, each, None) for each in ("row", "element", "line"))
+            if element is not None and row is not None and element.name in lines:
+                line = lines[element.name][min(row, len(lines[element.name]) - 1)]
+            where = name if line is None else f"{name}, line {line}"
+            what = re.sub(r"^line \d+: ", "", str(error))
+            raise CageError(f"{where}: {shortened(what, 200)}{cut}; expected a PLY file") from None
+
+
+def _contents(elements: dict[str, PlyElement], name: str, lines: dict[str, IntArray]) -> CageContents:
+    vertex, face = (_element(elements, wanted, name) for wanted in ("vertex", "face"))
+    numbers, lists = _properties(vertex)
     missing = [axis for axis in POSITION if axis not in numbers]
     if missing:
-        found = _listed(numbers)
-        raise CageError(f'{name}: the element "vertex" has no property "{missing[0]}"; expected x, y, z among {found}')
-    if not lists:
+        raise CageError(
+            f'{name}: the element "vertex" has no property "{missing[0]}"; expected x, y, z among {_listed(numbers)}'
+        )
+    of_faces, lists_of_faces = _properties(face)
+    polygons = next((each for each in _FACE_LISTS if each in lists_of_faces), None)
+    if polygons is None:
         raise CageError(
             f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; expected one, a list of '
-            f"integers, among {_listed(face.data.dtype.names)}"
+            f"integers, among {_listed([*of_faces, *lists_of_faces])}"
         )
+    owner = next((each for each in MATERIAL if each in of_faces and face.data[each].dtype.kind in "iu"), None)
     left_out = [
-        *(f'"{other}" of faces' for other in face.data.dtype.names if other not in (lists[0], owner)),
-        *(f'the list "{other}" of vertices' for other in header.lists("vertex")),
+        *(f'"{other}" of faces' for other in face.data.dtype.names if other not in (polygons, owner)),
+        *(f'the list "{other}" of vertices' for other in lists),
     ]
     if left_out:
         warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
-    sizes, vertices = polygons[:2] if polygons is not None else _polygons(face.data[lists[0]])
+    sizes, vertices = _polygons(face.data[polygons])
     if vertices.dtype.kind not in "iu":
         raise CageError(f"{name}: the vertex indices of faces have type {vertices.dtype}; expected integers")
-    materials = {}
-    if owner is not None:
-        materials = _materials(face.data[owner] if polygons is None or polygons.numbers is None else polygons.numbers)
     texcoords, attributes = _vertex_data(vertex.data, numbers)
     return CageContents(
         _columns(vertex.data, POSITION),
@@ -117,55 +149,15 @@ def _contents(content: bytes, header: PlyHeader) -> CageContents:
         vertices,
         texcoords=texcoords,
         attributes=attributes,
-        materials=materials,
-        source=CageSource(name, 0, header.lines("vertex"), header.lines("face")),
+        materials={} if owner is None else _materials(face.data[owner]),
+        source=CageSource(name, 0, lines.get("vertex"), lines.get("face")),
     )
 
 
-def _elements(content: bytes, header: PlyHeader) -> dict[str, PlyElement]:
-    name, lengths = header.name, header.tables(content)[0]
-    are_tables = lengths.keys() == header.elements.keys()
-    try:
-        from plyfile import PlyData, PlyParseError
-    except ImportError:
-        raise CageError(
-            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[ply]"'
-        ) from None
-    try:
-        with warnings.catch_warnings():
-            # For elements without rows NumPy warns, and plyfile then raises an error.
-            warnings.simplefilter("ignore", UserWarning)
-            # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
-            warnings.simplefilter("error", DeprecationWarning)
-            if lengths and (are_tables or not header.has_signed_lengths):
-                # Plyfile maps tables, and reads all else row by row, which takes a hundred times as long. A file of our
-                # own, as the process would end if another program cut a mapped one.
-                with tempfile.TemporaryFile() as file:
-                    file.write(content)
-                    file.seek(0)
-                    found = PlyData.read(file, known_list_len=lengths)
-            else:
-                found = PlyData.read((_Bytes if header.has_signed_lengths else io.BytesIO)(content), mmap=False)
-            return {element.name: element for element in found}
-    except UnicodeDecodeError:
-        raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
-    except OverflowError:
-        where = header.out_of_range(content) or "an integer is out of the range of its type"
-        raise CageError(f"{name}, {where}") from None
-    except (PlyParseError, ValueError, DeprecationWarning) as error:
-        cut = " (is the file cut short?)" if "early end" in str(error) else ""
-        what = re.sub(r"^line \d+: ", "", str(error))
-        raise CageError(f"{name}{_place(error, header)}: {shortened(what, 200)}{cut}; {EXPECTED}") from None
-
-
-def _place(error: Exception, header: PlyHeader) -> str:
-    """Line of an error of plyfile, in the header or in an ASCII file, as a message has it; empty if there is none."""
-    line, row, element = (getattr(error, name, None) for name in ("line", "row", "element"))
-    if row is not None and element is not None:
-        lines = header.lines(element.name)
-        if lines is not None:
-            line = lines[min(row, len(lines) - 1)]
-    return "" if line is None else f", line {line}"
+def _properties(element: PlyElement) -> tuple[list[str], list[str]]:
+    """Names of an element's properties that are numbers, and of those that are lists."""
+    lists = [each.name for each in element.properties if hasattr(each, "len_dtype")]
+    return [each.name for each in element.properties if each.name not in lists], lists
 
 
 def _element(elements: dict[str, PlyElement], wanted: str, name: str) -> PlyElement:
@@ -220,12 +212,3 @@ def _columns(data: NDArray, names: Sequence[str], scaled: bool = False) -> NDArr
         highest = np.iinfo(column.dtype).max if scaled and column.dtype.kind == "u" else 1
         columns.append(column.astype(np.float64) / highest)
     return np.stack(columns, axis=1)
-
-
-class _Bytes(io.BytesIO):
-    """A stream that refuses to read a negative number of bytes, for which a list of negative length would ask."""
-
-    def read(self, size: int | None = -1) -> bytes:
-        if size is not None and size < 0:
-            raise ValueError(f"{size} bytes; expected 0 or more")
-        return super().read(size)
