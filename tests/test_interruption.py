@@ -1,10 +1,14 @@
 """Ctrl-C ends commands at once, with a line, the right status and no file."""
 
+import fcntl
 import os
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import threading
+import time
 
 import pytest
 from mitsuba_subdivision.__main__ import main
@@ -93,6 +97,8 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, words, variant, request):
     cube().save(tmp_path / "cube.obj")
     (tmp_path / "scene.xml").write_text(SCENE.format(shading=shading))
     mine, its = pty.openpty()
+    # A terminal of no width would show no progress.
+    fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     command = [sys.executable, "-c", LISTENING, "render", "scene.xml", "-o", "picture.exr"]
     command += ["--spp", SAMPLES, "--variant", variant, *words]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -102,6 +108,8 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, words, variant, request):
     said = os.read(mine, 1000)
     while b"Rendering" not in said:
         said += os.read(mine, 1000)
+    # Mitsuba's own handler is replaced within a moment.
+    time.sleep(1)
     render.send_signal(signal.SIGINT)
     out, _ = render.communicate(timeout=60)
     while b"interrupted" not in said:

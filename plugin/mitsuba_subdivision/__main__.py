@@ -11,7 +11,6 @@ from .cage import CageWarning
 from .commands.command_line import parsed
 from .interruption import Abandoned, interruptible
 from .messages import USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
-from .progress import wipe
 from .whole_file import remove_unfinished
 
 INTERRUPTED = 130
@@ -37,7 +36,6 @@ def _interrupted(stop: KeyboardInterrupt) -> int:
     if is_abandoned:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         remove_unfinished()
-        wipe()
     print_remark("interrupted")
     if is_abandoned:
         os._exit(INTERRUPTED)

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import os
-import re
-import socket
+import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_HOST = re.sub(r"[^\w.]", "_", socket.gethostname())[:32]
-# A temporary file: ".NAME.HOST-PROCESS-NUMBER.part.SUFFIX", and what libraries append to the name while they write.
-_UNFINISHED = re.compile(rf"\..*\.{re.escape(_HOST)}-(\d+)-\d+\.part\b.*")
 # Most characters of a name that are kept: a file name has at most 255 bytes, and a character may take four.
 _LONGEST_STEM = 40
 
-_number = itertools.count(1)
 _unfinished: set[Path] = set()
 
 
@@ -25,9 +19,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; at the end, that file replaces ``path``.
 
     The temporary name has the suffix of ``path``. If writing fails, nothing stays behind, and a file that was there
-    before is as it was. A process that is killed leaves its temporary file; the next process that writes into the
-    folder removes it. If several processes write one file, the last to end wins. Links are followed. Pipes and devices
-    are written to directly.
+    before is as it was. A process that is killed leaves its temporary file, ".NAME.NUMBER.part.SUFFIX". If several
+    processes write one file, the last to end wins. Links are followed. Pipes and devices are written to directly.
 
     Raises
     ------
@@ -42,7 +35,6 @@ def whole_file(path: Path) -> Iterator[Path]:
     path = Path(os.path.realpath(path)) if path.is_symlink() else path
     if not path.parent.is_dir():  # Otherwise messages would name the temporary file.
         raise FileNotFoundError(f'"{path}": there is no folder "{path.parent}"')
-    _remove_leftovers(path.parent)
     beside = _beside(path)
     _unfinished.add(beside)
     try:
@@ -87,7 +79,6 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     if path.exists() and not path.is_file():
         return
     target = Path(os.path.realpath(path))
-    _remove_leftovers(target.parent)
     probe = _beside(target)
     _unfinished.add(probe)
     try:
@@ -124,34 +115,7 @@ def remove_unfinished() -> None:
 
 
 def _beside(path: Path) -> Path:
-    return path.with_name(f".{path.stem[:_LONGEST_STEM]}.{_HOST}-{os.getpid()}-{next(_number)}.part{path.suffix}")
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Remove temporary files from a folder whose processes, on this machine, have ended."""
-    with suppress(OSError):
-        for name in os.listdir(folder):
-            found = _UNFINISHED.fullmatch(name)
-            if found and not _is_being_written(name, int(found[1])):
-                with suppress(OSError):
-                    (folder / name).unlink()
-
-
-def _is_being_written(name: str, process: int) -> bool:
-    if process == os.getpid():
-        # In containers, one process often has the same number as an earlier one.
-        return any(beside.name == name for beside in _unfinished.copy())
-    if os.name != "posix":
-        # On Windows, signal 0 would end the process.
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        # The process of another user.
-        return True
-    return True
+    return path.with_name(f".{path.stem[:_LONGEST_STEM]}.{uuid.uuid4().hex}.part{path.suffix}")
 
 
 def _to_disk(path: Path) -> None:

@@ -269,16 +269,6 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
     assert set(cage.tags.edges) == {0, 10}
 
 
-def test_progress_goes_to_terminals_only(options, capsys, monkeypatch):
-    import sys
-
-    options().progress("a figure", 1, 2)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    options().progress("a figure", 1, 2)
-    assert "50 %" in capsys.readouterr().err
-
-
 @pytest.mark.core
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_a_refinement_step_has_the_points_of_the_report(valence):

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mitsuba_mesh import mitsuba_mesh
+from ..progress import timed
 from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded
 from ..variants import SceneNode
@@ -83,9 +84,8 @@ def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.flo
     """
     width, height = scene.sensors()[0].film().crop_size()
     parts = _parts(options.spp, PART_SAMPLES // (int(width) * int(height)))
-    pixels = render_parts(scene, parts, on_part=lambda index: options.progress(name, index, len(parts)))
-    options.progress(name, len(parts), len(parts))
-    return pixels
+    with timed(name) as at:
+        return render_parts(scene, parts, on_part=lambda index: at(f"part {index + 1} of {len(parts)}"))
 
 
 def _parts(spp: int, most: int) -> list[int]:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..examples import example_file
-from ..progress import draw_bar
 from ..whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -85,8 +84,6 @@ class FigureOptions:
         File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one.
     report : callable
         Is called with a line of text for each step.
-    progress : callable
-        Is called with the name of what is being rendered, how many parts are done, and how many there are.
     """
 
     output: Path
@@ -97,7 +94,6 @@ class FigureOptions:
     scheme: str = "catmull_clark"
     cage: Path | None = None
     report: Callable[[str], None] = field(default=_to_terminal)
-    progress: Callable[[str, int, int], None] = field(default=draw_bar)
 
     def paths(self, name: str, *formats: str) -> list[Path]:
         """Files to write, in the requested formats."""
