@@ -26,14 +26,6 @@ def test_a_row_is_where_it_was_written(size, variants_all_ad_rgb, np_rng):  # no
     np.testing.assert_array_equal(np.array(found).T, rows[index] * active[:, None])
 
 
-@pytest.mark.parametrize("size", [3, 48])
-def test_a_row_of_a_scalar_variant_is_too(size):
-    types = ArrayTypes.of(float)
-    buffer, rows = buffer_and_rows(size, types)
-    assert types.row(buffer, size, 4) == rows[4].tolist()
-    assert types.row(buffer, size, 4, active=False) == [0] * size
-
-
 @pytest.mark.parametrize("size", [3, 28, 48])
 def test_derivatives_by_a_row_return_to_it(size, variants_all_ad_rgb, np_rng):  # noqa: ARG001
     types = ArrayTypes.of(mi.Float)

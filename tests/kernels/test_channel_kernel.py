@@ -127,19 +127,6 @@ def test_derivatives_are_differences(surface, np_rng):
 
 
 @pytest.mark.core
-def test_scalar_variants_compute_the_same_one_by_one(surface, np_rng):
-    element, uv, corner = random_locations(surface, np_rng, 10, deepest=6)
-    kernel = surface.on_device("scalar_rgb")
-    for name in surface.attribute_names:
-        channel = channel_kernel(surface.channel(name), kernel.walk, float)
-        expected = evaluated(surface, name, DOUBLE, element, uv, corner)
-        for k in range(len(element)):
-            found = channel(kernel.walk.at(int(element[k]), *map(float, uv[k]), int(corner[k])))
-            for one, other in zip(found, expected, strict=True):
-                np.testing.assert_allclose(np.ravel(np.array(one)), other[k], rtol=0, atol=1e-12)
-
-
-@pytest.mark.core
 def test_values_differ_across_seams_only(np_rng):
     """The same place, seen from two elements."""
     cage = mixed_torus()

@@ -92,14 +92,3 @@ def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, 
     first.set(upload(float_type, 2 * values))
     np.testing.assert_array_equal(second.flat, kept)
     np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding(float_type))
-
-
-@pytest.mark.parametrize("is_weighted", [False, True])
-def test_scalar_variants_look_up_the_same(weights, is_weighted, np_rng):
-    first, second = np_rng.random((2, COLUMNS, 3))
-    types = ArrayTypes.of(float)
-    values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
-    values.set(second.ravel())
-    expected = weights @ second if is_weighted else second
-    np.testing.assert_allclose(np.array(values.fetch(5)), expected[5], rtol=0, atol=DOUBLE)
-    assert not values.are_moving

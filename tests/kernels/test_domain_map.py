@@ -14,10 +14,8 @@ MOST = 30
 ROUNDED = 2.0**-24
 
 
-@pytest.fixture(params=["float", "Float", "Float64"])
+@pytest.fixture(params=["Float", "Float64"])
 def types(request):
-    if request.param == "float":
-        return ArrayTypes.of(float)
     problem = llvm_problem()
     if problem:
         pytest.skip(problem)
@@ -25,10 +23,8 @@ def types(request):
 
 
 def on_device(function, types, *numbers):
-    """Results of a function for each number, one after the other in a scalar variant."""
-    if types.is_jit:
-        return [np.array(each) for each in function(*map(types.floats, numbers))]
-    return [np.array(each) for each in zip(*(function(*row) for row in zip(*numbers, strict=True)), strict=True)]
+    """Results of a function for some numbers."""
+    return [np.array(each) for each in function(*(types.floats(np.array(each)) for each in numbers))]
 
 
 @pytest.mark.core

@@ -129,18 +129,6 @@ def test_derivatives_follow_nearest_points(name, np_rng):
         np.testing.assert_allclose(one, other, rtol=DIFFERENCES, atol=DIFFERENCES)
 
 
-def test_scalar_variants_find_the_same(np_rng):
-    surface, kernel = surface_named("mixed torus"), kernel_named("mixed torus", "scalar_rgb")
-    size, points = points_near(surface, 5, np_rng)
-    expected = surface.closest_point(points)
-    for k, point in enumerate(points):
-        place = int(expected.element[k]), dr.scalar.Array2f64(expected.uv[k]), int(expected.corner[k])
-        found = kernel.closest(dr.scalar.Array3f64(point), *place)
-        assert abs(found.distance - expected.distance[k]) <= BARS[DOUBLE] * size
-    drawn = kernel.sample(0.25, dr.scalar.Array2f64(0.5, 0.25))
-    assert drawn.pdf > 0
-
-
 def drawn_points(kernel, count, np_rng):
     types = kernel.types
     numbers = np_rng.random((3, count))
@@ -194,6 +182,6 @@ def test_a_kernel_without_cells_draws_none():
 
     surface = surface_named("torus")
     table: PieceTable = surface.pieces()
-    kernel = SurfaceKernel(table, float)
+    kernel = SurfaceKernel(table, dr.llvm.ad.Float)
     with pytest.raises(ValueError, match="the kernel was made without cells to draw from"):
-        kernel.sample(0.5, dr.scalar.Array2f64(0.5, 0.5))
+        kernel.sample(0.5, dr.llvm.ad.Array2f(0.5, 0.5))

@@ -161,27 +161,6 @@ def test_derivatives_of_normals_are_those_of_the_surface(name, np_rng):
         assert (np.abs(vectors(derivative) - across).max(axis=1) / scale).max() <= BARS[DOUBLE]["derivative"]
 
 
-@pytest.mark.core
-@pytest.mark.parametrize("name", ["hexagon", "chaikin", "loop corner", "doo_sabin mixed torus"])
-def test_scalar_variants_compute_the_same_one_by_one(name, np_rng):
-    surface, kernel, scalar = (
-        surface_named(name),
-        kernel_named(name, DOUBLE),
-        surface_named(name).on_device("scalar_rgb"),
-    )
-    # Deeper, derivatives of normals are small differences of large numbers.
-    element, uv, corner = random_locations(surface, np_rng, 25, deepest=5)
-    uv[0] = 0
-    expected = evaluated(kernel, *on_device(kernel.types, element, uv, corner), derivatives=2)
-    for k, place in enumerate(zip(element, uv, corner, strict=True)):
-        # NumPy's own numbers, too.
-        found = scalar.evaluate(place[0], place[1], place[2], derivatives=2)
-        # At an extraordinary point there are no derivatives of the normal.
-        for column in ("p", "n", "dp_du", "dp_dv", "dn_du", "dn_dv")[: 4 if k == 0 else 6]:
-            one, other = np.array(getattr(found, column)), vectors(getattr(expected, column))[k]
-            np.testing.assert_allclose(one, other, rtol=BARS[DOUBLE]["derivative"], atol=BARS[DOUBLE]["point"])
-
-
 def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     surface = surface_named("mixed torus")
     refine_first(monkeypatch)
@@ -195,8 +174,6 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[DOUBLE]["point"])
     np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BARS[DOUBLE]["normal"])
     assert unequal(found.dp_du, expected.dp_du).max() <= BARS[DOUBLE]["derivative"]
-    scalar = refined.on_device("scalar_rgb").evaluate(int(element[30]), dr.scalar.Array2f64(uv[30]), int(corner[30]))
-    np.testing.assert_allclose(np.array(scalar.p), expected.p[30], rtol=0, atol=BARS[DOUBLE]["point"])
 
 
 @pytest.mark.parametrize("levels", range(PIECE_LEVELS))
@@ -611,13 +588,10 @@ def test_control_points_can_be_others_but_not_more():
         kernel.set_control_points(dr.zeros(kernel.types.float, 21))
 
 
-@pytest.mark.parametrize("variant", [SINGLE, "scalar_rgb"])
-def test_control_points_and_places_have_any_natural_form(variant):
-    kernel, p = LimitSurface(cube()).on_device(variant), 2 * cube().positions
-    forms = [p, p.ravel(), p.astype(np.float32).tolist()]
-    if variant == SINGLE:
-        tensor, point = upload(dr.llvm.ad.TensorXf, p), upload(kernel.types.vector3, p)
-        forms += [tensor, point, kernel.types.floats(p.ravel())]
+def test_control_points_and_places_have_any_natural_form():
+    kernel, p = LimitSurface(cube()).on_device(SINGLE), 2 * cube().positions
+    tensor, point = upload(dr.llvm.ad.TensorXf, p), upload(kernel.types.vector3, p)
+    forms = [p, p.ravel(), p.astype(np.float32).tolist(), tensor, point, kernel.types.floats(p.ravel())]
     for each in forms:
         kernel.set_control_points(cube().positions)
         kernel.set_control_points(each)
@@ -629,7 +603,8 @@ def test_control_points_and_places_have_any_natural_form(variant):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("opencl_rgb",), 'variant "opencl_rgb"; expected one of Mitsuba\'s, which begin with scalar, llvm or cuda'),
+        (("opencl_rgb",), 'variant "opencl_rgb"; expected one of Mitsuba\'s for arrays, which begin with llvm or cuda'),
+        (("scalar_rgb",), 'variant "scalar_rgb"; expected one of Mitsuba\'s for arrays, which begin with llvm or cuda'),
         ((SINGLE, "power"), 'evaluator "power"; expected "stabilized" or "stam" on a device'),
     ],
 )
@@ -644,4 +619,3 @@ def test_regular_and_irregular_surfaces_have_the_precision_of_their_variant():
         assert surface.on_device(SINGLE).types.float is dr.llvm.ad.Float
         assert surface.on_device(DOUBLE).types.float is dr.llvm.ad.Float64
         assert surface.on_device("llvm_rgb").types.float is dr.llvm.Float
-        assert surface.on_device("scalar_rgb").types.float is float

@@ -6,7 +6,7 @@ import sys
 from dataclasses import dataclass
 from functools import cached_property
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -29,8 +29,7 @@ class ArrayTypes:
     Attributes
     ----------
     float, index, vector2, vector3, vector4, index2, index4 : type
-        ``index``, ``index2`` and ``index4`` hold unsigned 32-bit integers. In scalar variants, ``float`` and ``index``
-        are Python's float and int.
+        ``index``, ``index2`` and ``index4`` hold unsigned 32-bit integers.
     """
 
     float: type
@@ -42,29 +41,16 @@ class ArrayTypes:
     index4: type
 
     @cached_property
-    def is_jit(self) -> bool:
-        """Whether arrays belong to a JIT backend; in scalar variants, each is one number."""
-        return bool(dr.is_jit_v(self.float))
-
-    @property
-    def loops(self) -> Literal["symbolic", "scalar"]:
-        """Mode of `drjit.while_loop`: symbolic, which also works inside functions called per shape."""
-        return "symbolic" if self.is_jit else "scalar"
-
-    @cached_property
     def is_double(self) -> bool:
         """Whether floats have 64 bits."""
-        return not self.is_jit or dr.type_v(self.float) == dr.VarType.Float64
+        return bool(dr.type_v(self.float) == dr.VarType.Float64)
 
     @classmethod
     def of(cls, float_type: type) -> ArrayTypes:
         """The types of the same backend and precision as a flat array, such as ``drjit.llvm.ad.Float``.
 
-        ``float`` stands for scalar variants. Raises RuntimeError if kernels of the backend would end the process.
+        Raises RuntimeError if kernels of the backend would end the process.
         """
-        if float_type is float:
-            scalar = dr.scalar
-            return cls(float, int, scalar.Array2f64, scalar.Array3f64, scalar.Array4f64, scalar.Array2u, scalar.Array4u)
         if dr.backend_v(float_type) == dr.JitBackend.LLVM:
             require_llvm()
         arrays = sys.modules[float_type.__module__]
@@ -74,7 +60,7 @@ class ArrayTypes:
 
     @property
     def _module(self) -> ModuleType:
-        """Dr.Jit's module of the type; of JIT variants."""
+        """Dr.Jit's module of the type."""
         return sys.modules[self.float.__module__]
 
     @property
@@ -85,13 +71,11 @@ class ArrayTypes:
     @property
     def index64(self) -> type:
         """Unsigned integers of 64 bits."""
-        return self._module.UInt64 if self.is_jit else int
+        return self._module.UInt64
 
     @property
     def matrix4(self) -> type:
         """Matrices of four rows and columns."""
-        if not self.is_jit:
-            return dr.scalar.Matrix4f64
         return self._module.Matrix4f64 if self.is_double else self._module.Matrix4f
 
     def vector(self, size: int) -> type:
@@ -100,13 +84,11 @@ class ArrayTypes:
 
     def indices(self, *parts: NDArray[np.integer]) -> IndexBuffer:
         """Upload integer arrays, flattened and concatenated."""
-        if self.is_jit:
-            return mapped(self.index, *parts)
-        return np.concatenate(parts, axis=None, dtype=np.uint32, casting="unsafe")
+        return mapped(self.index, *parts)
 
     def floats(self, values: NDArray[np.floating]) -> FloatBuffer:
         """Upload an array of numbers, flattened."""
-        return mapped(self.float, values) if self.is_jit else np.array(values, dtype=np.float64).ravel()
+        return mapped(self.float, values)
 
     def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
         """Upload an array of numbers, flattened; equal ones share their memory while one is referenced."""
@@ -115,9 +97,7 @@ class ArrayTypes:
 
     def given(self, kind: type, values: Any) -> Any:
         """A user's values as an array of one of these types; vectors of NumPy have a row for each component."""
-        if self.is_jit and isinstance(values, np.ndarray):
-            return mapped(kind, values.T)
-        return kind(values)
+        return mapped(kind, values.T) if isinstance(values, np.ndarray) else kind(values)
 
     def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:
         """Gather a number or a vector from an array that `indices` or `floats` uploaded.
@@ -131,28 +111,17 @@ class ArrayTypes:
         active : mask
             Inactive lanes read zero.
         """
-        if self.is_jit:
-            return dr.gather(kind, buffer, index, active)
-        if not active:
-            return kind(0)
-        if kind in (float, int):
-            return kind(buffer[index])
-        size = dr.size_v(kind)
-        return kind(buffer[size * index : size * (index + 1)])
+        return dr.gather(kind, buffer, index, active)
 
     def row(self, buffer: FloatBuffer, size: int, index: Index, active: Mask = True) -> list[Float]:
         """Gather a row of as many numbers from an array of such rows; more than one.
 
         In one operation, which reads them in the largest packets that the backend has.
         """
-        if self.is_jit:
-            return [*dr.gather(self._many, buffer, index, active, shape=(size, dr.width(index)))]
-        return buffer[size * index : size * (index + 1)].tolist() if active else [0.0] * size
+        return [*dr.gather(self._many, buffer, index, active, shape=(size, dr.width(index)))]
 
     def padded(self, flat: FloatBuffer) -> FloatBuffer:
         """Pad flat 3-vectors to four components, for packet loads."""
-        if not self.is_jit:
-            return np.pad(np.reshape(flat, (-1, 3)), ((0, 0), (0, 1))).ravel()
         v: Vector3 = dr.unravel(self.vector3, flat)
         return dr.ravel(self.vector4(v.x, v.y, v.z, 0))
 
@@ -167,7 +136,7 @@ class ArrayTypes:
 
 
 def float_type_of(variant: str) -> type:
-    """Flat float array type of a variant of Mitsuba; ``float`` for scalar variants.
+    """Flat float array type of a variant of Mitsuba.
 
     Parameters
     ----------
@@ -177,13 +146,11 @@ def float_type_of(variant: str) -> type:
     Raises
     ------
     ValueError
-        If the variant's backend is unknown.
+        If the variant is scalar, or its backend is unknown.
     """
     backend, *features = variant.split("_")
-    if backend == "scalar":
-        return float
     if backend not in ("llvm", "cuda"):
-        raise ValueError(f'variant "{variant}"; expected one of Mitsuba\'s, which begin with scalar, llvm or cuda')
+        raise ValueError(f'variant "{variant}"; expected one of Mitsuba\'s for arrays, which begin with llvm or cuda')
     arrays = getattr(dr, backend)
     if "ad" in features:
         arrays = arrays.ad

@@ -50,8 +50,6 @@ class SubdividedChannelKernel:
         self._size = size = channel.values.shape[1]
 
         def make(values: FloatBuffer) -> FloatBuffer:
-            if not types.is_jit:
-                return coefficients(np.pad(values, ((0, 0), (0, 3 - size))))
             own: Value = values if size == 1 else dr.unravel(types.vector(size), values)
             return coefficients(dr.ravel(types.vector3(*([own] if size == 1 else own), *[0] * (3 - size))))
 

@@ -51,37 +51,7 @@ class CoefficientMap:
         made : flat array, optional
             The coefficients if they are known, to attach them to the points only.
         """
-        if not self._types.is_jit:
-            return self._on_host(np.asarray(points, dtype=np.float64).reshape(-1, 3))
         return dr.custom(_Coefficients, self, points, made)
-
-    def _on_host(self, points: np.ndarray) -> np.ndarray:
-        table = self._table
-        if table.refinement is not None:
-            points = table.refinement @ points
-        found, of_piece = np.zeros((table.packet_count, PACKET)), table.packets_of_piece
-        for maps, (first, count, control_count, first_piece, piece_count, first_ring, ring) in zip(
-            table.maps, table.classes.astype(np.int64), strict=True
-        ):
-            controls = points[table.controls[first : first + count * control_count].reshape(control_count, count)]
-            # Sums are relative to the first control point, to lose fewer digits.
-            relative = controls - controls[0]
-            if ring:
-                own = found[first_ring:][: count * ring].reshape(count, ring, PACKET)
-                own[..., :3] = relative.swapaxes(0, 1)
-                own[:, 0, :3] = controls[0]
-            relative = relative.reshape(control_count, -1)
-            own = found[of_piece * first_piece :][: of_piece * count * piece_count]
-            own = own.reshape(count, piece_count, PACKET * of_piece)
-            for begin, stencils, pieces in maps:
-                own_count, monomial_count, _ = pieces.shape
-                parts = relative if stencils is None else stencils @ relative
-                made = pieces.reshape(own_count * monomial_count, -1) @ parts
-                coefficients = made.reshape(own_count, monomial_count, count, 3).transpose(2, 0, 1, 3)
-                rows = own[:, begin : begin + own_count]
-                rows[..., : 3 * monomial_count] = coefficients.reshape(count, own_count, -1)
-                rows[..., :3] += controls[0][:, None]
-        return found.ravel()
 
     def apply(self, points: FloatBuffer) -> FloatBuffer:
         """The coefficients on a device, without derivatives."""

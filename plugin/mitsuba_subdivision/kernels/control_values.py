@@ -106,9 +106,6 @@ class ControlValues:
         self._types, self.size, self._make = types, values.shape[1], make
         self.flat: FloatBuffer = None
         self._shared: LaterArray | None = None
-        if not types.is_jit:
-            self.set(values)
-            return
         self.flat = types.float()
         # Kept, so that others that are equal share the memory.
         self._given = types.shared_floats(values)
@@ -117,10 +114,6 @@ class ControlValues:
 
     def set(self, values: FloatBuffer) -> None:
         """Set new values of the cage, flat. Later lookups are attached to them."""
-        if not self._types.is_jit:
-            given = np.array(values, dtype=np.float64).reshape(-1, self.size)
-            self.flat = np.ravel(given if self._make is None else self._make(given))
-            return
         self.flat[:] = self._made(values)
         self._shared = None
 
@@ -133,7 +126,7 @@ class ControlValues:
     @property
     def are_moving(self) -> bool:
         """Whether there are derivatives by the values."""
-        return self._types.is_jit and bool(dr.grad_enabled(self.flat))
+        return bool(dr.grad_enabled(self.flat))
 
     def fetch(self, index: Index, active: Mask = True) -> Value:
         """Gather the value at an index, where a mask is set."""

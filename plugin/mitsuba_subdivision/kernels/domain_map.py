@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 
 import drjit as dr
@@ -81,13 +80,9 @@ def doublings(types: ArrayTypes, x: Float, most: Index) -> tuple[Index, Float]:
     most : index array
         The number of times at most.
     """
-    count: Index
-    if not types.is_jit:
-        count = min(max(-math.frexp(x)[1], 0), most)
-        return count, math.ldexp(1.0, count)
     integer, mantissa, bias = (types.index64, 52, 1023) if types.is_double else (types.index, 23, 127)
     bits: Index = dr.reinterpret_array(integer, dr.detach(x))
-    count = dr.minimum(bias - 1 - dr.minimum(bits >> mantissa, bias - 1), integer(most))
+    count: Index = dr.minimum(bias - 1 - dr.minimum(bits >> mantissa, bias - 1), integer(most))
     return types.index(count), dr.reinterpret_array(types.float, (count + bias) << mantissa)
 
 

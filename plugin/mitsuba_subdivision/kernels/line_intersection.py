@@ -186,7 +186,7 @@ class LineIntersection:
         begin = (types.index(ON_LINE), types.index(0), zero, zero > 1, d, location.half_edge, location.u, location.v)
         state = (*begin, *(d * 0 for _ in range(4)))
         aim, _, _, _, _, half_edge, u, v, *values = dr.while_loop(
-            state, continues, search, mode=types.loops, label="line_intersection"
+            state, continues, search, mode="symbolic", label="line_intersection"
         )
         corner = self._walk.corner(half_edge, active)
         first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
@@ -247,6 +247,6 @@ class LineIntersection:
         begin = (types.index(STEPS_IN_ROUND + 1), type(d)(d), zero, zero, zero, zero > 1)
         state = (*begin, *(d * 0 for _ in range(4)))
         _, d, u, v, length, is_along_surface, *values = dr.while_loop(
-            state, continues, step, mode=types.loops, label="newton"
+            state, continues, step, mode="symbolic", label="newton"
         )
         return _Round(d, u, v, length, is_along_surface, PatchValues(*values))

@@ -139,7 +139,7 @@ class NearestLocation:
         zero = types.float(0)
         begin = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
         state = (*begin, zero, zero, zero > 1)
-        _, half_edge, u, v, *_ = dr.while_loop(state, continues, step, mode=types.loops, label="nearest_location")
+        _, half_edge, u, v, *_ = dr.while_loop(state, continues, step, mode="symbolic", label="nearest_location")
         # A last step at the final location, seen from the first corner, for the direction in which it may move.
         location = self._walk.from_first(Location(half_edge, u, v), active)
         values = self._piece(location.half_edge, location.u, location.v, active).values(derivatives=2)

@@ -248,13 +248,13 @@ class Piece:
 
         sum_count = size * (1 + len(by) + (0 if frame is None else 2))
         # It sums only, so that derivatives pass through it backwards without a record of its iterations.
-        keywords: dict[str, Any] = {"max_iterations": -1} if types.is_jit and dr.grad_enabled(self.buffer) else {}
+        keywords: dict[str, Any] = {"max_iterations": -1} if dr.grad_enabled(self.buffer) else {}
         _, *sums = dr.while_loop(
             # The other control points are relative to the first.
             (types.index(1), *(types.float(0) for _ in range(sum_count))),
             lambda k, *_: k < tip.control_count,
             add,
-            mode=types.loops,
+            mode="symbolic",
             label="tip",
             **keywords,
         )
@@ -354,10 +354,9 @@ class PieceKernel:
             How many of a coefficient's three numbers are wanted.
         """
         types, domain = self.types, self.domain
-        if types.is_jit:
-            # Dr.Jit evaluates this again for derivatives, and must find the same array then, whatever the
-            # object has been assigned since.
-            buffer = type(buffer)(buffer)
+        # Dr.Jit evaluates this again for derivatives, and must find the same array then, whatever the object has been
+        # assigned since.
+        buffer = type(buffer)(buffer)
         if row is None:
             row = self.walk.row(half_edge, active)
         code, scale, quarter = row[CODE], types.float(1), types.index(0)
@@ -463,7 +462,7 @@ class PieceKernel:
                 dr.select(is_only, scale, scale * inner_scale),
             )
 
-        return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode=types.loops, label="piece_tree")
+        return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode="symbolic", label="piece_tree")
 
     def _at_level(
         self, is_tip: Mask, level_count: Index, u: Float, v: Float, scale: Float

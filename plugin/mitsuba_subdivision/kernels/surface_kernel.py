@@ -75,7 +75,7 @@ class SurfaceKernel:
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
-        self.coefficients: FloatBuffer = float_type() if self.types.is_jit else None
+        self.coefficients: FloatBuffer = float_type()
         self._loaded: LaterArray | None = None
 
     def set_control_points(self, points: FloatBuffer) -> None:
@@ -111,9 +111,6 @@ class SurfaceKernel:
 
     def take(self, coefficients: FloatBuffer) -> None:
         """Take over coefficients, maybe equal ones with other derivatives."""
-        if not self.types.is_jit:
-            self.coefficients = coefficients
-            return
         # Literals would be compiled into kernels.
         dr.make_opaque(coefficients)
         # Assign in place, because others may hold a reference to the array.

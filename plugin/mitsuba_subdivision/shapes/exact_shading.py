@@ -96,14 +96,12 @@ class ExactShading:
         self, variant: Variant, surface: LimitSurface, positions: NDArray[np.float64], *, use_stam: bool
     ) -> None:
         self._variant = variant
-        self._is_jit = dr.is_jit_v(variant.Float)
         self._name = surface.cage.source.name
-        float_type = variant.Float if self._is_jit else float
         pieces = surface.pieces("stam" if use_stam else "stabilized")
-        self.kernel = SurfaceKernel(pieces, float_type, use_stam=use_stam)
+        self.kernel = SurfaceKernel(pieces, variant.Float, use_stam=use_stam)
         self.kernel.load(positions)
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)
-        self._counts: IndexBuffer = []
+        self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
         self.take_counts()
         self._limit_surface = surface
         self._channels: dict[str, ChannelKernel] = {}
@@ -111,7 +109,7 @@ class ExactShading:
         self._attributes = {
             mesh_name(name): self.channel(name)
             for name, attribute in surface.cage.attributes.items()
-            if self._is_jit and attribute.values.shape[1] in WIDTHS
+            if attribute.values.shape[1] in WIDTHS
         }
         self._colors = {
             name for name, channel in self._attributes.items() if holds_spectra(variant, name, channel.values.size)
@@ -179,8 +177,6 @@ class ExactShading:
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the arrays that gradients pass through: forward mode reaches a rendering through such arrays only."""
-        if not self._is_jit:
-            return
         differentiable = mi.ParamFlags.Differentiable
         callback.put("shading_coefficients", self.kernel.coefficients, differentiable)
         callback.put("shading_to_world", self.to_world, differentiable)
@@ -244,10 +240,7 @@ class ExactShading:
             )
             log: Any = mi.Log  # Mitsuba's stub says of this function only that it is an object.
             log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
-        if self._is_jit:
-            dr.scatter_add(self._counts, self.kernel.types.index(1), kind, active)
-        elif active:
-            self._counts[kind] += 1
+        dr.scatter_add(self._counts, self.kernel.types.index(1), kind, active)
 
     def take_counts(self) -> list[int]:
         """Number of hits since the last call that were found on the ray, along a normal, and not at all.
@@ -255,7 +248,7 @@ class ExactShading:
         Hits are counted at the log level Debug only.
         """
         counts = np.array(self._counts).tolist()
-        self._counts = dr.zeros(self.kernel.types.index, len(_KINDS)) if self._is_jit else [0] * len(_KINDS)
+        self._counts = dr.zeros(self.kernel.types.index, len(_KINDS))
         return counts
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
@@ -295,12 +288,6 @@ class ExactShading:
         index, b1, b2 = np.repeat(np.arange(face_count), 3), *np.tile(np.eye(3)[1:], face_count)
         if self._are_turned:
             b1, b2 = b2, b1
-        if not self._is_jit:
-            found = [
-                self._texcoords(self._triangles(*corner, True), True)[0]
-                for corner in zip(index.tolist(), b1.tolist(), b2.tolist(), strict=True)
-            ]
-            return np.array(found)
         types = self.kernel.types
         with dr.suspend_grad():
             location = self._triangles(types.indices(index), types.floats(b1), types.floats(b2), True)

@@ -525,4 +525,6 @@ def _is_exact(parameters: Parameters, variant: Variant) -> bool:
         from .exact_shading_support import exact_shading_problem
 
         return exact_shading_problem(variant) is None
+    if parameters.shading == "exact" and not dr.is_jit_v(variant.Float):
+        raise ValueError('shading: "exact" in a scalar variant; expected "vertex", "auto", or an llvm or cuda variant')
     return parameters.shading == "exact"

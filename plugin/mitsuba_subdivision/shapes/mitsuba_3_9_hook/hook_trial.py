@@ -79,18 +79,17 @@ def trial_problem(variant: Variant, attach: Callable[[mi.Mesh, Trial], None]) ->
     if _identity(interaction().uv) != _identity(answered) or trial.asked != expected:
         return "compute_surface_interaction does not pass on its arguments, or its result"
     questions: list[Callable[[], Any]] = [interaction]
-    if dr.is_jit_v(variant.Float):
-        si = dr.zeros(variant.SurfaceInteraction3f)
-        si.t = variant.Float(_DISTANCE)
-        for function, name, answer in (
-            (shape.eval_attribute, "face_one", variant.UnpolarizedSpectrum(_VALUE[0])),
-            (shape.eval_attribute_1, "face_one", variant.Float(_VALUE[0])),
-            (shape.eval_attribute_3, "face_three", variant.Color3f(*_VALUE)),
-        ):
-            found = function(name, si, active)
-            if _identity(found) != _identity(answer) or trial.asked != [name, *_identity(si.t, active)]:
-                return f"{function.__name__} does not pass on its arguments, or its result"
-            questions.append(partial(function, name, si, active))
+    si = dr.zeros(variant.SurfaceInteraction3f)
+    si.t = variant.Float(_DISTANCE)
+    for function, name, answer in (
+        (shape.eval_attribute, "face_one", variant.UnpolarizedSpectrum(_VALUE[0])),
+        (shape.eval_attribute_1, "face_one", variant.Float(_VALUE[0])),
+        (shape.eval_attribute_3, "face_three", variant.Color3f(*_VALUE)),
+    ):
+        found = function(name, si, active)
+        if _identity(found) != _identity(answer) or trial.asked != [name, *_identity(si.t, active)]:
+            return f"{function.__name__} does not pass on its arguments, or its result"
+        questions.append(partial(function, name, si, active))
     trial.fails = True
     raised = [_raises(ask) for ask in questions]
     # Scenes call the functions of all existing shapes.
@@ -115,13 +114,12 @@ def _triangle(variant: Variant) -> mi.Mesh:
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
             if name == "vertex_positions":
                 corners = [1, 2, 3, 4, 6, 5, 9, 7, 8]
-                variant.set_property(value, cpp_type, variant.Float(corners) if is_jit else dr.scalar.ArrayXf(corners))
+                variant.set_property(value, cpp_type, variant.Float(corners))
 
     # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
     class Triangle(variant.Mesh):
         """Mesh derived in Python."""
 
-    is_jit = dr.is_jit_v(variant.Float)
     mesh = Triangle("triangle", vertex_count=3, face_count=1)
     for name, size in _ATTRIBUTES.items():
         mesh.add_attribute(name, size, [0.0] * size)
@@ -130,11 +128,8 @@ def _triangle(variant: Variant) -> mi.Mesh:
 
 
 def _identity(*values: Any) -> list[Any]:
-    """Dr.Jit variable indices of values; the values themselves in scalar variants."""
+    """Dr.Jit variable indices of values."""
     found: list[Any] = []
     for value in values:
-        if dr.depth_v(value) > (1 if dr.is_jit_v(value) else 0):
-            found += _identity(*value)
-        else:
-            found.append(value.index if dr.is_jit_v(value) else value)
+        found += _identity(*value) if dr.depth_v(value) > 1 else [value.index]
     return found

@@ -24,7 +24,6 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Container
-from contextlib import nullcontext
 from functools import lru_cache
 from types import TracebackType
 from typing import Any, NoReturn, Protocol
@@ -136,16 +135,12 @@ class Answers(Protocol):
     ) -> None:
         """Complete a surface interaction.
 
-        Called after Mitsuba has filled in that of the triangle, while a kernel is traced; in scalar variants for every
-        hit.
+        Called after Mitsuba has filled in that of the triangle, while a kernel is traced.
         """
         ...
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
-        """Value of a mesh attribute at a surface interaction, or None for Mitsuba's own value.
-
-        In scalar variants Mitsuba's own is taken.
-        """
+        """Value of a mesh attribute at a surface interaction, or None for Mitsuba's own value."""
         ...
 
 
@@ -170,25 +165,20 @@ class InteractionHook:
         if problem is not None:
             raise RuntimeError(problem)
         self._variant, self._bindings = variant, _Bindings()
-        self._is_jit = dr.is_jit_v(variant.Float)
-        self._collection = paused_collection if self._is_jit else nullcontext
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
         # Tags of the groups that a shape has been found in.
         self._tags: WeakKeyDictionary[Answers, set[int]] = WeakKeyDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._answer_interaction(entries)
-        if self._is_jit:
-            # In scalar variants their results are numbers in registers, which no function of Python can return.
-            spectrum = variant.UnpolarizedSpectrum
-            self._answer_attribute(entries, "", spectrum, {1, dr.size_v(spectrum)})
-            self._answer_attribute(entries, "_1", variant.Float, {1})
-            self._answer_attribute(entries, "_3", variant.Color3f, {3})
+        spectrum = variant.UnpolarizedSpectrum
+        self._answer_attribute(entries, "", spectrum, {1, dr.size_v(spectrum)})
+        self._answer_attribute(entries, "_1", variant.Float, {1})
+        self._answer_attribute(entries, "_3", variant.Color3f, {3})
         self._table = (ctypes.c_void_p * len(entries))(*entries)
         problem = trial_problem(variant, self.attach)
         if problem is not None:
             raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
-        if self._is_jit:
-            self._tag_groups()
+        self._tag_groups()
 
     def attach(self, shape: mi.Mesh, answers: Answers) -> None:
         """Override a shape's functions. The shape keeps the answers alive."""
@@ -212,8 +202,7 @@ class InteractionHook:
         return found
 
     def _mask_at(self, value: int) -> Mask:
-        """A mask that is passed by its address in variants with a backend, and as a byte in others."""
-        return self._object_at(self._variant.Mask, value) if self._is_jit else bool(value & 0xFF)
+        return self._object_at(self._variant.Mask, value)
 
     def _answer_interaction(self, entries: list[int]) -> None:
         """Override ``compute_surface_interaction``."""
@@ -227,7 +216,7 @@ class InteractionHook:
             if answers is None or (tag and tag not in self._tags[answers]):
                 return
             # A scene that is collected while a function is being frozen ends the process.
-            with self._collection():
+            with paused_collection():
                 answers.complete(
                     self._object_at(result_type, result),
                     self._object_at(ray_type, ray),
@@ -238,7 +227,7 @@ class InteractionHook:
 
         # Shapes outside every group are called inside all instances, and return zeros, which are one variable. Other
         # shapes set a point, and leave the time zero.
-        equal = self._offsets(dr.zeros(result_type), "p", "time") if self._is_jit else None
+        equal = self._offsets(dr.zeros(result_type), "p", "time")
         self._put(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS, result_type, answer, equal)
 
     def _tag_groups(self) -> None:
@@ -273,7 +262,7 @@ class InteractionHook:
             if answers is None:
                 return
             given = self._object_at(variant.SurfaceInteraction3f, si)
-            with self._collection():
+            with paused_collection():
                 value = answers.attribute(ctypes.string_at(text, length).decode(), given, self._mask_at(active))
             size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
             if size == 3 and result_type is variant.UnpolarizedSpectrum:
