@@ -85,7 +85,6 @@ def test_work_that_ends_itself_by_an_interrupt_is_told(monkeypatch, capsys):
     ("variant", "shading", "words"),
     [
         ("scalar_rgb", "vertex", []),
-        ("scalar_rgb", "exact", ["--passes", "2"]),
         ("llvm_ad_rgb", "vertex", ["--passes", "2"]),
         ("llvm_ad_rgb", "exact", []),
     ],

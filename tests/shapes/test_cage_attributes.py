@@ -19,6 +19,7 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 from reference.refined_cages import refine_first
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
+every_array_variant = pytest.mark.usefixtures("variants_array_rgb")
 every_ad_variant = pytest.mark.usefixtures("variants_all_ad_rgb")
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
 shadings = pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
@@ -210,7 +211,7 @@ def hits(shape):
 
 # Vertices of the other cages follow in test_an_update_equals_a_new_shape; hits compile kernels for seconds.
 @exact
-@every_variant
+@every_array_variant
 @pytest.mark.parametrize("cage", ["refined", "loop", "adaptive mixed"], indirect=True)
 def test_hits_follow(cage):
     made, parameters = cage

@@ -492,7 +492,7 @@ def test_both_strategies_find_the_same_light_of_coarse_triangles():
     assert means == pytest.approx([means[2]] * 3, rel=ENERGY)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 @pytest.mark.parametrize("displacement", [None, "vertex_heat"])
 @pytest.mark.parametrize("kind", ["bitmap", "checkerboard"])
 def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
@@ -513,8 +513,7 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
         si = scene.ray_intersect(mi.Ray3f([1.9, 0.3, 4], [0, 0, -1]))
         drawn = (scene.sample_emitter_direction(si, mi.Point2f(*xy), False)[0] for xy in ([0.2, 0.7], [0.9, 0.4]))
         points.append([np.array(each.p).ravel() for each in drawn])
-        # In scalar variants, a picture takes a minute.
-        means.append(np.array(mi.render(scene, spp=256)).mean() if dr.is_jit_v(mi.Float) else 0)
+        means.append(np.array(mi.render(scene, spp=256)).mean())
     np.testing.assert_allclose(points[0], points[1], rtol=0, atol=SINGLE)
     assert means[0] == pytest.approx(means[1], rel=ENERGY)
 
@@ -548,26 +547,26 @@ def test_attributes_are_those_of_the_surface_on_both_sides(eye):
     assert np.median(np.abs(coarse - fine)) < 1e-4
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@llvm
 def test_a_plane_is_met_without_a_step():
     points = np.stack([*np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0]), np.zeros((3, 3))], axis=-1).reshape(-1, 3)
     plane = ControlCage(points, [[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]])
     scene = mi.load_dict({"type": "scene", "shape": make(plane, tessellation_rate=1)})
     for x, y in np.random.default_rng(3).uniform(0.2, 1.8, (10, 2)):
-        si = scene.ray_intersect(mi.Ray3f([x, y, 3], [0, 0, -1]))
-        np.testing.assert_allclose([*si.p, *si.n], [x, y, 0, 0, 0, 1], atol=SINGLE)
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(float(x), float(y), 3), mi.Vector3f(0, 0, -1)))
+        np.testing.assert_allclose(np.ravel([si.p, si.n]), [x, y, 0, 0, 0, 1], atol=SINGLE)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_all_hits_are_counted_for_the_log(monkeypatch):
     """With the level Debug, by where they were found; the shape logs those before the latest."""
     plane = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="edge_and_corner")
     scene, logged = mi.load_dict({"type": "scene", "shape": make(plane, tessellation_rate=1)}), []
     monkeypatch.setattr(mi, "Log", lambda _level, text: logged.append(text))
     monkeypatch.setattr(mi, "log_level", lambda: mi.LogLevel.Debug)
-    count = 5 if dr.is_jit_v(mi.Float) else 1
+    count = 5
     for _ in range(2):
-        ray = mi.Ray3f(mi.Point3f(mi.Float([0.3] * count) if count > 1 else 0.3, 0.6, 3), mi.Vector3f(0, 0, -1))
+        ray = mi.Ray3f(mi.Point3f(mi.Float([0.3] * count), 0.6, 3), mi.Vector3f(0, 0, -1))
         dr.eval(scene.ray_intersect(ray).n)
     (text,) = logged
     assert f"of {count} hits, 100.00% are on the ray, 0.00% are along" in text
@@ -724,7 +723,7 @@ def test_shapes_of_equal_cages_share_coefficients_until_one_moves():
 # Variants
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono"])
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
 def test_variants_agree(variant, request):
     request.getfixturevalue("variant_llvm_ad_rgb")
     small = {"resolution": 6, "fov": 12}
@@ -747,9 +746,7 @@ def test_variants_agree(variant, request):
     np.testing.assert_allclose(gray()[..., :3], expected[..., :3], atol=0.15)
     rays = mi.Ray3f([0.13, 0.21, 4], [0, 0, -1])
     si = hits(make(cube(), tessellation_rate=2), rays)
-    found = LimitSurface(cube()).evaluate(
-        [1], np.array([[si.uv.x, si.uv.y]] if variant == "scalar_rgb" else rows(si.uv))
-    )
+    found = LimitSurface(cube()).evaluate([1], rows(si.uv))
     np.testing.assert_allclose(np.ravel(np.array(si.n)), found.n[0], atol=NORMAL)
 
 

@@ -5,7 +5,6 @@ import gc
 import re
 import subprocess
 import sys
-import threading
 import traceback
 import weakref
 
@@ -78,7 +77,7 @@ def program(code, variant):
 # Errors
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_an_error_is_raised_by_what_caused_it_and_by_nothing_else(monkeypatch, capfd):
     shape = make()
     scene = scene_of(shape)
@@ -136,7 +135,7 @@ def test_with_a_debugger_errors_are_causes(monkeypatch):
     assert isinstance(caught.value.__cause__, AnswerError)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_errors_keep_no_objects_of_c(monkeypatch):
     shape = make()
 
@@ -151,7 +150,7 @@ def test_errors_keep_no_objects_of_c(monkeypatch):
     assert frames["complete"].f_locals == frames["answer"].f_locals == {}
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_errors_go_with_their_last_name(monkeypatch):
     # And with them, what their frames hold; not when the collector comes by.
     scene, alive = scene_of(make()), []
@@ -262,20 +261,14 @@ for shading, scene in scenes.items():
 """
 
 
-# Of pictures, of shapes and of samples: one render without end, or many that take most of their time in answers.
-@pytest.mark.parametrize(
-    ("variant", "width", "count", "samples"), [("scalar_rgb", 16, 1, 100000), ("llvm_ad_rgb", 8, 40, 1)]
-)
-def test_an_interruption_is_raised_when_mitsuba_has_returned(variant, width, count, samples, request):
-    request.getfixturevalue(f"variant_{variant}")
-    code = f"WIDTH, COUNT, SAMPLES = {width}, {count}, {samples}\n{INTERRUPTED}"
-    turns = program(code, variant).splitlines()
+# Many renders, which take most of their time in answers.
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_an_interruption_is_raised_when_mitsuba_has_returned():
+    turns = program(f"WIDTH, COUNT, SAMPLES = 8, 40, 1\n{INTERRUPTED}", "llvm_ad_rgb").splitlines()
     assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
-    if variant == "scalar_rgb":
-        assert all(turn.endswith(" KeyboardInterrupt") for turn in turns)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_an_interruption_inside_an_answer_is_raised(monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -440,7 +433,7 @@ def test_shapes_that_are_made_in_parallel_share_a_hook():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_shapes_come_and_go():
     # Addresses are used again, so that answers kept for too long would be those of another cage.
     expected = vector(interaction(make()).sh_frame.n)
@@ -453,7 +446,7 @@ def test_shapes_come_and_go():
     assert vector(interaction(plain).p)[2] == pytest.approx(np.sqrt(1 - 0.13**2 - 0.21**2), abs=1e-5)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_shapes_are_freed_with_their_scenes():
     shape = make()
     scene = mi.load_dict({"type": "scene", "shape": shape})
@@ -479,9 +472,7 @@ def test_a_scene_outlives_the_names_of_its_shapes():
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_variants_side_by_side():
-    names = [
-        name for name in mi.variants() if name in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono")
-    ]
+    names = [name for name in mi.variants() if name in ("llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono")]
     shapes, found = {}, {}
     for name in names:
         mi.set_variant(name)
@@ -490,30 +481,10 @@ def test_variants_side_by_side():
         mi.set_variant(name)
         found[name] = vector(interaction(shapes[name]).sh_frame.n)
     for normal in found.values():
-        np.testing.assert_allclose(normal, found["scalar_rgb"], atol=1e-6)
+        np.testing.assert_allclose(normal, found["llvm_ad_rgb"], atol=1e-6)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_threads_of_scalar_variants_ask_at_once():
-    scene = mi.load_dict({"type": "scene", "shape": make()})
-    xs = np.linspace(-0.4, 0.4, 8)
-
-    def ask(x):
-        return vector(scene.ray_intersect(mi.Ray3f([float(x), 0.1, 4], [0, 0, -1])).n)
-
-    expected = [ask(x) for x in xs]
-    found = {}
-    threads = [threading.Thread(target=lambda k=k: found.update({k: [ask(x) for x in xs]})) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for each in found.values():
-        np.testing.assert_array_equal(each, expected)
-    assert len(found) == len(threads)
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_mitsubas_own_threads_ask_as_well():
     scene = scene_of(make(), "direct", size=24)
     images = [np.array(mi.render(scene, spp=1, seed=3)) for _ in range(2)]
@@ -577,7 +548,7 @@ def test_a_shape_says_that_no_memory_can_be_executed(monkeypatch):
         make()
 
 
-@pytest.mark.usefixtures("variants_all_rgb", "_asked_again")
+@pytest.mark.usefixtures("variants_array_rgb", "_asked_again")
 def test_another_version_works_if_nothing_has_moved(monkeypatch):
     monkeypatch.setattr(interaction_hook, "_hooks", {})
     monkeypatch.setattr(mi, "__version__", "3.9.2")

@@ -235,7 +235,7 @@ def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
 
 
 @exact
-@every_variant
+@pytest.mark.usefixtures("variants_array_rgb")
 def test_nothing_is_kept_when_the_last_shape_has_gone():
     shape = of(coloured(named_cages.torus(4, 3)), shading="exact")
     one, two = mi.load_dict(shape), mi.load_dict(shape)

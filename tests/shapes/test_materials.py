@@ -6,7 +6,6 @@ import pytest
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.figures.output import scene_path
 
 MATERIALS = {"": [0], "red": [1, 4], "dark blue": [2, 3, 5]}
 # Sums of some hundred areas in single precision.
@@ -14,7 +13,6 @@ ROUNDING = 1e-6
 TESSELLATIONS = {
     "uniform": {"tessellation_rate": 3},
     "adaptive": {"tessellation": "adaptive", "max_edge": 0.4},
-    "exact": {"tessellation": "adaptive", "max_edge": 0.4, "shading": "exact"},
 }
 
 
@@ -61,37 +59,6 @@ def test_materials_share_their_vertices_bit_by_bit(file, name):
     areas = [float(part.surface_area()) for part in parts]
     assert sum(areas) == pytest.approx(float(whole.surface_area()), rel=ROUNDING)
     assert min(areas) > 0
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_hits_of_materials_are_those_of_the_whole(np_rng):
-    filename = str(scene_path("human").parent / "cages" / "star.obj")
-    faces = ControlCage.from_file(filename).face_count
-    tensor = mi.TensorXu
-    chosen = np_rng.permutation(faces)
-    settings = {"filename": filename, "tessellation_rate": 2, "shading": "exact"}
-    parts = {f"part_{i}": each for i, each in enumerate(np.split(chosen, [faces // 3]))}
-    scenes = [
-        mi.load_dict({"type": "scene", "whole": {"type": "subdivision", **settings}}),
-        mi.load_dict(
-            {
-                "type": "scene",
-                **{
-                    key: {"type": "subdivision", **settings, "shown_faces": tensor(each.astype(np.uint32))}
-                    for key, each in parts.items()
-                },
-            }
-        ),
-    ]
-    hits = 0
-    for origin, direction in np_rng.normal(size=(20, 2, 3)):
-        ray = mi.Ray3f(origin.tolist(), (direction - origin).tolist())
-        expected, found = (scene.ray_intersect(ray) for scene in scenes)
-        assert expected.is_valid() == found.is_valid()
-        if found.is_valid():
-            hits += 1
-            np.testing.assert_array_equal([*found.p, *found.sh_frame.n], [*expected.p, *expected.sh_frame.n])
-    assert hits
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -315,12 +315,6 @@ def test_methods(check, shading, tmp_path):
     check(at)
 
 
-@exact
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_points_are_found_by_texture_coordinates_in_scalar_variants():
-    eval_parameterization(Place("exact"))
-
-
 @pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
 @pytest.mark.usefixtures("variants_all_rgb")
 def test_a_cage_without_texture_coordinates_has_none_to_find(shading):
