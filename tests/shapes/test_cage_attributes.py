@@ -524,3 +524,69 @@ def test_derivatives_do_not_keep_shapes_alive(shading):
     del shape, parameters
     gc.collect()
     assert alive() is None
+
+
+# Differences of values at hits over this step, in single precision, beside the largest: rounding over the step, and
+# what values bend within it.
+MOVED, MOVED_DIFFERENCE = 1e-3, 2e-3
+
+
+def grown_colours(scheme):
+    cage = named_cages.extraordinary_triangles(5) if scheme == "loop" else named_cages.cube()
+    weights = np.linspace(0, 1, len(cage.positions))[:, None]
+    return ControlCage(
+        cage.positions,
+        np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1]),
+        attributes={"weight": Attribute(weights), "colour": Attribute(np.hstack([weights, 1 - weights, weights**2]))},
+    )
+
+
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+@pytest.mark.parametrize("by", ["control_points", "to_world"])
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+@shadings
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, mode, np_rng):
+    """Under exact shading they left out that it moves: a surface moving along its colours had a gradient of zero."""
+    cage = grown_colours(scheme)
+    shape = make(cage, scheme=scheme, tessellation_rate=4, shading=shading)
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    parameters, by = mi.traverse(scene), f"{shape.id()}.{by}"
+    inside = LimitSurface(cage, scheme).sample(64, 1)
+    targets = cage.positions.mean(axis=0) + 0.9 * (inside.p - cage.positions.mean(axis=0))
+    o, d = inside.p + inside.n, targets - inside.p - inside.n
+    ray = mi.Ray3f(msub.upload(mi.Point3f, o.T), msub.upload(mi.Vector3f, d.T))
+    moves, given = np_rng.normal(size=len(cage.positions) * 3), type(parameters[by])(parameters[by])
+
+    def values(step):
+        if by.endswith("control_points"):
+            parameters[by] = given + step * msub.upload(mi.Float, moves)
+        else:
+            parameters[by] = mi.AffineTransform4f().translate([0.3 * step, step, -0.5 * step]) @ given
+        parameters.update()
+        si = scene.ray_intersect(ray)
+        found, is_valid = si.shape.eval_attribute_1("vertex_weight", si), si.is_valid()
+        dr.eval(found, is_valid, si.prim_index)
+        return found, is_valid, si.prim_index
+
+    ahead, behind = (values(mi.Float(sign * MOVED)) for sign in (1, -1))
+    differences = (np.array(ahead[0]) - np.array(behind[0])) / (2 * MOVED)
+    step = mi.Float(0)
+    dr.enable_grad(step)
+    found, is_valid, triangle = values(step)
+    # Values of vertex shading have kinks between triangles.
+    same = np.all([np.array(each[2]) == np.array(triangle) for each in (ahead, behind)], axis=0) & np.array(is_valid)
+    assert same.mean() > 0.5
+    if mode == "forward":
+        dr.set_grad(step, 1)
+        derivative = np.array(dr.forward_to(found))
+    else:
+        weights, kept = np.where(same, np_rng.choice([-1, 1], 64), 0), same
+        dr.backward(dr.sum(found * msub.upload(mi.Float, weights)))
+        derivative = np.array(dr.grad(step))
+    tolerance = MOVED_DIFFERENCE * np.abs(differences[same]).max()
+    if mode == "backward":
+        # Of the same rays as the differences.
+        derivative, same = derivative / same.sum(), [0]
+        differences = (differences * weights)[kept].sum(keepdims=True) / kept.sum()
+    np.testing.assert_allclose(derivative[same], differences[same], rtol=0, atol=tolerance)
