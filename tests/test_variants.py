@@ -8,7 +8,7 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 
-VARIANT = "scalar_rgb"
+VARIANT = "llvm_ad_rgb"
 STAGE = """#usda 1.0
 def Mesh "quad" {
     int[] faceVertexCounts = [4]
@@ -57,12 +57,12 @@ def test_these_are_all_public_functions_that_ask_for_mitsuba():
     assert found == {*FUNCTIONS}
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
 @EVERY_FUNCTION
 def test_a_variant_is_a_module_or_a_name(tmp_path, name):
     expected = made(name, mi, tmp_path)
     assert made(name, VARIANT, tmp_path) == expected
-    assert made(name, mi.scalar_rgb, tmp_path) == expected
+    assert made(name, mi.llvm_ad_rgb, tmp_path) == expected
 
 
 @EVERY_FUNCTION

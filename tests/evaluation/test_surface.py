@@ -111,8 +111,8 @@ def test_the_scheme_that_a_cage_asks_for_is_the_default():
     ("call", "message"),
     [
         (lambda _: LimitSurface("cube.obj"), "cage 'cube.obj'; expected a ControlCage"),
-        (lambda s: LimitSurface(s.cage, 3), "scheme 3; expected a scheme's name, or an object that states its rules"),
-        (lambda s: LimitSurface(s.cage, CatmullClark), "CatmullClark'>; expected a scheme's name, or an object"),
+        (lambda s: LimitSurface(s.cage, 3), "scheme 3; expected a scheme's name, or an object of"),
+        (lambda s: LimitSurface(s.cage, CatmullClark), "class CatmullClark; expected a scheme's name, or an object"),
         (lambda s: s.evaluate(0, "ab"), r"uv is no table of numbers \(could not convert .*\); expected \(s, 2\)"),
         (lambda s: s.evaluate(0, [[0, 0]], dtype="foo"), "dtype foo: expected float32 or float64"),
         (lambda s: s.tessellate(2, dtype="foo"), "dtype foo: expected float32 or float64"),

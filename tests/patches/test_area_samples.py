@@ -143,7 +143,7 @@ def test_a_surface_without_area_has_no_points():
     with pytest.raises(ValueError, match="the surface has no area"):
         LimitSurface(cage).sample(3)
     with pytest.raises(ValueError, match="the surface has no area"):
-        LimitSurface(cage).on_device("scalar_rgb").sample(0.5, [0.5, 0.5])
+        LimitSurface(cage).on_device("llvm_ad_rgb").sample(0.5, [0.5, 0.5])
 
 
 def test_no_points_can_be_drawn():

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
-from mitsuba_subdivision.schemes import CatmullClark, StencilTable, add_scheme
+from mitsuba_subdivision.schemes import CatmullClark, StencilTable, register_scheme
 
 SCENES = Path(__file__).parents[2] / "scenes"
 RESOLUTION = 64
@@ -86,11 +86,11 @@ class OtherVertexRule(CatmullClark):
 
 def wrong_rule(valence, *, one_neighbour):
     """One weight of a refinement rule wrong by 1e-3: taken from one neighbour, or from all."""
-    add_scheme(OtherVertexRule(one_neighbour))
+    register_scheme(OtherVertexRule(one_neighbour))
     try:
         return scene_of(valence)
     finally:
-        add_scheme(CatmullClark())
+        register_scheme(CatmullClark())
 
 
 DEFECTS = {

@@ -264,9 +264,8 @@ def test_errors_come_before_anything_is_written(folder, capsys, words, message):
         ["scene.xml", "-o", "a.exr", "--passes", "2"],
     ],
 )
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
-def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words, variant, request):
-    request.getfixturevalue(f"variant_{variant}")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
     strings = {"filename": "cube.obj", "shading": "exact"}
     shape = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
     shape = f'<shape type="subdivision">{shape}</shape>'
@@ -278,7 +277,7 @@ def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words, 
         raise ValueError("no surface")
 
     monkeypatch.setattr(ExactShading, "complete", fail)
-    assert render(*words, "--spp", "4", "-m", variant) == 1
+    assert render(*words, "--spp", "4", "-m", "llvm_ad_rgb") == 1
     assert capsys.readouterr().err.endswith("error: no surface\n")
     assert {path.name for path in folder.iterdir()} == {"cube.obj", "scene.xml"}
 

@@ -16,7 +16,7 @@ def test_copies_of_used_surfaces_are_the_same_surfaces(copied, scheme):
     surface = LimitSurface(named_cages.cube(), scheme)
     surface.tessellate(2)
     surface.cage.refined()
-    _ = surface.cage.edges, surface.area(), surface.bounds(), surface.on_device("scalar_rgb")
+    _ = surface.cage.edges, surface.area(), surface.bounds(), surface.on_device("llvm_ad_rgb")
     found, cage = copied(surface), copied(surface.cage)
     expected = surface.evaluate(1, [[0.2, 0.3]])
     for other in (found, LimitSurface(cage, scheme)):

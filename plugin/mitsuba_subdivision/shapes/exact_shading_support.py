@@ -19,7 +19,7 @@ def exact_shading_problem(variant: Variant) -> str | None:
         Such as ``mitsuba.llvm_ad_rgb``.
     """
     if not dr.is_jit_v(variant.Float):
-        return "scalar variants interpolate vertex normals; expected a variant of llvm or cuda for exact shading"
+        return "exact shading needs a variant of llvm or cuda"
     problem = hook_problem() or _trial_problem(variant)
     return problem and f"exact shading {problem}"
 
