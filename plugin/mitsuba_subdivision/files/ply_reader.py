@@ -67,47 +67,49 @@ def read_ply(path: str | Path) -> CageContents:
     """
     name, content = f'"{path}"', Path(path).read_bytes()
     header = content[: max(0, content.find(b"end_header"))]
+    binary = re.search(rb"[\r\n]format\s+binary", header) is not None
     lines: dict[str, IntArray] = {}
     first = 2 + len(header.splitlines())
-    for word, digits in re.findall(rb"\nelement\s+(\S+)\s+(\d+)", header):
+    for word, digits in re.findall(rb"[\r\n]element\s+(\S+)\s+(\d+)", header):
         # Plyfile makes an array of as many rows as the header announces.
-        if int(digits) > len(content):
-            rows = shortened(f"{int(digits)} rows of {word.decode('ascii', 'replace')}", 200)
+        if len(digits) > 18 or int(digits) > len(content):
+            rows = shortened(f"{digits.decode()} rows of {word.decode('ascii', 'replace')}", 200)
             raise CageError(f"{name}: {rows} do not fit into the file; expected fewer")
-        if b"\nformat ascii" in header:
+        if not binary:
             # A row is a line.
             lines[word.decode("ascii", "replace")] = first + np.arange(int(digits))
             first += int(digits)
     # When the cage is validated, numbers that are not finite become errors that name their place.
     with np.errstate(over="ignore", invalid="ignore"):
-        return _contents(_elements(content, name, lines), name, lines)
+        return _contents(_elements(content, name, lines, binary), name, lines)
 
 
-def _elements(content: bytes, name: str, lines: dict[str, IntArray]) -> dict[str, PlyElement]:
+def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: bool) -> dict[str, PlyElement]:
     try:
-        from plyfile import PlyData, PlyParseError
+        from plyfile import PlyData
     except ImportError:
         raise CageError(
             f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[ply]"'
         ) from None
-    with tempfile.TemporaryFile() as file, warnings.catch_warnings():
+    with warnings.catch_warnings():
         # For elements without rows NumPy warns, and plyfile then raises an error.
         warnings.simplefilter("ignore", UserWarning)
         # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
         warnings.simplefilter("error", DeprecationWarning)
         # Plyfile maps lists of one known length, and reads all others row by row, in a hundred times as long. It maps
         # a file of our own, as the process would end if another program cut a mapped file.
-        file.write(content)
-        for corners in () if lines else (3, 4):
-            file.seek(0)
-            lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
-            with suppress(PlyParseError, ValueError):
+        for corners in (3, 4) if binary else ():
+            with suppress(Exception), tempfile.TemporaryFile() as file:
+                file.write(content)
+                file.seek(0)
+                lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
                 return {element.name: element for element in PlyData.read(file, known_list_len=lengths)}
         try:
             return {element.name: element for element in PlyData.read(io.BytesIO(content), mmap=False)}
         except UnicodeDecodeError:
             raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
-        except (PlyParseError, ValueError, OverflowError, MemoryError, DeprecationWarning) as error:
+        # Damaged files make plyfile raise errors of its own, of Python and of NumPy.
+        except Exception as error:
             cut = " (is the file cut short?)" if "early end" in str(error) else ""
             row, element, line = (getattr(error, each, None) for each in ("row", "element", "line"))
             if element is not None and row is not None and element.name in lines:
