@@ -34,7 +34,7 @@ import numpy as np
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.ball_fits import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
-from mitsuba_subdivision.fit.triangle_samples import triangle_samples
+from mitsuba_subdivision.fit.to_mesh import triangle_samples
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"

@@ -29,7 +29,6 @@ NUMPY_PACKAGES = [
 ALLOWED = {
     "llvm": set(),
     "messages": {"progress"},
-    "interruption": set(),
     "examples": set(),
     **{package: set(NUMPY_PACKAGES[:i]) for i, package in enumerate(NUMPY_PACKAGES)},
     "whole_file": set(),
@@ -87,7 +86,7 @@ ALLOWED = {
         "doctor",
         "__init__",
     },
-    "__main__": {"messages", "interruption", "whole_file", "progress", "cage", "commands", "__init__"},
+    "__main__": {"messages", "whole_file", "progress", "cage", "commands", "__init__"},
     "__init__": {"llvm", "examples", *NUMPY_PACKAGES, "kernels", "shapes", "fit", "studio", "usd"},
 }
 # Imports that go up, each a public method that only calls a function above: the module, and what it may import there.

@@ -11,9 +11,8 @@ import threading
 import time
 
 import pytest
-from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.__main__ import Abandoned, interruptible, main
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.interruption import Abandoned, interruptible
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 # Windows has no such terminals.

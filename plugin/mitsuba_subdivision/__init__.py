@@ -27,11 +27,11 @@ if TYPE_CHECKING:
     from .evaluation.limit_stencil import limit_stencil
     from .evaluation.scheme_laws import check_scheme
     from .examples import example_file
+    from .fit.views import loss_of_views
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
     from .schemes import SchemeError
     from .shapes.tessellation_parameters import pixel_error_for
-    from .shapes.views import loss_of_views
     from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
     from .tessellation import Tessellation, VertexMatrices

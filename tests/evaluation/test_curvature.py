@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_face, extraordinary_triangles, torus
-from mitsuba_subdivision.evaluation.curvature import curvature
+from mitsuba_subdivision.evaluation.element import curvature
 from patches.closed_cages import triangulated
 from reference.bars import CURVATURE, CURVATURE_LEVELS
 from reference.exact_samples import ORDINARY, SCHEMES, curvature_error, samples_at

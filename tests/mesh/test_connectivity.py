@@ -4,9 +4,8 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.mesh import connectivity
-from mitsuba_subdivision.mesh.connectivity import Topology
-from mitsuba_subdivision.mesh.edge_pairing import paired
-from mitsuba_subdivision.mesh.refinement_differences import differences
+from mitsuba_subdivision.mesh.connectivity import Topology, paired
+from mitsuba_subdivision.refinement.refined_attributes import differences
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core

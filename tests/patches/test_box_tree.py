@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.patches import box_tree
-from mitsuba_subdivision.patches.box_tree import BoxTree
+from mitsuba_subdivision.patches import closest_points
+from mitsuba_subdivision.patches.closest_points import BoxTree
 
 pytestmark = pytest.mark.core
 
 
-@pytest.mark.parametrize("most", [box_tree.MOST_PAIRS, 10])
+@pytest.mark.parametrize("most", [closest_points.MOST_PAIRS, 10])
 def test_near_boxes_are_those_no_further_than_asked(most, np_rng, monkeypatch):
     """In whole numbers, so that some are exactly as far."""
-    monkeypatch.setattr(box_tree, "MOST_PAIRS", most)
+    monkeypatch.setattr(closest_points, "MOST_PAIRS", most)
     lower = np_rng.integers(0, 20, (300, 3)).astype(float)
     upper, points = lower + np_rng.integers(0, 5, (300, 3)), np_rng.integers(-5, 30, (40, 3)).astype(float)
     squared = np_rng.integers(0, 6, 40).astype(float) ** 2

@@ -7,7 +7,7 @@ import pytest
 from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
-from mitsuba_subdivision.patches import patch_samples
+from mitsuba_subdivision.patches import channel
 from patches.closed_cages import bumpy, cage_of
 
 pytestmark = pytest.mark.core
@@ -64,7 +64,7 @@ def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
         close(found.n, expected.n[chosen], 1, NORMAL)
         np.testing.assert_array_equal(found.level, expected.level[chosen])
     # In short runs.
-    monkeypatch.setattr(patch_samples, "WEIGHTS", 70)
+    monkeypatch.setattr(channel, "WEIGHTS", 70)
     found = surface.evaluate(*where)
     close(found.p, expected.p, size)
     close(found.n, expected.n, 1, NORMAL)

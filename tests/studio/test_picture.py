@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes import exact_shading_support
+from mitsuba_subdivision.shapes import exact_shading
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import StillPicture, Turntable
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
-from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.model import Model
 from mitsuba_subdivision.studio.picture import ERRORS
+from mitsuba_subdivision.studio.studio_entries import Look
 
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -74,7 +74,7 @@ def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
 def test_the_command_says_once_what_it_does_elsewhere(tmp_path, monkeypatch, capfd, words):
     CUBE.save(tmp_path / "cube.obj")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(exact_shading_support, "hook_problem", lambda: "needs another computer")
+    monkeypatch.setattr(exact_shading, "hook_problem", lambda: "needs another computer")
     assert main(["render", "cube.obj", "-o", "a.png", *SMALL, *words, "-m", "llvm_ad_rgb"]) == 0
     assert capfd.readouterr().err.count("exact shading needs another computer\n") == 1
     assert main(["render", "cube.obj", "-o", "b.png", *SMALL, *words, "--shading", "vertex", "-m", "llvm_ad_rgb"]) == 0

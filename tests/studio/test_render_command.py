@@ -18,8 +18,8 @@ from mitsuba_subdivision.shapes.exact_shading import ExactShading
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
-from mitsuba_subdivision.studio.look import Look
 from mitsuba_subdivision.studio.model import Model
+from mitsuba_subdivision.studio.studio_entries import Look
 
 SCENES = scene_path("human").parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]

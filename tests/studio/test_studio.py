@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageError, named_cages
 from mitsuba_subdivision.cage.errors import CageWarning
+from mitsuba_subdivision.commands.pictures import save_scene
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, framed, outermost
-from mitsuba_subdivision.studio.scene_file import save_scene
+from mitsuba_subdivision.studio.model import CageWire
 from mitsuba_subdivision.studio.studio_entries import sampler
 from mitsuba_subdivision.studio.view import VIEWS
-from mitsuba_subdivision.studio.wire import CageWire
 
 CAGES = scene_path("human").parent / "cages"
 # How far outside the margin rounding may put a point, in parts of the picture.
@@ -260,7 +260,7 @@ def test_rods_and_balls_lie_around_edges_and_vertices():
 def test_the_up_axis_is_the_one_of_the_file(tmp_path):
     pytest.importorskip("pxr")
     pytest.importorskip("plyfile")
-    from mitsuba_subdivision.studio.up_axis import up_axis_of
+    from mitsuba_subdivision.studio.model import up_axis_of
     from pxr import Usd, UsdGeom
 
     for suffix, axis in ((".obj", "y"), (".ply", "z")):

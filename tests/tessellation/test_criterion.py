@@ -12,7 +12,7 @@ from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
 from mitsuba_subdivision.tessellation.cones import NormalCone, TangentCone
-from mitsuba_subdivision.tessellation.least_rates import least_product
+from mitsuba_subdivision.tessellation.criterion import least_product
 from patches.closed_cages import bumpy
 from scipy.spatial import ConvexHull
 from tessellation.distances import distances

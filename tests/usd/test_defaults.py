@@ -5,7 +5,7 @@ import mitsuba_subdivision as msub
 import pytest
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
-from mitsuba_subdivision.studio.look import Look
+from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_subdivision.usd.stage_scenes import StageScenes
 from usd.moving_stages import CORNERS, CUBE, mesh, write
 

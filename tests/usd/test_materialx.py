@@ -11,7 +11,7 @@ import pytest
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_subdivision.usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_subdivision.usd.materialx_library import library
-from mitsuba_subdivision.usd.stage_reader import StageReader
+from mitsuba_subdivision.usd.stage_scenes import StageReader
 
 pytest.importorskip("MaterialX")
 Sdf = pytest.importorskip("pxr.Sdf")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageWarning, named_cages
 from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
-from mitsuba_subdivision.studio.placed_points import points_at
+from mitsuba_subdivision.studio.polygon_mesh import points_at
 from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_subdivision.usd.limit_surfaces import DENSE, Surfaces
 from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture

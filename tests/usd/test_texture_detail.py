@@ -16,10 +16,9 @@ from mitsuba_subdivision.usd.contents import (
     ShapeContents,
     TextureContents,
 )
-from mitsuba_subdivision.usd.image_reduction import halvings, reduced
 from mitsuba_subdivision.usd.stage_warnings import StageWarnings
 from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
-from mitsuba_subdivision.usd.texture_image import read_texture_image
+from mitsuba_subdivision.usd.texture_image import halvings, read_texture_image, reduced
 from mitsuba_subdivision.usd.textures import Textures
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")

@@ -419,7 +419,7 @@ class ControlCage:
         Row i times values is the number of i's neighbours times its value, less the values of these. It is symmetric
         and positive semi-definite; constants are in its null space. `LimitSurface.stiffness` knows lengths and angles.
         """
-        from .graph import laplacian_of
+        from .structure import laplacian_of
 
         return laplacian_of(self.edges, self.vertex_count)
 

@@ -14,7 +14,7 @@ from .arguments import add_cage_options
 
 if TYPE_CHECKING:
     from ..surface import LimitSurface
-    from .parser import Commands
+    from .arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

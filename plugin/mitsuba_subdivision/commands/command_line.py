@@ -7,7 +7,7 @@ import argparse
 from .. import __version__
 from ..messages import PROGRAM
 from . import cage, compare, doctor, figure, render
-from .parser import CommandParser
+from .arguments import CommandParser
 
 
 def parser() -> CommandParser:

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 from ..messages import PROGRAM, print_remark, print_result
 from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..whole_file import require_folder, require_writable, whole_file
-from .arguments import positive, seed
-from .parser import table
+from .arguments import positive, seed, table
 from .passes import TOLERANCES, add_tolerances
 
 if TYPE_CHECKING:
-    from .parser import Commands
+    from .arguments import Commands
 
 # Exit status of ``compare`` and ``merge`` for input or output that cannot be used: 1 and 2 say how images differ.
 UNUSABLE = 3

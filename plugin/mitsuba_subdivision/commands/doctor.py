@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ..messages import print_result
 
 if TYPE_CHECKING:
-    from .parser import Commands
+    from .arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

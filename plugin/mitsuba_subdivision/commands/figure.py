@@ -12,11 +12,10 @@ from ..figures.output import COLUMN, INCH, PAGE
 from ..messages import print_result
 from ..schemes import SCHEME_CLASSES
 from ..whole_file import require_folder, require_writable
-from .arguments import add_variant, positive, set_variant
-from .parser import table
+from .arguments import add_variant, positive, set_variant, table
 
 if TYPE_CHECKING:
-    from .parser import Commands
+    from .arguments import Commands
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")

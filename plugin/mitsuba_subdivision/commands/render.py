@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..files.formats import FORMATS
 from ..messages import print_remark, print_result
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from .parser import Commands
+    from .arguments import Commands
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 SCENE_SUFFIX = ".xml"
@@ -48,6 +48,10 @@ _OF_MODELS = (
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
+
+VIDEO_SUFFIXES = (".gif", ".mp4")
+# Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
+EVEN = 2
 
 
 def add_parser(commands: Commands) -> None:
@@ -192,7 +196,6 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
         require_denoiser()
         options.filter = BOX
     has_frames = options.turntable or options.frames
-    from ..studio.video import VIDEO_SUFFIXES
 
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if options.output.suffix.lower() not in known:
@@ -274,7 +277,6 @@ def _render_model(options: argparse.Namespace) -> None:
 def _write_frames(options: argparse.Namespace) -> None:
     """Render the missing frames, and join all to a video if requested."""
     from ..progress import counted
-    from ..studio.video import VIDEO_SUFFIXES, require_encoder, write_video
 
     is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
@@ -343,3 +345,48 @@ def _assignment(text: str) -> tuple[str, str]:
     if not (name and equals):
         raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=VALUE')
     return name, value
+
+
+def require_encoder(path: Path) -> None:
+    """Check that the packages that write a video are installed, before frames are rendered.
+
+    Raises
+    ------
+    ValueError
+        If a package is missing.
+    """
+    try:
+        import imageio.v2  # noqa: F401 - only to find out whether it is there
+
+        if path.suffix.lower() == ".mp4":
+            import imageio_ffmpeg  # noqa: F401
+    except ImportError as error:
+        raise ValueError(
+            f'output "{path}": the package {error.name}, which writes videos, is missing; pip install '
+            '"mitsuba-subdivision[video]", or name a .png file for frames only'
+        ) from None
+
+
+def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
+    """Write images as a video, an animated GIF that repeats or an MP4 file.
+
+    Parameters
+    ----------
+    path : Path
+    frames : sequence of Path
+        PNG files of one size.
+    fps : float
+        Frames per second.
+    """
+    import imageio.v2 as imageio
+
+    # A GIF file repeats for ever, and its durations are milliseconds.
+    is_gif = path.suffix.lower() == ".gif"
+    settings: dict[str, Any] = {"duration": 1000 / fps, "loop": 0} if is_gif else {"fps": fps, "macro_block_size": EVEN}
+    with whole_file(path) as beside:
+        video: Any = imageio.get_writer(beside, **settings)
+        with video:
+            for frame in frames:
+                pixels = imageio.imread(frame)[..., :3]
+                height, width = (side if is_gif else side // EVEN * EVEN for side in pixels.shape[:2])
+                video.append_data(pixels[:height, :width])

@@ -15,8 +15,8 @@ from ..cage import ControlCage
 from ..cage.named_cages import cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
-from ..fit.triangle_samples import triangle_samples
-from ..shapes.views import loss_of_views
+from ..fit.to_mesh import triangle_samples
+from ..fit.views import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode
 from .figure_scenes import make_mesh

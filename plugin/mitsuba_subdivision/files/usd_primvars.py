@@ -15,7 +15,7 @@ from ..cage.errors import CageError, shortened
 from ..cage.source import CageSource
 from ..cage.validation import require_range
 from ..mesh.connectivity import IntArray, Topology
-from .usd_names import INTERPOLATIONS, TEXCOORDS
+from .usd_values import INTERPOLATIONS, TEXCOORDS
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom

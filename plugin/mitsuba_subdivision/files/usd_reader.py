@@ -20,11 +20,10 @@ from ..cage.validation import require_range, validated_face_indices
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from .joined_meshes import joined
-from .usd_names import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, rule_name, token
 from .usd_primvars import PrimvarChoice, read_primvars
 from .usd_skinning import Skinning
 from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at, usd_messages_of
-from .usd_values import local_to_world, time_of, value_at
+from .usd_values import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, local_to_world, rule_name, time_of, token, value_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cage.errors import CageError, shortened, warn
-from .usd_names import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES
-from .usd_values import value_at
+from .usd_values import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES, value_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom

@@ -16,7 +16,7 @@ from ..cage.errors import CageError
 from ..cage.rules import RULES
 from ..whole_file import whole_file
 from .losses import warn_of_losses
-from .usd_names import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token
+from .usd_values import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token
 
 if TYPE_CHECKING:
     from pxr import UsdGeom

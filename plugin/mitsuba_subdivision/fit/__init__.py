@@ -1,9 +1,9 @@
 """Fitting: control cages from pictures, points or dense meshes."""
 
 from .cage_fit import CageFit
+from .fitting import Schedule
 from .large_steps import LargeSteps
 from .point_fit import PointFit
-from .schedule import Schedule
 from .to_mesh import to_mesh
 from .views import View
 

@@ -18,10 +18,9 @@ from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
-from .fitting import Fit
+from .fitting import Fit, Schedulable, Schedule
 from .large_steps import LargeSteps
 from .regularizers import device_regularizer
-from .schedule import Schedulable, Schedule
 from .unknown_creases import UnknownCreases
 from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 

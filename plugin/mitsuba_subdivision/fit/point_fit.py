@@ -16,9 +16,8 @@ from ..refinement.cage_refinement import CageRefinement
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State
-from .fitting import Fit
+from .fitting import Fit, Schedulable, Schedule
 from .regularizers import Regularizer
-from .schedule import Schedulable, Schedule
 
 if TYPE_CHECKING:
     from scipy import sparse

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..cage import ControlCage
 from ..device_arrays import upload
-from ..kernels.sparse_matrix import SparseMatrix
+from ..kernels.control_values import SparseMatrix
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from .folds import folds
 
 if TYPE_CHECKING:
     from scipy import sparse
+
+# No quadratic form.
+FOLDS = "folds"
+# Terms of the displacement from the initial control points.
+ABOUT_START = ("anchor",)
+# Faces count from this cosine between their normals on, 107 degrees. Where a part is about to grow, those on both sides
+# of its end turn by a right angle and more.
+LEAST_COSINE = -0.3
 
 
 def _laplacian(surface: LimitSurface) -> sparse.csr_array:
@@ -39,10 +48,6 @@ MATRICES: dict[str, Callable[[LimitSurface], sparse.csr_array]] = {
     "bending": LimitSurface.bending,
     "anchor": _anchor,
 }
-# No quadratic form.
-FOLDS = "folds"
-# Terms of the displacement from the initial control points.
-ABOUT_START = ("anchor",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,3 +108,34 @@ def device_form(regularizer: Regularizer) -> Callable[[dr.ArrayBase], mi.Float]:
         return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2
 
     return energy
+
+
+def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
+    """Penalty of folds between neighbouring faces: a function of control points, flat x, y, z, differentiable by them.
+
+    The mean over edges between two faces of ``max(0, -0.3 - cos a)^2``, where a is the angle between normals: between
+    those of the two quadrilaterals, or triangles, that the edge makes with the next vertices around each face.
+    """
+    t = cage.topology
+    half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
+    sides = [_quadrilaterals(t, each) for each in (half_edges, t.twin[half_edges])]
+
+    def energy(points: dr.ArrayBase) -> mi.Float:
+        if not len(half_edges):
+            return mi.Float(0)
+        cosine: Any = dr.dot(*(_normals(points, side) for side in sides))
+        return dr.sum(dr.square(dr.maximum(LEAST_COSINE - cosine, 0))) / len(half_edges)
+
+    return energy
+
+
+def _quadrilaterals(t: Topology, half_edges: IntArray) -> list[mi.UInt32]:
+    """Vertices of a face around its edge: one before it, the ends, and one after it, which may be the first one."""
+    corners = t.prev[half_edges], half_edges, t.next[half_edges], t.next[t.next[half_edges]]
+    return [upload(mi.UInt32, t.face_vertices[each]) for each in corners]
+
+
+def _normals(points: dr.ArrayBase, corners: list[mi.UInt32]) -> mi.Normal3f:
+    before, start, end, after = (dr.gather(mi.Point3f, points, each) for each in corners)
+    normal = dr.cross(end - before, after - start)
+    return normal * dr.rsqrt(dr.maximum(dr.squared_norm(normal), dr.smallest(mi.Float)))

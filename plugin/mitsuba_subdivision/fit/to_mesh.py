@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..cage import ControlCage
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
 from .point_fit import PointFit
-from .triangle_samples import triangle_samples
 
 # Points on the mesh for each control point that the fit ends with, by default.
 POINTS_PER_CONTROL_POINT = 8
@@ -78,3 +79,27 @@ def _samples(positions: np.ndarray, triangles: np.ndarray, count: int, seed: int
     chosen, weights = triangle_samples(positions, triangles, count, seed)
     points = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
     return points, normals[chosen] / doubled[chosen, None]
+
+
+def triangle_samples(positions: FloatArray, triangles: IntArray, count: int, seed: int) -> tuple[IntArray, FloatArray]:
+    """Locations uniform by area.
+
+    Parameters
+    ----------
+    positions : (n, 3) array
+    triangles : (m, 3) int array
+        0-based; some of them have an area.
+    count : int
+    seed : int
+
+    Returns
+    -------
+    triangle : (count,) int64
+        0-based.
+    weights : (count, 3) float64
+        Of its three vertices; not negative, and their sum is one.
+    """
+    rng = np.random.default_rng(seed)
+    a, b, c = positions[triangles].swapaxes(0, 1)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return rng.choice(len(areas), count, p=areas / areas.sum()), rng.dirichlet(np.ones(3), count)

@@ -7,18 +7,15 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .area_samples import AreaSamples, uniform_locations
-    from .channel import Channel, ChannelLayout, LinearChannel, SubdividedChannel, contracts_alike
+    from .area_samples import AreaSamples, SamplingCells, SurfaceAreas, uniform_locations
+    from .channel import Channel, ChannelLayout, LinearChannel, PatchSampler, SubdividedChannel, contracts_alike
     from .closest_points import ClosestPoints, ClosestPointSearch
     from .element_bounds import ElementBounds
     from .energies import energy_matrix, gradients, hessians
-    from .patch_samples import PatchSampler
     from .patch_table import PatchClass, PatchTable
     from .piece_table import PieceTable
     from .polynomial_pieces import SurfacePieces
-    from .sampling_cells import SamplingCells
     from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
-    from .surface_area import SurfaceAreas
 
 __all__ = [
     "AreaSamples",
@@ -57,14 +54,14 @@ __getattr__ = deferred(
         "ElementBounds": "element_bounds",
         "LinearChannel": "channel",
         "PatchClass": "patch_table",
-        "PatchSampler": "patch_samples",
+        "PatchSampler": "channel",
         "PatchTable": "patch_table",
         "PieceTable": "piece_table",
-        "SamplingCells": "sampling_cells",
+        "SamplingCells": "area_samples",
         "StencilMatrices": "stencil_matrices",
         "StencilRows": "stencil_matrices",
         "SubdividedChannel": "channel",
-        "SurfaceAreas": "surface_area",
+        "SurfaceAreas": "area_samples",
         "SurfacePieces": "polynomial_pieces",
         "contracts_alike": "channel",
         "energy_matrix": "energies",

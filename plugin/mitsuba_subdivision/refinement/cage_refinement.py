@@ -22,12 +22,11 @@ from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, VertexRule
-from ..mesh.refinement_differences import differences
 from ..mesh.sharpness import INFINITE, Sharpness
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import adapted_scheme
-from .refined_attributes import dual_attributes, refined_attributes
+from .refined_attributes import differences, dual_attributes, refined_attributes
 from .refined_corners import RefinedCorners
 
 if TYPE_CHECKING:

@@ -23,12 +23,10 @@ from ..files.formats import read_file
 from ..regression.scene import LoadedScene
 from ..shapes.attribute_parameters import mesh_name
 from ..variants import SceneNode
-from .animation import load_quietly, set_parameters
-from .frame_files import FrameFiles
-from .look import Look
+from .animation import FrameFiles, load_quietly, set_parameters
 from .model import Model
 from .obj_materials import material_bsdf, material_emitter
-from .studio_entries import DEFAULT_SIZE, studio
+from .studio_entries import DEFAULT_SIZE, Look, studio
 from .view import View
 
 CLAY = (0.56, 0.52, 0.47)

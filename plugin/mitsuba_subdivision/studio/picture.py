@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..messages import print_remark
-from ..shapes.exact_shading_support import exact_shading_problem
+from ..shapes.exact_shading import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
 from ..shapes.tessellation_parameters import pixel_error_for
 from ..variants import SceneNode
-from .placed_points import box_corners
+from .polygon_mesh import box_corners
 
 # Largest distance of triangles from the surface, in pixels. With exact shading only silhouettes show it. Interpolated
 # normals need more: a 32nd of a pixel is half of one at a quarter of the segments.

@@ -8,9 +8,8 @@ from ..cage import ControlCage
 from ..variants import SceneNode
 from .animation import StillPicture
 from .cage_scenes import CageScenes
-from .look import Look
 from .picture import shading_for
-from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, variant_in_use
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, Look, variant_in_use
 from .view import DEFAULT_VIEW, View
 
 

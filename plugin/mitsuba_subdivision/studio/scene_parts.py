@@ -17,7 +17,7 @@ import numpy as np
 from ..cage import CageError, CageWarning, ControlCage
 from ..cage.contents import CageContents
 from ..cage.rules import RULES
-from ..files import ply_names, usd_names
+from ..files import ply_names, usd_values
 from ..files.formats import write_file
 from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
 from ..variants import SceneNode
@@ -143,10 +143,10 @@ def _suffix_for(name: str, contents: CageContents) -> str:
             'it as USD: pip install "mitsuba-subdivision[usd]"'
         )
     for key in contents.attributes:
-        if not usd_names.is_possible(key) or key in usd_names.TEXCOORDS:
+        if not usd_values.is_possible(key) or key in usd_values.TEXCOORDS:
             raise CageError(
                 f'attribute "{key}" of "{name}" cannot be written to a file; expected a name of letters, digits and '
-                f'"_" other than {", ".join(usd_names.TEXCOORDS)}'
+                f'"_" other than {", ".join(usd_values.TEXCOORDS)}'
             )
     return ".usda"
 

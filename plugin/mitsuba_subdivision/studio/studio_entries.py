@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import numbers
+from dataclasses import dataclass
 from math import isqrt
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..cage import ControlCage
 from ..cage.errors import in_digits, warn
+from ..cage.source import CageSource
 from ..variants import SceneNode
-from .backdrop import backdrop
 from .camera import FIELD_OF_VIEW, Camera, framed
-from .placed_points import box_corners
+from .polygon_mesh import box_corners
 from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 
 DEFAULT_SIZE = (640, 480)
@@ -210,3 +212,63 @@ def _check_film(size: tuple[int, int], spp: int) -> None:
         raise ValueError(f"size {size!r}; expected width and height, 1 to {LARGEST_SIDE} pixels")
     if not isinstance(spp, numbers.Integral) or spp < 1:
         raise ValueError(f"spp {spp!r}; expected 1 or more samples per pixel")
+
+
+def backdrop(front: float, bend: float, wall: float, height: float, half_width: float) -> ControlCage:
+    """Cage of a sweep across the x axis: the floor is z = 0, and the wall rises towards +y.
+
+    Parameters
+    ----------
+    front : float
+        How far the floor reaches towards -y; more than ``wall - 2 * bend``.
+    bend, wall : float
+        Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height ``wall - bend``.
+    height : float
+        Of the wall; more than ``2 * (wall - bend)``.
+    half_width : float
+    """
+    # A cubic spline is straight where four control points in a row are.
+    step = wall - bend
+    floor = [[-front, 0], [bend - step, 0], [bend, 0]]
+    profile = np.array([*floor, [wall, 0], [wall, step], [wall, 2 * step], [wall, height]])
+    positions = np.concatenate([np.insert(profile, 0, x, axis=1) for x in (-half_width, half_width)])
+    left = np.arange(len(profile) - 1)
+    right = left + len(profile)
+    return ControlCage(positions, np.stack([left, right, right + 1, left + 1], axis=1), source=CageSource("backdrop"))
+
+
+@dataclass(frozen=True)
+class Look:
+    """Display options of a model or a stage.
+
+    Attributes
+    ----------
+    view : str or (azimuth, elevation)
+        From where the studio's camera looks.
+    size : (width, height) or None
+        Of the film, in pixels. None for 640 by 480, or what a stage's render settings or its camera ask for.
+    spp : int
+        Samples per pixel.
+    up : "y", "z" or None
+        Axis of a cage that points up; None for that of its file.
+    rate : int or None
+        Segments on each edge of a cage; None for as many as a picture needs.
+    shading : "vertex" or "exact"
+        Of a cage.
+    checker : bool
+        Whether texture coordinates of a cage are shown as a checkerboard.
+    cage : bool
+        Whether the control cage is drawn over its surface.
+    texture_size : int or None
+        Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows.
+    """
+
+    view: View = DEFAULT_VIEW
+    size: tuple[int, int] | None = None
+    spp: int = DEFAULT_SPP
+    up: str | None = None
+    rate: int | None = None
+    shading: str = "vertex"
+    checker: bool = False
+    cage: bool = False
+    texture_size: int | None = None

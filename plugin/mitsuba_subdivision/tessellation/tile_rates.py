@@ -14,8 +14,7 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .cones import NormalCone, TangentCone, cross, dot
-from .criterion import Criterion, Measure
-from .least_rates import TINY, least_product, rounded_up
+from .criterion import TINY, Criterion, Measure, least_product, rounded_up
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
 from .tiles import UNIT, Tiles

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..evaluation.normals import LEAST_EXTENT, unit_normals
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
-from .grid import Grid
 from .vertex_stencils import ClassStencils, VertexStencils
 
 if TYPE_CHECKING:
@@ -296,3 +295,43 @@ class _Block(NamedTuple):
         else:
             values = np.einsum("dkn,xkn->dxn", weights.take(self.sample, axis=2), relative)
         return values, origin, np.abs(relative).max(axis=1)
+
+
+class Grid(Protocol):
+    """Numbering of a tessellation: the same for all surfaces over the same elements."""
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of the tessellation."""
+        ...
+
+    def triangles(self) -> NDArray[np.uint32]:
+        """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
+        ...
+
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` element of each triangle."""
+        ...
+
+    def locations(self) -> tuple[IntArray, FloatArray]:
+        """Locations of the vertices on the surface.
+
+        Returns
+        -------
+        half_edge : (vertex_count,) int64
+            Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
+        uv : (vertex_count, 2) float64
+            Samples at corners have (0, 0).
+        """
+        ...
+
+    def cut(self, topology: Topology) -> Grid:
+        """The same triangles over elements with the same half-edges, cut along more edges.
+
+        Vertices on a cut have a copy on each side, and lie on their side of it.
+        """
+        ...
+
+    def vertices_of(self, other: Any) -> IntArray:
+        """``(vertex_count,)`` for each vertex, its original in a grid of which this one is a `cut`."""
+        ...

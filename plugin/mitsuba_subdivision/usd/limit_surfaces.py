@@ -18,7 +18,7 @@ from ..cage.errors import CageError, CageWarning
 from ..progress import counted
 from ..schemes import SchemeError
 from ..studio.model import frame_table
-from ..studio.placed_points import box_corners, points_at
+from ..studio.polygon_mesh import box_corners, points_at
 from ..surface import LimitSurface
 from ..tessellation import VertexTable
 from ..variants import SceneNode

@@ -7,9 +7,8 @@ from types import ModuleType
 from typing import Any
 
 from ..studio.animation import StillPicture
-from ..studio.look import Look
 from ..studio.polygon_mesh import with_meshes
-from ..studio.studio_entries import DEFAULT_SPP
+from ..studio.studio_entries import DEFAULT_SPP, Look
 from ..studio.view import DEFAULT_VIEW, View
 from ..variants import SceneNode, variant_set
 from .stage_scenes import StageScenes

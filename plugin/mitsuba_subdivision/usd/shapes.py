@@ -13,8 +13,7 @@ from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..studio.placed_points import points_at
-from ..studio.polygon_mesh import PolygonMesh
+from ..studio.polygon_mesh import PolygonMesh, points_at
 from ..variants import SceneNode
 from .contents import ShapeContents
 from .limit_surfaces import Surfaces

@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
+import math
+import warnings
+import weakref
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.equality import same
-from ..cage.errors import CageError, in_digits
+from ..cage.errors import CageError, CageWarning, in_digits, warn
 from ..progress import timed
 from ..regression.scene import LoadedScene
-from ..studio.animation import load_quietly, set_parameters
-from ..studio.frame_files import FrameFiles
-from ..studio.look import Look
+from ..studio.animation import FrameFiles, load_quietly, set_parameters
 from ..studio.picture import MOST_SEGMENTS, outline_for, shading_for
-from ..studio.studio_entries import variant_in_use
+from ..studio.studio_entries import Look, variant_in_use
 from ..studio.view import View
 from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
+from .materialx_library import library
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
 from .scene_entries import SceneEntries
 from .sensors import NO_BLUR, sensor
-from .stage_reader import StageReader
+from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage
 from .stage_warnings import StageWarnings
 from .studio_defaults import angles_for, size_for, with_studio_defaults
 from .texture_detail import texels_for_pictures
+
+if TYPE_CHECKING:
+    from pxr import Usd
 
 # What differs between contents where only the camera does.
 _OF_CAMERA = frozenset({"camera", "resolution"})
@@ -318,3 +323,80 @@ def _is_equal(a: Any, b: Any) -> bool:
 def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
     """A sensor, moved by a transform ``(4, 4)``."""
     return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}
+
+
+class StageReader:
+    """Reads a stage at several times.
+
+    Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
+
+    Parameters
+    ----------
+    path : str or Path
+    camera : str, optional
+        Path of the camera; by default, that of the stage's render settings, or its first one.
+    warned : set of str, optional
+        Warnings about other files, without their names; those about this one are added.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    """
+
+    def __init__(self, path: str | Path, camera: str | None = None, warned: set[str] | None = None) -> None:
+        with Path(path).open("rb"):
+            pass  # So that a missing file is an OSError, as for other formats.
+        self._path, self._camera = path, camera
+        self._stage: Usd.Stage | None = None
+        # The first contents, and, from the second time on, whether they stay but for the camera.
+        self._first: SceneContents | None = None
+        self._is_still: bool | None = None
+        self._warned = set() if warned is None else warned
+        # It takes a dozen megabytes, which no scene needs.
+        weakref.finalize(self, library.cache_clear)
+
+    def at(self, time: float | None = None) -> SceneContents:
+        """Contents of the stage at a time code; see `read_stage`.
+
+        Raises
+        ------
+        CageError
+            As `read_stage`.
+        ValueError
+            If the time is not finite.
+        """
+        if time is not None and not math.isfinite(time):
+            raise ValueError(f'"{self._path}": time {time}; expected a finite number, a time code')
+        code = None if time is None else float(time)
+        caught: list[warnings.WarningMessage] = []
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", CageWarning)
+                return self._contents(f'"{self._path}"', code)
+        finally:
+            for each in caught:
+                self._pass_on(each)
+
+    def _pass_on(self, warning: warnings.WarningMessage) -> None:
+        """Give a warning that was caught, if it is not one of the cage's that has been given."""
+        if not issubclass(warning.category, CageWarning):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+            return
+        message = str(warning.message)
+        what = message.replace(str(self._path), "")
+        if what not in self._warned:
+            self._warned.add(what)
+            warn(message)
+
+    def _contents(self, name: str, time: float | None) -> SceneContents:
+        self._stage = self._stage or open_checked(self._path)
+        if self._first is not None and self._is_still is None:
+            self._is_still = is_still(self._stage)
+        if self._first is None or not self._is_still:
+            contents = read_open_stage(self._stage, name, time, self._camera)
+            # Kept only where it may serve.
+            self._first = contents if self._is_still is None else None
+            return contents
+        camera, resolution = read_open_camera(self._stage, name, time, self._camera)
+        return replace(self._first, camera=camera, resolution=resolution)

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageError, shortened
-from ..files.usd_names import HIDDEN_PURPOSES
 from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
-from ..files.usd_values import local_to_world, require_types, time_of, value_at
+from ..files.usd_values import HIDDEN_PURPOSES, local_to_world, require_types, time_of, value_at
 from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents

@@ -7,8 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..studio.look import Look
-from ..studio.studio_entries import DEFAULT_SIZE, LIGHTS, studio
+from ..studio.studio_entries import DEFAULT_SIZE, LIGHTS, Look, studio
 from ..studio.view import View
 from ..variants import SceneNode
 from .bsdfs import integrator, rgb

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..cage.contents import CageContents
 from ..mesh import ragged
 from ..studio.picture import outline_for, pixels_of_boxes
-from ..studio.placed_points import box_corners
+from ..studio.polygon_mesh import box_corners
 from ..variants import SceneNode
 from .baking import samples_elsewhere
 from .contents import MaterialContents, NodeContents, SceneContents, ShapeContents, TextureContents, leaves

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from ..variants import SceneNode
 from .baking import Baked, baked
 from .contents import NodeContents, TextureContents, leaves
-from .image_reduction import linear_values
 from .materialx_nodes import affine
 from .stage_warnings import StageWarnings
-from .texture_image import TextureImage, is_srgb_image, read_texture_image, with_alpha
+from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
 # From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
 _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])

@@ -23,9 +23,10 @@ import platform
 import re
 import sys
 import threading
-from collections.abc import Callable, Container
+import traceback
+from collections.abc import Callable, Container, Iterator
 from functools import lru_cache
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, NoReturn, Protocol
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
@@ -37,7 +38,6 @@ from ...variants import Variant, variant_name
 from ..garbage_collection import paused_collection
 from .hook_trial import trial_problem
 from .machine_code import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
-from .original_error import clear_frames, origin, raise_itself
 
 # Functions of the library of Mitsuba's Python bindings: from a Python object to its C++ instance, and back; and the
 # size of the latter in bytes.
@@ -56,6 +56,10 @@ _INTERACTION_ARGUMENTS = (
 )
 _ATTRIBUTE_ARGUMENTS = rf"std::basic_string_view<.*>, mitsuba::SurfaceInteraction<.*> const&, {_MASK}"
 _TAG, _FLAGS = 0xFFFF0000, 0x0000FFFF
+
+# Mitsuba makes the shapes of a scene in parallel.
+_lock = threading.Lock()
+_LIBRARIES = ("mitsuba", "drjit")
 
 
 class _Symbol(ctypes.Structure):
@@ -356,8 +360,6 @@ def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
 
 # Never emptied: shapes need their functions for their whole lifetime.
 _hooks: dict[Variant, InteractionHook] = {}
-# Mitsuba makes the shapes of a scene in parallel.
-_lock = threading.Lock()
 
 
 def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
@@ -378,3 +380,69 @@ def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
                 )
             _hooks[variant] = InteractionHook(variant, example)
         return _hooks[variant]
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and its chain of causes."""
+    seen: list[BaseException] = []
+    while error is not None and error not in seen:
+        seen.append(error)
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def origin(error: BaseException) -> BaseException:
+    """The error that Dr.Jit has raised ``RuntimeError`` from; the error itself if Dr.Jit did not raise it."""
+    while type(error) is RuntimeError and error.__cause__ is not None:
+        error = error.__cause__
+    return error
+
+
+def clear_frames(error: BaseException) -> None:
+    """Forget the local variables of the functions that an error has ended."""
+    for each in _causes(error):
+        traceback.clear_frames(each.__traceback__)
+
+
+def raise_itself(error: BaseException, frame: FrameType | None) -> None:
+    """Raise an error itself in the user's code that called Mitsuba, instead of one that was raised from it.
+
+    This uses the trace function: under a debugger, which needs it too, the other error is raised.
+
+    Parameters
+    ----------
+    error : exception
+        About to be raised through C++.
+    frame : frame, or None
+        Frame that called C++; None in threads that Python did not start.
+    """
+    caller = _caller(frame)
+    if caller is None or sys.gettrace() is not None:
+        return
+
+    errors = [error]
+
+    def look(_: FrameType, event: str, argument: Any) -> None:
+        # Called for the error, or for the next line if the caller has handled it.
+        sys.settrace(None)
+        caller.f_trace = None
+        error = errors.pop()
+        try:
+            if event == "exception" and argument[1] is not error and error in _causes(argument[1]):
+                raise error
+        finally:
+            # Its traceback has this frame.
+            del error, argument
+
+    caller.f_trace = look
+    sys.settrace(lambda *_: None)
+
+
+def _caller(frame: FrameType | None) -> FrameType | None:
+    """The frame outside all those of Mitsuba and Dr.Jit."""
+    caller = frame
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").partition(".")[0] in _LIBRARIES:
+            caller = frame.f_back
+        frame = frame.f_back
+    return caller
