@@ -23,7 +23,7 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinxcontrib.mermaid",
 ]
-exclude_patterns = ["mitsuba_subdivision", "reference/build", "**/__pycache__", "**/.ipynb_checkpoints"]
+exclude_patterns = ["mitsuba_subdivision", "mitsuba_usd", "reference/build", "**/__pycache__", "**/.ipynb_checkpoints"]
 
 myst_enable_extensions = ["dollarmath", "html_image"]
 myst_fence_as_directive = ["mermaid"]

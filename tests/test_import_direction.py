@@ -1,14 +1,17 @@
 """Imports between packages go one way (plugin/ARCHITECTURE.md)."""
 
 import ast
+import importlib
 from functools import cache
 from pathlib import Path
 
 import mitsuba_subdivision
+import mitsuba_usd
 import pytest
 
 PACKAGE = "mitsuba_subdivision"
 ROOT = Path(mitsuba_subdivision.__file__).parent
+WHOLE_FILES = Path(mitsuba_usd.__file__).parent
 # Packages, and modules beside them, and what each may import of this project. Later ones build on earlier ones.
 NUMPY_PACKAGES = [
     "deferred",
@@ -39,7 +42,7 @@ ALLOWED = {
     "evaluation": {"mesh", "schemes"},
     "cage": {"variants", "device_arrays", "mesh", "schemes"},
     "refinement": {"mesh", "schemes", "cage"},
-    "files": {"whole_file", "mesh", "cage"},
+    "files": {"deferred", "whole_file", "mesh", "cage"},
     "inspection": {"mesh", "schemes", "cage", "surface"},
     "kernels": {"llvm", "deferred", "device_arrays", "mesh", "schemes", "evaluation", "patches", "tessellation"},
     "shapes": {"llvm", *NUMPY_PACKAGES, "kernels"},
@@ -59,19 +62,6 @@ ALLOWED = {
         "__init__",
     },
     "studio": {"messages", *NUMPY_PACKAGES, "mitsuba_mesh", "shapes", "regression"},
-    "usd": {
-        "srgb",
-        "progress",
-        "variants",
-        "mesh",
-        "schemes",
-        "cage",
-        "files",
-        "tessellation",
-        "surface",
-        "regression",
-        "studio",
-    },
     "doctor": {"llvm", "cage", "__init__"},
     "commands": {
         "llvm",
@@ -81,13 +71,12 @@ ALLOWED = {
         "shapes",
         "regression",
         "studio",
-        "usd",
         "figures",
         "doctor",
         "__init__",
     },
     "__main__": {"messages", "whole_file", "progress", "cage", "commands", "__init__"},
-    "__init__": {"llvm", "examples", *NUMPY_PACKAGES, "kernels", "shapes", "fit", "studio", "usd"},
+    "__init__": {"llvm", "examples", *NUMPY_PACKAGES, "kernels", "shapes", "fit", "studio"},
 }
 # Imports that go up, each a public method that only calls a function above: the module, and what it may import there.
 UP = {
@@ -108,7 +97,6 @@ MAY_IMPORT = {
         "regression",
         "figures",
         "studio",
-        "usd",
         "doctor",
         "commands",
     },
@@ -126,10 +114,11 @@ MAY_IMPORT = {
     },
     "matplotlib": {"regression", "figures"},
     "plyfile": {"files"},
-    "pxr": {"files", "usd"},
-    "MaterialX": {"usd"},
+    "pxr": {"files"},
+    "MaterialX": set(),
     "mitsuba_oidn": {"studio"},
-    "PIL": {"usd"},
+    "PIL": set(),
+    "mitsuba_usd": {"commands", "__init__"},
 }
 
 
@@ -159,7 +148,7 @@ def imported_names(tree, package):
 @cache
 def imports_of(path, root):
     """The imported names of a file, each once."""
-    package = [PACKAGE, *path.relative_to(root).parts[:-1]]
+    package = [WHOLE_FILES.name if root == WHOLE_FILES else PACKAGE, *path.relative_to(root).parts[:-1]]
     return set(imported_names(ast.parse(path.read_text(encoding="utf-8")), package))
 
 
@@ -204,9 +193,35 @@ def violations(root):
     return found
 
 
+def names_within(root):
+    """What the package of whole USD files imports of this one that is not public: in ``__all__`` of a package."""
+    found = []
+    for path in sorted(root.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names = [(alias.name, None) for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and not node.level:
+                names = [(node.module, alias.name) for alias in node.names]
+            else:
+                continue
+            found += [f"{path.name}: {module} {name}" for module, name in names if not is_public(module, name)]
+    return found
+
+
+def is_public(module, name):
+    """Whether a name is one of another library, of a module beside the packages, or in ``__all__`` of a package."""
+    if module.split(".")[0] != PACKAGE:
+        return True
+    place = ROOT.joinpath(*module.split(".")[1:])
+    if place.is_dir():
+        return name in importlib.import_module(module).__all__
+    return place.parent == ROOT and not name.startswith("_")
+
+
 def module_graph(root):
     """The modules of ours that each module imports, wherever in it, but for what packages offer and for `UP`."""
-    modules = {".".join([PACKAGE, *path.relative_to(root).with_suffix("").parts]): path for path in root.rglob("*.py")}
+    package = WHOLE_FILES.name if root == WHOLE_FILES else PACKAGE
+    modules = {".".join([package, *path.relative_to(root).with_suffix("").parts]): path for path in root.rglob("*.py")}
     graph = {}
     for module, path in modules.items():
         relative = path.relative_to(root)
@@ -256,11 +271,31 @@ def test_nothing_else_goes_up():
 def test_modules_do_not_import_in_circles():
     known = f"{PACKAGE}.shapes."  # Protocols of `vertices`, for type checking.
     assert [module for module in circles(module_graph(ROOT)) if not module.startswith(known)] == []
+    assert circles(module_graph(WHOLE_FILES)) == []
+
+
+def test_whole_usd_files_are_built_on_public_names():
+    assert names_within(WHOLE_FILES) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from mitsuba_subdivision.files.usd_stage import open_stage",
+        "from mitsuba_subdivision.studio import picture",
+        "from mitsuba_subdivision.progress import _bar",
+        "import mitsuba_subdivision.cage",
+    ],
+)
+def test_a_name_that_is_not_public_is_found(tmp_path, text):
+    (tmp_path / "a.py").write_text(text + "\n")
+    assert len(names_within(tmp_path)) == 1
 
 
 def test_no_module_looks_up_limits_of_numbers_while_dr_jit_renders():
     """NumPy before 2.3 warns of subnormals where it looks them up in arithmetic without any, which Dr.Jit sets."""
-    assert not [path for path in ROOT.rglob("*.py") if "finfo(" in path.read_text(encoding="utf-8")]
+    paths = [*ROOT.rglob("*.py"), *WHOLE_FILES.rglob("*.py")]
+    assert not [path for path in paths if "finfo(" in path.read_text(encoding="utf-8")]
 
 
 def test_a_circle_of_modules_is_found(tmp_path):

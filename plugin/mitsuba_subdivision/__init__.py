@@ -21,6 +21,8 @@ register()
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from mitsuba_usd import usd_scene
+
     from . import fit as fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .device_arrays import upload
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
     from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
     from .tessellation import Tessellation, VertexMatrices
-    from .usd import usd_scene
 
 __all__ = [
     "AreaSamples",
@@ -85,13 +86,12 @@ _MODULES = {
     "check_scheme": "evaluation.scheme_laws",
     "example_file": "examples",
     "limit_stencil": "evaluation.limit_stencil",
-    "loss_of_views": "shapes.views",
+    "loss_of_views": "fit.views",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "schemes",
     "render_denoised": "studio",
     "studio_scene": "studio",
     "upload": "device_arrays",
-    "usd_scene": "usd.scene",
 }
 
 
@@ -99,6 +99,8 @@ _deferred = deferred(__name__, _MODULES)
 
 
 def __getattr__(name: str) -> object:
+    if name == "usd_scene":
+        return importlib.import_module("mitsuba_usd").usd_scene
     return importlib.import_module(".fit", __name__) if name == "fit" else _deferred(name)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import CageWarning
 from mitsuba_subdivision.files.usd_reader import read_usd
-from mitsuba_subdivision.usd.stage_scenes import StageReader
+from mitsuba_usd.stage_scenes import StageReader
 
 pytest.importorskip("pxr")
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.usd import copies
-from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
-from mitsuba_subdivision.usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
-from mitsuba_subdivision.usd.stage_warnings import StageWarnings
+from mitsuba_usd import copies
+from mitsuba_usd.contents import InstanceContents, SceneContents, ShapeContents
+from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
+from mitsuba_usd.stage_warnings import StageWarnings
 
 FACES = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
 POINTS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)

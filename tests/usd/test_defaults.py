@@ -6,7 +6,7 @@ import pytest
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.studio_entries import Look
-from mitsuba_subdivision.usd.stage_scenes import StageScenes
+from mitsuba_usd.stage_scenes import StageScenes
 from usd.moving_stages import CORNERS, CUBE, mesh, write
 
 BODY = f"point3f[] points = [{CORNERS}]{CUBE}"

@@ -9,9 +9,9 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
-from mitsuba_subdivision.usd.contents import NodeContents, PrimvarContents, TextureContents
-from mitsuba_subdivision.usd.materialx_library import library
-from mitsuba_subdivision.usd.stage_scenes import StageReader
+from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
+from mitsuba_usd.materialx_library import library
+from mitsuba_usd.stage_scenes import StageReader
 
 pytest.importorskip("MaterialX")
 Sdf = pytest.importorskip("pxr.Sdf")

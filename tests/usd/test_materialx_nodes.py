@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.usd import baking
-from mitsuba_subdivision.usd.baking import _procedural_wrap, baked
-from mitsuba_subdivision.usd.contents import NodeContents, TextureContents, leaves
-from mitsuba_subdivision.usd.materialx_nodes import evaluate, node, operation
+from mitsuba_usd import baking
+from mitsuba_usd.baking import _procedural_wrap, baked
+from mitsuba_usd.contents import NodeContents, TextureContents, leaves
+from mitsuba_usd.materialx_nodes import evaluate, node, operation
 
 UV = NodeContents("texcoord", "vector2", {"name": "st"})
 

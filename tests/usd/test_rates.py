@@ -13,10 +13,10 @@ from mitsuba_subdivision.cage import CageWarning, named_cages
 from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.polygon_mesh import points_at
-from mitsuba_subdivision.usd.contents import InstanceContents, SceneContents, ShapeContents
-from mitsuba_subdivision.usd.limit_surfaces import DENSE, Surfaces
-from mitsuba_subdivision.usd.rates import segments_of, triangles_for_picture
-from mitsuba_subdivision.usd.stage_warnings import StageWarnings
+from mitsuba_usd.contents import InstanceContents, SceneContents, ShapeContents
+from mitsuba_usd.limit_surfaces import DENSE, Surfaces
+from mitsuba_usd.rates import segments_of, triangles_for_picture
+from mitsuba_usd.stage_warnings import StageWarnings
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 

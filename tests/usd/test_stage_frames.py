@@ -14,11 +14,11 @@ from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.studio_entries import Look
-from mitsuba_subdivision.usd import loaded_shapes, stage_scenes
-from mitsuba_subdivision.usd.limit_surfaces import Surfaces
-from mitsuba_subdivision.usd.scene_entries import SceneEntries
-from mitsuba_subdivision.usd.stage_scenes import StageReader, StageScenes
-from mitsuba_subdivision.usd.stage_walk import is_still, open_checked
+from mitsuba_usd import loaded_shapes, stage_scenes
+from mitsuba_usd.limit_surfaces import Surfaces
+from mitsuba_usd.scene_entries import SceneEntries
+from mitsuba_usd.stage_scenes import StageReader, StageScenes
+from mitsuba_usd.stage_walk import is_still, open_checked
 from usd.moving_stages import (
     BARE,
     CAMERA,
@@ -126,7 +126,7 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
 def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, monkeypatch):
     """On a rig, with its focal length and its focus."""
     made = Counter()
-    for module, name in ((stage_scenes, "SceneEntries"), ("read_open_stage")):
+    for module, name in ((stage_scenes, "SceneEntries"), (stage_scenes, "read_open_stage")):
         call = getattr(module, name)
         monkeypatch.setattr(
             module,

@@ -7,14 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.usd import surface_models
-from mitsuba_subdivision.usd.bsdfs import Bsdfs, interior
-from mitsuba_subdivision.usd.contents import ShapeContents, TextureContents
-from mitsuba_subdivision.usd.materialx_library import library, numbers
-from mitsuba_subdivision.usd.materialx_nodes import node
-from mitsuba_subdivision.usd.stage_warnings import StageWarnings
-from mitsuba_subdivision.usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
-from mitsuba_subdivision.usd.textures import Textures
+from mitsuba_usd import surface_models
+from mitsuba_usd.bsdfs import Bsdfs, interior
+from mitsuba_usd.contents import ShapeContents, TextureContents
+from mitsuba_usd.materialx_library import library, numbers
+from mitsuba_usd.materialx_nodes import node
+from mitsuba_usd.stage_warnings import StageWarnings
+from mitsuba_usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
+from mitsuba_usd.textures import Textures
 
 pytest.importorskip("MaterialX")
 

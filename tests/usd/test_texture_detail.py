@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.usd.baking import Baked
-from mitsuba_subdivision.usd.contents import (
+from mitsuba_usd.baking import Baked
+from mitsuba_usd.contents import (
     InstanceContents,
     MaterialContents,
     NodeContents,
@@ -16,10 +16,10 @@ from mitsuba_subdivision.usd.contents import (
     ShapeContents,
     TextureContents,
 )
-from mitsuba_subdivision.usd.stage_warnings import StageWarnings
-from mitsuba_subdivision.usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
-from mitsuba_subdivision.usd.texture_image import halvings, read_texture_image, reduced
-from mitsuba_subdivision.usd.textures import Textures
+from mitsuba_usd.stage_warnings import StageWarnings
+from mitsuba_usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
+from mitsuba_usd.texture_image import halvings, read_texture_image, reduced
+from mitsuba_usd.textures import Textures
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -199,7 +199,7 @@ def test_a_jpeg_of_many_pixels_is_no_attack(tmp_path, monkeypatch):
 
 def test_two_components_are_red_and_green(monkeypatch):
     values = np.random.default_rng(1).random((4, 4, 2)).astype(np.float32)
-    monkeypatch.setattr("mitsuba_subdivision.usd.textures.baked", lambda *_: Baked(values, np.eye(3), "repeat"))
+    monkeypatch.setattr("mitsuba_usd.textures.baked", lambda *_: Baked(values, np.eye(3), "repeat"))
     given = NodeContents("texcoord", "vector2", {"name": "st"})
     found = np.array(Textures(StageWarnings()).color(given)["bitmap"])
     np.testing.assert_array_equal(found, np.pad(values, ((0, 0), (0, 0), (0, 1))))

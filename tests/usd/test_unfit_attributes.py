@@ -8,7 +8,7 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import CageWarning
-from mitsuba_subdivision.usd import stage_warnings
+from mitsuba_usd import stage_warnings
 from usd.moving_stages import write
 
 pytest.importorskip("pxr")

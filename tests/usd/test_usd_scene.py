@@ -11,9 +11,9 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.cage.equality import same
-from mitsuba_subdivision.usd import materialx_layers, stage_meshes
-from mitsuba_subdivision.usd.stage_walk import read_stage
-from mitsuba_subdivision.usd.texture_image import read_texture_image
+from mitsuba_usd import materialx_layers, stage_meshes
+from mitsuba_usd.stage_walk import read_stage
+from mitsuba_usd.texture_image import read_texture_image
 from scipy.spatial import cKDTree
 
 pytest.importorskip("pxr")
@@ -436,7 +436,7 @@ def test_copies_in_place_of_many_instances_look_like_them(stage, monkeypatch):
     sun = 'def DistantLight "sun" { float inputs:angle = 0\n float inputs:intensity = 3 }\n'
     pictures, names = [], []
     for least in (3, 2):
-        monkeypatch.setattr("mitsuba_subdivision.usd.copies.LEAST_INSTANCES", least)
+        monkeypatch.setattr("mitsuba_usd.copies.LEAST_INSTANCES", least)
         entries = {**msub.usd_scene(stage(CAMERA + sun + points), mi, size=(32, 32)), "integrator": UV_AND_NORMAL}
         names.append(set(entries) & {"points_0", "points_1", "copies_0_smooth", "copies_0_flat"})
         pictures.append(np.array(mi.render(mi.load_dict(entries), spp=4)))

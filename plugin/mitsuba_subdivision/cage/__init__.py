@@ -1,7 +1,24 @@
 """Control cages: validation, tags, attributes, what files hold of them, and named examples."""
 
 from .attributes import Attribute
+from .contents import CageContents
 from .control_cage import ControlCage
-from .errors import CageError, CageWarning
+from .equality import same, same_topology
+from .errors import CageError, CageWarning, in_digits, shortened, warn
+from .source import CageSource
+from .validation import require_range
 
-__all__ = ["Attribute", "CageError", "CageWarning", "ControlCage"]
+__all__ = [
+    "Attribute",
+    "CageContents",
+    "CageError",
+    "CageSource",
+    "CageWarning",
+    "ControlCage",
+    "in_digits",
+    "require_range",
+    "same",
+    "same_topology",
+    "shortened",
+    "warn",
+]

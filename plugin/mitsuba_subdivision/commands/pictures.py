@@ -155,7 +155,7 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
     look, which = _look(options), {"time": options.time, "numbers": options.frames}
     is_usd = options.scene.suffix.lower().startswith(".usd")
     if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
-        from ..usd.stage_scenes import StageScenes
+        from mitsuba_usd import StageScenes
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}
         parameters = {name: v for name, v in given.items() if v is not None}

@@ -1,1 +1,6 @@
 """Polygon meshes: half-edges, sharpness, cuts and seams, and the one-rings of elements."""
+
+from . import ragged
+from .connectivity import IntArray
+
+__all__ = ["IntArray", "ragged"]

@@ -1,7 +1,52 @@
 """A neutral studio around a model: camera, lights and backdrop, turntables, and the command ``render``."""
 
+from ..regression.scene import LoadedScene
+from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .denoising import render_denoised
+from .model import frame_table
+from .picture import (
+    MOST_SEGMENTS,
+    MOST_TRIANGLES,
+    highest_rate,
+    outline_for,
+    pixels_of_boxes,
+    segments_for,
+    shading_for,
+    triangles_for,
+)
+from .polygon_mesh import PolygonMesh, box_corners, points_at, with_meshes
 from .scene import studio_scene
-from .studio_entries import studio
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, LIGHTS, Look, sampler, studio, variant_in_use
+from .view import DEFAULT_VIEW, View
 
-__all__ = ["render_denoised", "studio", "studio_scene"]
+__all__ = [
+    "DEFAULT_SIZE",
+    "DEFAULT_SPP",
+    "DEFAULT_VIEW",
+    "LIGHTS",
+    "MOST_SEGMENTS",
+    "MOST_TRIANGLES",
+    "FrameFiles",
+    "LoadedScene",
+    "Look",
+    "PolygonMesh",
+    "StillPicture",
+    "View",
+    "box_corners",
+    "frame_table",
+    "highest_rate",
+    "load_quietly",
+    "outline_for",
+    "pixels_of_boxes",
+    "points_at",
+    "render_denoised",
+    "sampler",
+    "segments_for",
+    "set_parameters",
+    "shading_for",
+    "studio",
+    "studio_scene",
+    "triangles_for",
+    "variant_in_use",
+    "with_meshes",
+]

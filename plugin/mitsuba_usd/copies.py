@@ -12,13 +12,11 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from mitsuba_subdivision.cage import Attribute, CageContents, CageSource
+from mitsuba_subdivision.files import reversed_order
+from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
-from ..cage.source import CageSource
-from ..files.usd_reader import reversed_order
-from ..mesh.connectivity import IntArray
 from .contents import SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 

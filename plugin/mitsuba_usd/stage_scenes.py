@@ -14,17 +14,23 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage import CageError, CageWarning, in_digits, same, warn
+from mitsuba_subdivision.progress import timed
+from mitsuba_subdivision.studio import (
+    MOST_SEGMENTS,
+    FrameFiles,
+    LoadedScene,
+    Look,
+    View,
+    load_quietly,
+    outline_for,
+    set_parameters,
+    shading_for,
+    variant_in_use,
+)
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..cage.equality import same
-from ..cage.errors import CageError, CageWarning, in_digits, warn
-from ..progress import timed
-from ..regression.scene import LoadedScene
-from ..studio.animation import FrameFiles, load_quietly, set_parameters
-from ..studio.picture import MOST_SEGMENTS, outline_for, shading_for
-from ..studio.studio_entries import Look, variant_in_use
-from ..studio.view import View
-from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .limit_surfaces import Surfaces

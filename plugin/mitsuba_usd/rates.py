@@ -8,14 +8,13 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+from mitsuba_subdivision.cage import CageError, ControlCage
+from mitsuba_subdivision.mesh import IntArray
+from mitsuba_subdivision.schemes import SchemeError
+from mitsuba_subdivision.studio import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, segments_for, triangles_for
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..cage import ControlCage
-from ..cage.errors import CageError
-from ..mesh.connectivity import IntArray
-from ..schemes import SchemeError
-from ..studio.picture import MOST_SEGMENTS, MOST_TRIANGLES, highest_rate, segments_for, triangles_for
-from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .limit_surfaces import Surfaces
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mitsuba_subdivision.files import value_at
 from numpy.typing import NDArray
 
-from ..files.usd_values import value_at
 from .contents import CameraContents
 from .stage_warnings import StageWarnings
 

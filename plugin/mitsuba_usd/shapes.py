@@ -7,14 +7,12 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage import Attribute, CageContents
+from mitsuba_subdivision.mesh import IntArray, ragged
+from mitsuba_subdivision.studio import PolygonMesh, points_at
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
-from ..studio.polygon_mesh import PolygonMesh, points_at
-from ..variants import SceneNode
 from .contents import ShapeContents
 from .limit_surfaces import Surfaces
 from .stage_warnings import StageWarnings

@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..variants import SceneNode
 from .baking import Baked, baked
 from .contents import NodeContents, TextureContents, leaves
 from .materialx_nodes import affine

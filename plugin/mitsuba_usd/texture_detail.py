@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from mitsuba_subdivision.cage import CageContents
+from mitsuba_subdivision.mesh import ragged
+from mitsuba_subdivision.studio import box_corners, outline_for, pixels_of_boxes
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..cage.contents import CageContents
-from ..mesh import ragged
-from ..studio.picture import outline_for, pixels_of_boxes
-from ..studio.polygon_mesh import box_corners
-from ..variants import SceneNode
 from .baking import samples_elsewhere
 from .contents import MaterialContents, NodeContents, SceneContents, ShapeContents, TextureContents, leaves
 

@@ -1,6 +1,9 @@
-"""A whole USD file as a scene of Mitsuba.
+"""Whole USD files as scenes of Mitsuba, subdivided where they ask for it.
 
-stage_reader.py, stage_walk.py, stage_*.py, polygons.py   read a stage to plain data
+Meshes, cameras, lights, and materials of MaterialX and of UsdPreviewSurface become entries of a scene dictionary.
+The package needs nothing of `mitsuba_subdivision` but its public names.
+
+stage_walk.py, stage_*.py, polygons.py   read a stage to plain data
 materialx_layers.py, materialx_library.py   the USD layers and the node library of MaterialX
 contents.py                  the plain data
 surface_models.py            models of surfaces, by the inputs that all share
@@ -15,5 +18,6 @@ stage_warnings.py            warnings, one for each kind
 """
 
 from .scene import usd_scene
+from .stage_scenes import StageScenes
 
-__all__ = ["usd_scene"]
+__all__ = ["StageScenes", "usd_scene"]

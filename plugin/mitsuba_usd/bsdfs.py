@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
-from ..variants import SceneNode
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .materialx_nodes import constant, is_constant, node
 from .stage_warnings import StageWarnings

@@ -13,7 +13,8 @@ import posixpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..cage.errors import warn
+from mitsuba_subdivision.cage import warn
+
 from .materialx_library import has_materialx, library
 
 if TYPE_CHECKING:

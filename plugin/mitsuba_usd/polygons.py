@@ -7,14 +7,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mitsuba_subdivision.cage import CageContents, CageSource, require_range
+from mitsuba_subdivision.files import MeshReader, reversed_order, value_at
+from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
-
-from ..cage.contents import CageContents
-from ..cage.source import CageSource
-from ..cage.validation import require_range
-from ..files.usd_reader import MeshReader, reversed_order
-from ..files.usd_values import value_at
-from ..mesh.connectivity import IntArray
 
 if TYPE_CHECKING:
     from pxr import Usd

@@ -9,11 +9,10 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage import CageError, CageWarning, same, same_topology
+from mitsuba_subdivision.studio import set_parameters
+from mitsuba_subdivision.variants import SceneNode
 
-from ..cage.equality import same, same_topology
-from ..cage.errors import CageError, CageWarning
-from ..studio.animation import set_parameters
-from ..variants import SceneNode
 from .bsdfs import interior
 from .contents import MaterialContents, ShapeContents
 from .limit_surfaces import Surfaces

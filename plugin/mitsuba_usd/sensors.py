@@ -6,9 +6,9 @@ import math
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.studio import sampler
+from mitsuba_subdivision.variants import SceneNode
 
-from ..studio.studio_entries import sampler
-from ..variants import SceneNode
 from .contents import CameraContents
 from .stage_warnings import StageWarnings
 

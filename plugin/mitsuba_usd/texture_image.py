@@ -13,9 +13,8 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.srgb import decoded, encoded
 from numpy.typing import NDArray
-
-from ..srgb import decoded, encoded
 
 UDIM = "<UDIM>"
 # A file within an archive: archive.usdz[folder/file.png].

@@ -8,12 +8,12 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage import CageError
+from mitsuba_subdivision.progress import counted
+from mitsuba_subdivision.schemes import SchemeError
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..cage.errors import CageError
-from ..progress import counted
-from ..schemes import SchemeError
-from ..variants import SceneNode
 from .bsdfs import Bsdfs, interior, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .emitters import emitter, one_environment

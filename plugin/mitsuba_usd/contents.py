@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from mitsuba_subdivision.cage import CageContents
 from numpy.typing import NDArray
-
-from ..cage.contents import CageContents
 
 
 @dataclass(frozen=True, eq=False)

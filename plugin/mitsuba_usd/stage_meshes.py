@@ -7,17 +7,11 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mitsuba_subdivision.cage import Attribute, CageContents, CageError, require_range, shortened
+from mitsuba_subdivision.files import MeshReader, PrimvarChoice, Skinning, require_types, value_at
+from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
-from ..cage.errors import CageError, shortened
-from ..cage.validation import require_range
-from ..files.usd_primvars import PrimvarChoice
-from ..files.usd_reader import MeshReader
-from ..files.usd_skinning import Skinning
-from ..files.usd_values import require_types, value_at
-from ..mesh.connectivity import IntArray
 from .contents import ShapeContents
 from .polygons import GPRIMS, read_gprim, read_normals
 from .stage_lights import read_emission

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from mitsuba_subdivision.studio import DEFAULT_SIZE, LIGHTS, Look, View, studio
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..studio.studio_entries import DEFAULT_SIZE, LIGHTS, Look, studio
-from ..studio.view import View
-from ..variants import SceneNode
 from .bsdfs import integrator, rgb
 from .contents import CameraContents, SceneContents
 from .emitters import are_lamps_in_the_way

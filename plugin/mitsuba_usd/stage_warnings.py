@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from ..cage.errors import shortened, warn
+from mitsuba_subdivision.cage import shortened, warn
 
 # Prims that a message names, and characters of their names that it shows.
 _SHOWN, _LENGTH = 3, 200

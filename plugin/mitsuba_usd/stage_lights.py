@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mitsuba_subdivision.files import value_at
 from numpy.typing import NDArray
 
-from ..files.usd_values import value_at
 from .contents import LightContents
 from .stage_warnings import StageWarnings
 

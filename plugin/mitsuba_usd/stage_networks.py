@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mitsuba_subdivision.files import value_at
+from mitsuba_subdivision.srgb import decoded
 from numpy.typing import NDArray
 
-from ..files.usd_values import value_at
-from ..srgb import decoded
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_library import library, numbers
 from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node

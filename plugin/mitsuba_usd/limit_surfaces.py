@@ -9,19 +9,15 @@ from functools import cached_property
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage import CageContents, CageError, CageWarning, ControlCage, same, same_topology
+from mitsuba_subdivision.progress import counted
+from mitsuba_subdivision.schemes import SchemeError
+from mitsuba_subdivision.studio import box_corners, frame_table, points_at
+from mitsuba_subdivision.surface import LimitSurface
+from mitsuba_subdivision.tessellation import VertexTable
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..cage import ControlCage
-from ..cage.contents import CageContents
-from ..cage.equality import same, same_topology
-from ..cage.errors import CageError, CageWarning
-from ..progress import counted
-from ..schemes import SchemeError
-from ..studio.model import frame_table
-from ..studio.polygon_mesh import box_corners, points_at
-from ..surface import LimitSurface
-from ..tessellation import VertexTable
-from ..variants import SceneNode
 from .contents import SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 

@@ -14,12 +14,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mitsuba_subdivision.cage import CageError, shortened
+from mitsuba_subdivision.files import (
+    HIDDEN_PURPOSES,
+    local_to_world,
+    open_stage,
+    require_types,
+    require_usd,
+    time_of,
+    usd_errors_at,
+    usd_messages_of,
+    value_at,
+)
+from mitsuba_subdivision.progress import timed
 from numpy.typing import NDArray
 
-from ..cage.errors import CageError, shortened
-from ..files.usd_stage import open_stage, require_usd, usd_errors_at, usd_messages_of
-from ..files.usd_values import HIDDEN_PURPOSES, local_to_world, require_types, time_of, value_at
-from ..progress import timed
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
 from .materialx_layers import with_documents
 from .polygons import GPRIMS

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from mitsuba_subdivision.cage import same
 from numpy.typing import NDArray
 
-from ..cage.equality import same
 from . import materialx_noise as noise
 from .contents import Input, NodeContents, PrimvarContents, TextureContents
 

@@ -6,11 +6,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ..studio.animation import StillPicture
-from ..studio.polygon_mesh import with_meshes
-from ..studio.studio_entries import DEFAULT_SPP, Look
-from ..studio.view import DEFAULT_VIEW, View
-from ..variants import SceneNode, variant_set
+from mitsuba_subdivision.studio import DEFAULT_SPP, DEFAULT_VIEW, Look, StillPicture, View, with_meshes
+from mitsuba_subdivision.variants import SceneNode, variant_set
+
 from .stage_scenes import StageScenes
 
 

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from ..variants import SceneNode
 from .bsdfs import rgb
 from .contents import LightContents
 from .stage_warnings import StageWarnings

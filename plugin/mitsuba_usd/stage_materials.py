@@ -6,10 +6,10 @@ from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mitsuba_subdivision.cage import same
+from mitsuba_subdivision.files import value_at
 from numpy.typing import NDArray
 
-from ..cage.equality import same
-from ..files.usd_values import value_at
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_library import MISSING, has_materialx
