@@ -44,10 +44,6 @@ def long_description(text: str, repository: str | None, tag: str) -> str:
         Address of the repository on GitHub.
     tag : str
         Version of the files that links lead to.
-
-    Returns
-    -------
-    str
     """
 
     def resolved(link: re.Match[str]) -> str:

@@ -35,56 +35,29 @@ _CHILD = "import sys; from mitsuba_subdivision.doctor import _print_report; _pri
 
 @dataclass(frozen=True)
 class VariantReport:
-    """Result of a test of one variant of Mitsuba.
+    """Result of a test of one variant of Mitsuba."""
 
-    Attributes
-    ----------
-    works : bool or None
-        Whether it renders a surface at the right place. None if the machine lacks what it needs, and need not have it.
-    problem : str or None
-        Why it does not work.
-    exact_shading : bool
-        Whether exact shading puts a hit on the surface.
-    exact_problem : str or None
-        Why exact shading does not work.
-    llvm : int or None
-        Major version of the LLVM library that Dr.Jit has loaded.
-    seconds : float
-        From the start of the process to its end.
-    """
-
+    # Whether it renders a surface at the right place. None if the machine lacks what it needs, and need not have it.
     works: bool | None
-    problem: str | None = None
-    exact_shading: bool = False
-    exact_problem: str | None = None
-    llvm: int | None = None
-    seconds: float = 0.0
+    problem: str | None = None  # Why it does not work
+    exact_shading: bool = False  # Whether exact shading puts a hit on the surface
+    exact_problem: str | None = None  # Why exact shading does not work
+    llvm: int | None = None  # Major version of the LLVM library that Dr.Jit has loaded
+    seconds: float = 0.0  # From the start of the process to its end
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Facts about a machine for a bug report.
+    """Facts about a machine for a bug report."""
 
-    Attributes
-    ----------
-    versions : dict of str to str or None
-        Of this package, Python and the packages that it needs; None for one that is missing.
-    machine : str
-        Operating system and processor.
-    llvm : LlvmChoice
-        Which LLVM library this package has chosen, and why.
-    late_llvm : int or None
-        Major version of the library that programs get which import Mitsuba first. None if there is none.
-    variants : dict of str to VariantReport
-    extras : dict of str to dict of str to str or None
-        Versions of the packages of each extra; None for missing ones.
-    """
-
+    # Of this package, Python and the packages that it needs; None for one that is missing
     versions: dict[str, str | None]
-    machine: str
-    llvm: LlvmChoice
+    machine: str  # Operating system and processor
+    llvm: LlvmChoice  # Which LLVM library this package has chosen, and why
+    # Major version of the library that programs get which import Mitsuba first. None if there is none.
     late_llvm: int | None
     variants: dict[str, VariantReport]
+    # Versions of the packages of each extra; None for missing ones
     extras: dict[str, dict[str, str | None]] = field(default_factory=dict)
 
     @property
@@ -130,10 +103,6 @@ def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
     ----------
     variants : dict of str to bool, optional
         Names of variants, and whether one that the machine has no device for is a problem. By default `VARIANTS`.
-
-    Returns
-    -------
-    Diagnosis
     """
     from . import __version__
 
@@ -153,10 +122,6 @@ def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> 
         Whether it is a problem if the machine has no device for it.
     seconds : float
         After which the process is ended.
-
-    Returns
-    -------
-    VariantReport
     """
     start = time.monotonic()
     command = [sys.executable, "-c", _CHILD, variant]

@@ -28,56 +28,34 @@ VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 @dataclass(frozen=True)
 class Inspection:
-    """Statistics of a cage and its limit surface.
+    """Statistics of a cage and its limit surface."""
 
-    Attributes
-    ----------
-    name : str
-        How messages call the cage.
-    scheme : str
-    vertex_count, edge_count, face_count, component_count : int
-    bounding_box : two tuples of float
-        Least and greatest coordinates of the control points that faces have.
-    face_sizes, valences : dict of int to int
-        How many faces have so many corners, and how many inner vertices so many faces.
-    boundary_edge_count, boundary_loop_count : int
-    boundary : str
-        The boundary rule.
-    rules : dict of str to str
-        The other rules where they are not the default.
-    sharp : dict of str to int
-        Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes, and of the edges and vertices
-        that are sharp because the cage is no manifold there.
-    attributes : dict of str to str
-        Interpolation of each attribute, and how many edges of face-varying ones are seams.
-    patch_count, class_count : int
-    rate, triangle_count, mesh_bytes : int
-        The tessellation at a rate: segments per edge, triangles, and memory of the mesh that Mitsuba gets.
-    warnings : tuple of str
-        What will look odd.
-    """
-
-    name: str
+    name: str  # How messages call the cage
     scheme: str
     vertex_count: int
     edge_count: int
     face_count: int
     component_count: int
+    # Least and greatest coordinates of the control points that faces have
     bounding_box: tuple[tuple[float, ...], tuple[float, ...]]
+    # How many faces have so many corners, and how many inner vertices so many faces
     face_sizes: dict[int, int]
     valences: dict[int, int]
     boundary_edge_count: int
     boundary_loop_count: int
-    boundary: str
-    rules: dict[str, str]
+    boundary: str  # The boundary rule
+    rules: dict[str, str]  # The other rules where they are not the default
+    # Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes, and of the edges and vertices
+    # that are sharp because the cage is no manifold there
     sharp: dict[str, int]
-    attributes: dict[str, str]
+    attributes: dict[str, str]  # Interpolation of each attribute, and how many edges of face-varying ones are seams
     patch_count: int
     class_count: int
+    # The tessellation at a rate: segments per edge, triangles, and memory of the mesh that Mitsuba gets
     rate: int
     triangle_count: int
     mesh_bytes: int
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # What will look odd
 
     def __str__(self) -> str:
         rows = [
@@ -112,7 +90,6 @@ def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
 
     Parameters
     ----------
-    surface : LimitSurface
     rate : int
         Segments per edge of the tessellation whose size is predicted, at least 1.
 

@@ -46,21 +46,12 @@ _SYSTEM_FOLDERS = (
 
 
 class LlvmChoice(NamedTuple):
-    """The library for Dr.Jit to load.
+    """The library for Dr.Jit to load."""
 
-    Attributes
-    ----------
-    path : str or None
-        Path of the library. None if Dr.Jit searches by itself, or if there is no usable library.
-    version : int or None
-        Major version of the library, None if unknown. Without a path: of the newest library, which is too old.
-    reason : str
-        Why this choice was made.
-    """
-
-    path: str | None
+    path: str | None  # Path of the library. None if Dr.Jit searches by itself, or if there is no usable library.
+    # Major version of the library, None if unknown. Without a path: of the newest library, which is too old.
     version: int | None
-    reason: str
+    reason: str  # Why this choice was made
 
 
 def lowest_version() -> int:

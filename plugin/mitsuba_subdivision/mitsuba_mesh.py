@@ -31,7 +31,6 @@ def mitsuba_mesh(
 
     Parameters
     ----------
-    name : str
     triangles : (m, 3) int
     buffers : dict of str to (n, k) array
         ``vertex_positions``, and if the mesh has them ``vertex_normals``, ``vertex_texcoords``, and attributes of

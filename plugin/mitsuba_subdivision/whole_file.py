@@ -57,7 +57,6 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
 
     Parameters
     ----------
-    path : Path
     inputs : iterable of Path, optional
         Files that the work reads; ``path`` must not be one of them.
 

@@ -47,7 +47,6 @@ def baked(expression: NodeContents, source: Source) -> Baked:
 
     Parameters
     ----------
-    expression : NodeContents
     source : callable
         Reads pictures; where there is none, its fallback is taken.
     """

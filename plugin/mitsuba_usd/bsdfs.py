@@ -46,13 +46,7 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class Bsdfs:
-    """Builds BSDFs and emitters from materials.
-
-    Parameters
-    ----------
-    textures : Textures
-    notes : StageWarnings
-    """
+    """Builds BSDFs and emitters from materials."""
 
     def __init__(self, textures: Textures, notes: StageWarnings) -> None:
         self._textures = textures
@@ -70,7 +64,6 @@ class Bsdfs:
 
         Parameters
         ----------
-        material : MaterialContents
         shape : ShapeContents
             Whose attributes the material may read.
         """
@@ -117,7 +110,6 @@ def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear
 
     Parameters
     ----------
-    materials : list of MaterialContents
     usual : dict
         The integrator of scenes without glass.
     has_clear_lamps : bool

@@ -25,7 +25,6 @@ class TextureContents:
     color_space : "auto", "raw" or "sRGB"
     wrap : str
         Mitsuba's name: "repeat", "clamp" or "mirror".
-    scale, bias : list of 4 floats
     to_uv : (3, 3) float64
         From texture coordinates to those of the picture, whose v points up.
     texcoords : str
@@ -232,12 +231,9 @@ class CameraContents:
     name : str
         Path of the prim.
     to_world : (4, 4) float64
-    is_perspective : bool
     aperture, offset : list of 2 floats
         Of the film, horizontal and vertical, in the same unit as the focal length; for orthographic cameras, in the
         world's.
-    focal_length : float
-    near, far : float
     lens_radius, focus_distance : float
         In the world's units; 0 without depth of field.
     shutter : list of 2 floats

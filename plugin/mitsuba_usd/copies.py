@@ -81,12 +81,9 @@ def with_copies(
 
     Parameters
     ----------
-    contents : SceneContents
     rates : dict of (n,) int array by shape
         Segments on each edge of limit surfaces that their copies need, in the order of ``contents.placed_shapes``.
     shading : "vertex" or "exact"
-    notes : StageWarnings
-    lowest : int
     """
     placed = _of_instances(contents, rates)
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}

@@ -29,10 +29,8 @@ def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
 
     Parameters
     ----------
-    light : LightContents
     up : "y" or "z"
         Up axis of the stage.
-    textures : Textures
     """
     return _MAKERS[light.kind](light, up, textures)
 

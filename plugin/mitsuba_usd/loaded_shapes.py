@@ -65,13 +65,10 @@ class LoadedShapes:
 
         Parameters
         ----------
-        shape : ShapeContents
-        material : MaterialContents or None
         bsdf : callable
             Makes the entry of its BSDF.
         area : dict or None
             Entry of its emitter.
-        notes : StageWarnings
 
         Raises
         ------

@@ -35,7 +35,6 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
 
     Parameters
     ----------
-    stage : Usd.Stage
     name : str
         Beginning of messages.
 

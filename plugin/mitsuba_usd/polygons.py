@@ -28,7 +28,6 @@ def read_normals(reader: MeshReader, cage: CageContents) -> NDArray[np.float64] 
 
     Parameters
     ----------
-    reader : MeshReader
     cage : CageContents
         Contents of the mesh, in its own space.
     """

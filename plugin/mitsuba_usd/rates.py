@@ -48,7 +48,6 @@ def triangles_for_picture(
 
     Parameters
     ----------
-    contents : SceneContents
     segments : dict of (n,) int array by shape
         See `segments_of`.
     outline : dict

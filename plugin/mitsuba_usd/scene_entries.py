@@ -32,8 +32,6 @@ class SceneEntries:
 
     Parameters
     ----------
-    contents : SceneContents
-    notes : StageWarnings
     parameters : dict
         Of every shape ``subdivision``; see `with_rate`.
     surfaces : Surfaces
@@ -48,10 +46,6 @@ class SceneEntries:
         If given, its objects are used as shapes.
     has_clear_lamps : bool
         Whether shapes of lights let light through, which takes the integrator ``volpath``.
-
-    Attributes
-    ----------
-    scene : dict
     """
 
     def __init__(

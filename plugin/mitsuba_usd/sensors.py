@@ -22,11 +22,8 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
 
     Parameters
     ----------
-    camera : CameraContents
     size : (width, height)
         Of the film, in pixels.
-    spp : int
-    notes : StageWarnings
     """
     width, height = size
     wide, high = film_window(camera, width / height)

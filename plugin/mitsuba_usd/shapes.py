@@ -30,13 +30,10 @@ def subdivision(
 
     Parameters
     ----------
-    shape : ShapeContents
     surfaces : Surfaces
         Where its cage is validated.
-    bsdf, emitter : dict, mi.Object or None
     parameters : dict
         Of the shape ``subdivision``.
-    notes : StageWarnings
 
     Raises
     ------

@@ -44,12 +44,10 @@ class FrameSettings:
 
     Parameters
     ----------
-    resolution : list of 2 ints or None
     camera : str or None
         Path of the camera.
     conform_policy : str
         One of `CONFORM_POLICIES`.
-    has_motion_blur, has_depth_of_field : bool
     """
 
     resolution: list[int] | None = None
@@ -112,12 +110,8 @@ def read_camera(
 
     Parameters
     ----------
-    camera : UsdGeom.Camera
     to_world : (4, 4) float64
         For column vectors. Scales are left out, as USD's own frustum of a camera has none.
-    time : Usd.TimeCode
-    settings : FrameSettings
-    notes : StageWarnings
     """
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)

@@ -53,11 +53,8 @@ def read_light(
 
     Parameters
     ----------
-    prim : Usd.Prim
     to_world : (4, 4) float64
         For column vectors.
-    time : Usd.TimeCode
-    notes : StageWarnings
     """
     path, given = prim.GetPath(), str(prim.GetTypeName())
     kind = KINDS.get(given)

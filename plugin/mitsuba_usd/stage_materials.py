@@ -38,11 +38,6 @@ _DEEPEST = 16
 class MaterialReader:
     """Reads materials, each once.
 
-    Parameters
-    ----------
-    time : Usd.TimeCode
-    notes : StageWarnings
-
     Attributes
     ----------
     materials : list of MaterialContents

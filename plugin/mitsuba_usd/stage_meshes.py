@@ -35,11 +35,8 @@ class ShapeReader:
     ----------
     name : str
         Beginning of messages.
-    time : float or None
     code : Usd.TimeCode
         The same time, for all but the cage.
-    materials : MaterialReader
-    notes : StageWarnings
     """
 
     def __init__(
@@ -57,7 +54,6 @@ class ShapeReader:
 
         Parameters
         ----------
-        prim : Usd.Prim
         to_world : (4, 4) float64
             From the prim's space, for column vectors.
 

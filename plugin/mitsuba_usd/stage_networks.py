@@ -59,13 +59,7 @@ def source_of(given: UsdShade.Input, notes: StageWarnings) -> Usd.Attribute | No
 
 
 class NetworkReader:
-    """Reads shaders whose identifiers are definitions of MaterialX.
-
-    Parameters
-    ----------
-    time : Usd.TimeCode
-    notes : StageWarnings
-    """
+    """Reads shaders whose identifiers are definitions of MaterialX."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time = time

@@ -68,7 +68,6 @@ class StageScenes:
         Its view, size and samples.
     parameters : dict
         Of every shape ``subdivision``.
-    time : float, optional
     camera : str, optional
         Path of the stage's camera.
     numbers : range, optional
@@ -338,7 +337,6 @@ class StageReader:
 
     Parameters
     ----------
-    path : str or Path
     camera : str, optional
         Path of the camera; by default, that of the stage's render settings, or its first one.
     warned : set of str, optional
@@ -367,8 +365,6 @@ class StageReader:
 
         Raises
         ------
-        CageError
-            As `read_stage`.
         ValueError
             If the time is not finite.
         """

@@ -89,7 +89,6 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
 
     Parameters
     ----------
-    path : str or Path
     time : float, optional
         Time code; by default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional

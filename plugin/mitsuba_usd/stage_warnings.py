@@ -27,7 +27,6 @@ class StageWarnings:
         ----------
         what : str
             The problem and its consequence, the same text for all of its kind.
-        prim : Sdf.Path or str
         """
         prims = self._prims.setdefault(what, [])
         if str(prim) not in prims:

@@ -53,13 +53,10 @@ def with_studio_defaults(
 
     Parameters
     ----------
-    contents : SceneContents
     points : (n, 3) float64
         In the world, that the studio is set up around.
     is_lit : bool
         Whether the stage has lights.
-    look : Look
-    notes : StageWarnings
     name : str, optional
         Of the stage, with which messages begin.
     """

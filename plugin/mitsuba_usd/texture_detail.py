@@ -29,7 +29,6 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
 
     Parameters
     ----------
-    contents : SceneContents
     sensors : list of dict
         Entries of a scene.
     """

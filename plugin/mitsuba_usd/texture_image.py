@@ -42,20 +42,14 @@ _ENCODED = np.round(255 * encoded(np.arange(65536) / 65535)).astype(np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class TextureImage:
-    """Pixels of one file, or of the bounding box of all existing tiles.
+    """Pixels of one file, or of the bounding box of all existing tiles."""
 
-    Attributes
-    ----------
-    pixels : (h, w, channels) array
-        As they are in the file; the first row is the uppermost. Where there is no tile, they are zero.
-    to_uv : (3, 3) float64
-        From texture coordinates, whose v points up, to those of the picture, which are from 0 to 1.
-    is_there : (h, w) bool, or None
-        Whether there is a tile; None if the picture is everywhere.
-    """
-
+    # (h, w, channels) array: as they are in the file; the first row is the uppermost. Where there is no tile, they
+    # are zero.
     pixels: NDArray
+    # (3, 3) float64: from texture coordinates, whose v points up, to those of the picture, which are from 0 to 1
     to_uv: NDArray[np.float64]
+    # (h, w) bool, or None: whether there is a tile; None if the picture is everywhere
     is_there: NDArray[np.bool_] | None = None
 
 
@@ -277,8 +271,6 @@ def reduced(pixels: NDArray, needed: float, most: int | None = None, *, is_srgb:
     Parameters
     ----------
     pixels : (h, w, c) array
-    needed : float
-    most : int, optional
     is_srgb : bool
         Whether colours are encoded; alpha is linear.
     """

@@ -28,7 +28,6 @@ class Textures:
 
     Parameters
     ----------
-    notes : StageWarnings
     needed : dict of float by file, optional
         Pixels along the sides of textures of materials that pictures show; see `texels_for_pictures`.
     most : int, optional
@@ -58,7 +57,6 @@ class Textures:
 
         Parameters
         ----------
-        given : TextureContents or NodeContents
         is_radiance : bool
             Whether values may be above 1.
         """

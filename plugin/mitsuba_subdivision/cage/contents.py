@@ -34,8 +34,6 @@ class CageContents:
         Rows (vertex, sharpness), one for each sharp vertex.
     holes : (n,) int
         0-based faces that are not part of the surface.
-    texcoords : Attribute or None
-    attributes : dict of str to Attribute
     materials : dict of str to (n,) int
         0-based faces of each material that the file names.
     rules : dict of str to str

@@ -17,7 +17,6 @@ def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
 
     Parameters
     ----------
-    a, b : object
     but : frozenset of str
         Fields of ``a`` and ``b`` themselves that may differ.
     """

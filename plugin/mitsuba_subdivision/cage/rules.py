@@ -28,8 +28,6 @@ def boundary_holes(rule: str, t: Topology, is_boundary: NDArray[np.bool_]) -> ND
 
     Parameters
     ----------
-    rule : str
-    t : Topology
     is_boundary : (n_h,) bool
         Half-edges on the boundary, but for infinitely sharp ones, which the surface reaches.
     """

@@ -69,7 +69,6 @@ class CageSource:
         ----------
         where : str
             Beginning of the message, from `at_face` or `at_vertex`.
-        problem, expected : str
         count, noun : int, str
             How many there are, and of what: "vertex".
         """

@@ -53,7 +53,6 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
     Parameters
     ----------
     faces : sequence of int sequences, or (f, k) array
-    source : CageSource
 
     Raises
     ------
@@ -84,11 +83,9 @@ def validated_faces(
 
     Parameters
     ----------
-    vertex_count : int
     face_sizes : (n_f,) int
     face_vertices : (n_h,) int
         0-based.
-    source : CageSource
     strict : bool
         Whether the faces must be an oriented 2-manifold, closed or with boundary.
 

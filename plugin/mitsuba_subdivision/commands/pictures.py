@@ -196,7 +196,6 @@ def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> lis
     scene : dict
         As for ``mi.load_dict``; a polygon mesh may have the type "ply" and, as ``mesh``, an object with a method
         ``save`` that takes a path.
-    path : Path
     inputs : iterable of Path
         Files that must not be written to, besides those that the scene names.
 

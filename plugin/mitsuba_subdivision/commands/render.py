@@ -372,7 +372,6 @@ def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
 
     Parameters
     ----------
-    path : Path
     frames : sequence of Path
         PNG files of one size.
     fps : float

@@ -27,7 +27,6 @@ class BernsteinBasis:
 
     Parameters
     ----------
-    domain : ParameterDomain
     degree : int
         In each of u and v over the square, of both together over the triangle.
     """
@@ -112,20 +111,11 @@ class BernsteinBasis:
 
 @dataclass(frozen=True, eq=False)
 class RegularBernstein:
-    """The regular patches of a scheme in Bernstein form.
-
-    Attributes
-    ----------
-    basis : BernsteinBasis
-    of_controls : (b, R) float64
-        Coefficients over a regular patch's control points.
-    of_monomials : (b, m) float64
-        Coefficients over those of the `PolynomialBasis`.
-    """
+    """The regular patches of a scheme in Bernstein form."""
 
     basis: BernsteinBasis
-    of_controls: FloatArray
-    of_monomials: FloatArray
+    of_controls: FloatArray  # (b, R) float64: coefficients over a regular patch's control points
+    of_monomials: FloatArray  # (b, m) float64: coefficients over those of the `PolynomialBasis`
 
 
 @lru_cache(maxsize=16)

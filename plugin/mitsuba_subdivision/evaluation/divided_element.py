@@ -54,8 +54,6 @@ class DividedElement:
 
     Attributes
     ----------
-    scheme : Scheme
-    signature : Signature
     control_count : int
         K, of the element's one-ring.
     """

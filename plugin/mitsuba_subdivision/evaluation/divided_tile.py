@@ -32,7 +32,6 @@ class DividedTile:
 
     Parameters
     ----------
-    scheme : Scheme
     source : DividedElement or IrregularPatch
         The element that it covers; or the patch around an extraordinary point, from any level on, whose control points
         here are its eigen-coordinates.
@@ -130,7 +129,6 @@ def part_of_tile(element: DividedElement, stencils: FloatArray) -> tuple[Divided
 
     Parameters
     ----------
-    element : DividedElement
     stencils : (K_element, K) float64
         The element's control points over those of the tile.
 

@@ -44,25 +44,16 @@ class Eigenbasis:
 
     Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit
     stencil of the extraordinary point.
-
-    Attributes
-    ----------
-    vectors : (K, K) float64
-        V, right eigenvectors in columns.
-    inverse : (K, K) float64
-        L, left eigenvectors in rows.
-    eigenvalues : (K,) float64
-        One for each column of V. The columns of a block all have the mean of the real parts of its eigenvalues.
-    moduli : (K,) float64
-        The modulus of each eigenvalue; in a block, the largest of them.
-    blocks : tuple of (slice, (m, m) float64)
-        The blocks of T that are not multiples of the identity, and the rows and columns where they stand.
     """
 
-    vectors: FloatArray
-    inverse: FloatArray
+    vectors: FloatArray  # (K, K) float64: V, right eigenvectors in columns
+    inverse: FloatArray  # (K, K) float64: L, left eigenvectors in rows
+    # (K,) float64: one for each column of V. The columns of a block all have the mean of the real parts of its
+    # eigenvalues.
     eigenvalues: FloatArray
-    moduli: FloatArray
+    moduli: FloatArray  # (K,) float64: the modulus of each eigenvalue; in a block, the largest of them
+    # tuple of (slice, (m, m) float64): the blocks of T that are not multiples of the identity, and the rows and
+    # columns where they stand
     blocks: tuple[tuple[slice, FloatArray], ...]
 
     @property
@@ -158,15 +149,9 @@ def require_basis(matrix: FloatArray | sparse.csr_array, basis: Eigenbasis, prob
     Parameters
     ----------
     matrix : (K, K) float64, or sparse array
-    basis : Eigenbasis
     probes : (K, p) float64
         Vectors that the equations are multiplied by: all unit vectors, or a few of random signs, which the products of
         wrong matrices cannot but differ for [Freivalds 1977].
-
-    Raises
-    ------
-    EigenbasisError
-        As `eigenbasis`.
     """
     coordinates = basis.inverse @ probes
     image: NDArray = probes

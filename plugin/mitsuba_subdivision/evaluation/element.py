@@ -66,7 +66,6 @@ def evaluate_samples(
 
     Parameters
     ----------
-    located : LocatedSamples
     points : list of (m, K, x) float64
         Control points of the samples of each element, in arrays that may be changed. They are rounded to the type of
         the evaluation.
@@ -77,7 +76,6 @@ def evaluate_samples(
         not depend on where the model stands. The others are as published.
     dtype : float32 or float64
         Of all arithmetic.
-    derivatives : 1 or 2
     """
     count, has_origin = len(located.leaf_sample), evaluator not in ("power", "stam")
     # Samples are along the last axis, as operations along rows of three would be slow.

@@ -89,25 +89,17 @@ MOST_MULTIPLICATIONS = 1 << 18
 
 @dataclass(frozen=True, eq=False)
 class SampleRows:
-    """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates.
+    """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates."""
 
-    Attributes
-    ----------
-    rows : (3, s, K) or (6, s, K)
-        Of the point; of its two first derivatives divided by ``derivative_scale[0]``; of its three second derivatives
-        divided by ``derivative_scale[1]``.
-    derivative_scale : (2, s)
-        ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ`` in the stabilised form; one in the other forms, and at the extraordinary point.
-    level : (s,) int64
-        n; `AT_EXTRAORDINARY_POINT` at the point itself.
-    frame : (2, s, K) or None
-        Of two tangents whose cross product is along the normal, where that of the derivatives is lost: on borders and
-        creases and at sharp vertices. None elsewhere.
-    """
-
+    # (3, s, K) or (6, s, K): of the point; of its two first derivatives divided by ``derivative_scale[0]``; of its
+    # three second derivatives divided by ``derivative_scale[1]``
     rows: FloatArray
+    # (2, s): ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ`` in the stabilised form; one in the other forms, and at the extraordinary
+    # point
     derivative_scale: FloatArray
-    level: NDArray[np.int64]
+    level: NDArray[np.int64]  # (s,) int64: n; `AT_EXTRAORDINARY_POINT` at the point itself
+    # (2, s, K) or None: of two tangents whose cross product is along the normal, where that of the derivatives is
+    # lost: on borders and creases and at sharp vertices. None elsewhere.
     frame: FloatArray | None = None
 
     @property

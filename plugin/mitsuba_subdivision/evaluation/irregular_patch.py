@@ -42,39 +42,24 @@ FLOAT32_SIZE = 2.0**-24
 
 @dataclass(frozen=True, eq=False)
 class IrregularStructure:
-    """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules.
+    """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), as found by running the rules."""
 
-    Attributes
-    ----------
-    signature : Signature
-        Of the one-ring; child 0 has the same.
-    slots : (K,) int64
-        The vertices of the one-ring that are control points: all of them, but at a dart one that equals another.
-    matrix : (K, K) float64
-        A: control points of child 0 from those of the parent.
-    children : (3, R, K) float64
-        P_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's lattice.
-    """
-
-    signature: Signature
+    signature: Signature  # Of the one-ring; child 0 has the same
+    # (K,) int64: the vertices of the one-ring that are control points: all of them, but at a dart one that equals
+    # another
     slots: IntArray
-    matrix: FloatArray
+    matrix: FloatArray  # (K, K) float64: A: control points of child 0 from those of the parent
+    # (3, R, K) float64: p_k Abar: control points of the regular children 1, 2, 3, in the order of the scheme's
+    # lattice
     children: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class IrregularPatch:
-    """A patch whose corner (0, 0) is extraordinary.
-
-    Attributes
-    ----------
-    scheme : Scheme
-    structure : IrregularStructure
-        A and ``P_k Ā``.
-    """
+    """A patch whose corner (0, 0) is extraordinary."""
 
     scheme: Scheme
-    structure: IrregularStructure
+    structure: IrregularStructure  # A and ``P_k Ā``
 
     @cached_property
     def basis(self) -> Eigenbasis:
@@ -153,7 +138,6 @@ class IrregularPatch:
         evaluator : "power" | "stam" | "stabilized" | "limit"
         dtype : float32 or float64
             Precision of every product and sum from the child's parameters on.
-        derivatives : 1 or 2
         """
         if evaluator == "limit":
             return self._rows_at_point(len(uv), dtype, derivatives)

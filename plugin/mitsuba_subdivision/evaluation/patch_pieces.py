@@ -23,20 +23,11 @@ MAX_REFINEMENTS = 6
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of an element that needs no further division: a regular patch, or one with an extraordinary point.
+    """A part of an element that needs no further division: a regular patch, or one with an extraordinary point."""
 
-    Attributes
-    ----------
-    domain : AffineMap
-        From the element's parameters to the piece's own, which have the extraordinary point at (0, 0).
-    stencils : (K_piece, K) float64
-        The piece's control points over the element's one-ring.
-    patch : IrregularPatch or None
-        None for a regular piece, whose control points are in the order of the scheme's lattice.
-    """
-
-    domain: AffineMap
-    stencils: FloatArray
+    domain: AffineMap  # From the element's parameters to the piece's own, which have the extraordinary point at (0, 0)
+    stencils: FloatArray  # (K_piece, K) float64: the piece's control points over the element's one-ring
+    # None for a regular piece, whose control points are in the order of the scheme's lattice
     patch: IrregularPatch | None
 
     @property

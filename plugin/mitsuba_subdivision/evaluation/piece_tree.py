@@ -50,61 +50,35 @@ class FrameKind(IntEnum):
 
 
 class PieceMap(NamedTuple):
-    """Makes the coefficients of consecutive pieces from the control points of the element's one-ring.
-
-    Attributes
-    ----------
-    first_piece : int
-    stencils : (K_part, K) float64, or None
-        Makes the control points of a part's one-ring, where parts of many elements are divided alike: then they share
-        ``pieces``. None if these are over the element's own one-ring.
-    pieces : (p, m, K_part) float64
-        Coefficients of the pieces' polynomials over control points.
-    """
+    """Makes the coefficients of consecutive pieces from the control points of the element's one-ring."""
 
     first_piece: int
+    # (K_part, K) float64, or None: makes the control points of a part's one-ring, where parts of many elements are
+    # divided alike: then they share ``pieces``. None if these are over the element's own one-ring.
     stencils: FloatArray | None
-    pieces: FloatArray
+    pieces: FloatArray  # (p, m, K_part) float64: coefficients of the pieces' polynomials over control points
 
 
 @dataclass(frozen=True, eq=False)
 class PieceTree:
-    """Pieces of an element.
+    """Pieces of an element."""
 
-    Attributes
-    ----------
-    kinds : (n,) uint32
-        `PartKind` of each node. The first node is the element.
-    turns : (n,) uint32
-        `DividedElement.turn` of each.
-    first : (n,) uint32
-        Of an inner node the first child, after which the others follow. Of a leaf the number of its piece; those of a
-        tip follow each other, level by level.
-    piece_count : int
-    maps : tuple of PieceMap
-        Make the coefficients of all pieces.
-    frames : (n,) uint32
-        `FrameKind` of a tip, else 0.
-    levels : (n,) uint32
-        The level at which a tip ends and its rest begins; else 0.
-    first_block : (n,) uint32
-        Of a tip: a block for each deeper level and each regular child there, then one for the rest, linear between the
-        tangents along the edges, then one whose derivatives are the frame of (13). If the frame is uneven, there are as
-        many blocks for levels once more, of the point without the second eigenvector, divided by the power of the third
-        eigenvalue.
-    blocks : (b, K, m) float64
-        As the relative first control point is zero, no block needs the first row for weights. In uneven tips it is the
-        polynomial of the second eigenvector, of which `uneven_frame` is made.
-    """
-
-    kinds: IntArray
-    turns: IntArray
+    kinds: IntArray  # (n,) uint32: `PartKind` of each node. The first node is the element.
+    turns: IntArray  # (n,) uint32: `DividedElement.turn` of each
+    # (n,) uint32: of an inner node the first child, after which the others follow. Of a leaf the number of its piece;
+    # those of a tip follow each other, level by level.
     first: IntArray
     piece_count: int
-    maps: tuple[PieceMap, ...]
-    frames: IntArray
-    levels: IntArray
+    maps: tuple[PieceMap, ...]  # Make the coefficients of all pieces
+    frames: IntArray  # (n,) uint32: `FrameKind` of a tip, else 0
+    levels: IntArray  # (n,) uint32: the level at which a tip ends and its rest begins; else 0
+    # (n,) uint32: of a tip: a block for each deeper level and each regular child there, then one for the rest, linear
+    # between the tangents along the edges, then one whose derivatives are the frame of (13). If the frame is uneven,
+    # there are as many blocks for levels once more, of the point without the second eigenvector, divided by the power
+    # of the third eigenvalue.
     first_block: IntArray
+    # (b, K, m) float64: as the relative first control point is zero, no block needs the first row for weights. In
+    # uneven tips it is the polynomial of the second eigenvector, of which `uneven_frame` is made.
     blocks: FloatArray
 
 
@@ -115,15 +89,8 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
 
     Parameters
     ----------
-    scheme : Scheme
-    signature : Signature
     piece_levels : int
         Number of levels of a tip that are pieces; the others are deeper ones.
-
-    Raises
-    ------
-    SchemeError
-        As `divided_elements`.
     """
     (element,) = divided_elements(scheme, [signature])
     kinds, turns, first = element.nodes.T.copy()
@@ -158,26 +125,14 @@ def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_L
 
 
 class _Tip(NamedTuple):
-    """What makes the polynomials of a tip.
+    """What makes the polynomials of a tip."""
 
-    Attributes
-    ----------
-    rows : (n, m, K) float64
-        Over control points: those of its pieces, then blocks.
-    second_eigenvector : (l, m) float64
-        What stands in the first blocks in place of weights of the first control point.
-    piece_count : int
-        Number of pieces.
-    frame : FrameKind
-    level_count : int
-        At which level it ends.
-    """
-
-    rows: FloatArray
+    rows: FloatArray  # (n, m, K) float64: over control points: those of its pieces, then blocks
+    # (l, m) float64: what stands in the first blocks in place of weights of the first control point
     second_eigenvector: FloatArray
-    piece_count: int
+    piece_count: int  # Number of pieces
     frame: FrameKind
-    level_count: int
+    level_count: int  # At which level it ends
 
     @property
     def pieces(self) -> FloatArray:

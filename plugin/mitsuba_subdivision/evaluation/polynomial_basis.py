@@ -28,20 +28,11 @@ class PolynomialBasis:
 
     Powers of distances from the middle are small, so that single precision loses no more digits than in the scheme's
     own formulas.
-
-    Attributes
-    ----------
-    centre : (2,) float64
-        Middle of the domain, ``(u_0, v_0)``.
-    powers : (m, 2) int64
-        Of the monomials ``(u - u_0)^a (v - v_0)^b``: a and b. The first is the constant.
-    matrix : (m, R) float64
-        Coefficients of each basis function, in columns.
     """
 
-    centre: FloatArray
-    powers: IntArray
-    matrix: FloatArray
+    centre: FloatArray  # (2,) float64: middle of the domain, ``(u_0, v_0)``
+    powers: IntArray  # (m, 2) int64: of the monomials ``(u - u_0)^a (v - v_0)^b``: a and b. The first is the constant.
+    matrix: FloatArray  # (m, R) float64: coefficients of each basis function, in columns
 
     def monomials(self, uv: FloatArray) -> FloatArray:
         """``(s, m)`` values at ``(s, 2)`` parameters."""

@@ -19,16 +19,10 @@ SAME = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class LatticeRows:
-    """Samples of a patch that are the rows of a lattice, u fastest, seen from one of the patch's corners.
-
-    Attributes
-    ----------
-    corner : int
-    u, v : (m,), (n,) float64
-        Sample ``j m + i`` has the parameters ``(u[i], v[j])``.
-    """
+    """Samples of a patch that are the rows of a lattice, u fastest, seen from one of the patch's corners."""
 
     corner: int
+    # (m,), (n,) float64: sample ``j m + i`` has the parameters ``(u[i], v[j])``
     u: FloatArray
     v: FloatArray
 
@@ -42,7 +36,6 @@ class ProductPatch:
 
     Parameters
     ----------
-    scheme : Scheme
     lattice_index : (4, r, r) int64
         Control points of the one-ring.
     """

@@ -61,7 +61,6 @@ class RingPattern:
 
     Attributes
     ----------
-    scheme : Scheme
     smooth : Signature
         Without semi-sharp features.
     refinement : Refinement
@@ -112,7 +111,6 @@ class RefinedRings:
 
     Parameters
     ----------
-    pattern : RingPattern
     topology : Topology
         The refined mesh, which may hold other one-rings, too.
     half_edges : (e, n_h) int
@@ -227,7 +225,6 @@ class RingMesh:
 
     Parameters
     ----------
-    scheme : Scheme
     counts : Counter of Signature
         Number of one-rings of each signature; signatures have no semi-sharp features.
     """

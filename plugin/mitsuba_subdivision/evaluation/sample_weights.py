@@ -70,7 +70,6 @@ class LocatedSamples:
 
     Parameters
     ----------
-    scheme : Scheme
     elements : sequence of DividedElement
         All different.
     element : (s,) int64
@@ -84,7 +83,6 @@ class LocatedSamples:
 
     Attributes
     ----------
-    leaves : list of Leaves
     leaf_sample : (s,) int64
         Number of each sample among those of all leaves.
     jacobian : (2, 2, s) float64

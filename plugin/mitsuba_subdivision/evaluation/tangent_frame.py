@@ -31,22 +31,12 @@ ROUNDED = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """An extraordinary point: the first corner of an element whose one-ring is self-similar.
-
-    Attributes
-    ----------
-    fan : Fan
-    ring : OneRing
-        Its first vertex is the point.
-    basis : Eigenbasis
-    regular_border_faces : int
-        Of the scheme: number of faces at each vertex of a regular border.
-    """
+    """An extraordinary point: the first corner of an element whose one-ring is self-similar."""
 
     fan: Fan
-    ring: OneRing
+    ring: OneRing  # Its first vertex is the point
     basis: Eigenbasis
-    regular_border_faces: int
+    regular_border_faces: int  # Of the scheme: number of faces at each vertex of a regular border
 
     def frame(self) -> FloatArray:
         """``(2, K)`` coefficients over the eigen-coordinates."""

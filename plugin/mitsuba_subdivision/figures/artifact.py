@@ -170,18 +170,11 @@ def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Lines over an image, in pixels.
+    """Lines over an image, in pixels."""
 
-    Attributes
-    ----------
-    needles : (n, 2, 2)
-        Both ends of the normals near the extraordinary vertex; that vertex's own comes first.
-    edges : (m, points, 2)
-        The cage's edges on the limit surface.
-    """
-
+    # (n, 2, 2): both ends of the normals near the extraordinary vertex; that vertex's own comes first
     needles: NDArray[np.float64]
-    edges: NDArray[np.float64]
+    edges: NDArray[np.float64]  # (m, points, 2): the cage's edges on the limit surface
 
 
 def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray[np.float32], Overlay]:

@@ -56,21 +56,12 @@ LIGHTS = {
 
 @dataclass(eq=False)
 class Course:
-    """The course of a fit.
+    """The course of a fit."""
 
-    Attributes
-    ----------
-    losses : list of float
-        Before each step.
-    distances : dict of int to float
-        Chamfer's distance after some steps, in diagonals of the target's box: the mean of both directions.
-    cages : dict of int to ControlCage
-        After the same steps; of a mesh, its triangles.
-    """
-
-    losses: list[float] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)  # Before each step
+    # Chamfer's distance after some steps, in diagonals of the target's box: the mean of both directions
     distances: dict[int, float] = field(default_factory=dict)
-    cages: dict[int, ControlCage] = field(default_factory=dict)
+    cages: dict[int, ControlCage] = field(default_factory=dict)  # After the same steps; of a mesh, its triangles
 
 
 def target() -> ControlCage:

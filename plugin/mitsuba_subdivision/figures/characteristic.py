@@ -25,11 +25,6 @@ class CharacteristicMap:
     The two subdominant eigenvectors could be any basis of their plane. In the basis chosen here, the edges at the
     extraordinary point form a regular star, and the first edge lies along x.
 
-    Parameters
-    ----------
-    patch : IrregularPatch
-    valence : int
-
     Attributes
     ----------
     control_points : (K, 2)

@@ -29,26 +29,14 @@ RATE = 8
 
 @dataclass(frozen=True, eq=False)
 class CreaseFit:
-    """A fit of unknown creases.
-
-    Attributes
-    ----------
-    target, start, found : ControlCage
-    edges : (12, 2) int
-        All edges.
-    truth : (12,) float64
-        Sharpness of the target's edges.
-    sharpness : (steps + 1, 12) float64
-        After each step.
-    losses : list of float
-    """
+    """A fit of unknown creases."""
 
     target: ControlCage
     start: ControlCage
     found: ControlCage
-    edges: NDArray[np.integer]
-    truth: NDArray[np.float64]
-    sharpness: NDArray[np.float64]
+    edges: NDArray[np.integer]  # (12, 2) int: all edges
+    truth: NDArray[np.float64]  # (12,) float64: sharpness of the target's edges
+    sharpness: NDArray[np.float64]  # (steps + 1, 12) float64: after each step
     losses: list[float]
 
 

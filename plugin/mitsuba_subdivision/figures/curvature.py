@@ -36,18 +36,12 @@ DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
 
 @dataclass(frozen=True, eq=False)
 class CurvatureMap:
-    """Curvature around vertex 0 of a bent ball.
+    """Curvature around vertex 0 of a bent ball."""
 
-    Attributes
-    ----------
-    x, y : (valence, s, s)
-        Positions in the tangent plane of a grid in each element.
-    gaussian, mean : (valence, s, s)
-        Mean curvature is positive where the surface bends inward, as on a ball.
-    """
-
+    # (valence, s, s): positions in the tangent plane of a grid in each element
     x: NDArray[np.float64]
     y: NDArray[np.float64]
+    # (valence, s, s): mean curvature is positive where the surface bends inward, as on a ball
     gaussian: NDArray[np.float64]
     mean: NDArray[np.float64]
 

@@ -18,24 +18,13 @@ from .output import COLUMN, PAGE, FigureOptions
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure; call it with `FigureOptions` to draw it, and get the files written.
+    """A figure; call it with `FigureOptions` to draw it, and get the files written."""
 
-    Attributes
-    ----------
-    module : str
-        Module of this package that draws the figure. It imports Mitsuba, so it is imported only then.
-    shows : str
-        What the figure shows, for the help.
-    options : tuple of str
-        Those of "spp", "scheme" and "cage" that change the figure; "resolution" and "width" change all.
-    width : float
-        Width on paper in millimetres, unless the options have another.
-    """
-
-    module: str
-    shows: str
+    module: str  # Module of this package that draws the figure. It imports Mitsuba, so it is imported only then.
+    shows: str  # What the figure shows, for the help
+    # Those of "spp", "scheme" and "cage" that change the figure; "resolution" and "width" change all
     options: tuple[str, ...] = ()
-    width: float = PAGE
+    width: float = PAGE  # Width on paper in millimetres, unless the options have another
 
     @property
     def formats(self) -> tuple[str, ...]:

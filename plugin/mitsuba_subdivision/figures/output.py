@@ -64,36 +64,18 @@ def _to_terminal(line: str) -> None:
 
 @dataclass(frozen=True)
 class FigureOptions:
-    """Options of a figure.
+    """Options of a figure."""
 
-    Attributes
-    ----------
-    output : Path
-        Folder to write to; created if it is missing.
-    resolution : int
-        Width of a panel in pixels. Pictures are rendered at this width; PDF files hold their pixels as they are.
-    spp : int
-        Samples per pixel of a rendered image.
-    width : float
-        Width of the figure on paper in millimetres.
-    formats : tuple of str
-        Which of "png", "pdf" and "exr" to write, if the figure has them.
-    scheme : str
-        Subdivision scheme, for the figures that show one scheme of several.
-    cage : Path or None
-        File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one.
-    report : callable
-        Is called with a line of text for each step.
-    """
-
-    output: Path
+    output: Path  # Folder to write to; created if it is missing
+    # Width of a panel in pixels. Pictures are rendered at this width; PDF files hold their pixels as they are.
     resolution: int = 512
-    spp: int = 256
-    width: float = PAGE
-    formats: tuple[str, ...] = ("png", "pdf", "exr")
-    scheme: str = "catmull_clark"
+    spp: int = 256  # Samples per pixel of a rendered image
+    width: float = PAGE  # Width of the figure on paper in millimetres
+    formats: tuple[str, ...] = ("png", "pdf", "exr")  # Which of "png", "pdf" and "exr" to write, if the figure has them
+    scheme: str = "catmull_clark"  # Subdivision scheme, for the figures that show one scheme of several
+    # File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one
     cage: Path | None = None
-    report: Callable[[str], None] = field(default=_to_terminal)
+    report: Callable[[str], None] = field(default=_to_terminal)  # Is called with a line of text for each step
 
     def paths(self, name: str, *formats: str) -> list[Path]:
         """Files to write, in the requested formats."""

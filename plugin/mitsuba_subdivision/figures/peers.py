@@ -91,22 +91,13 @@ def osd_samples(
 
 @dataclass(frozen=True, eq=False)
 class BlenderMesh:
-    """A cage after Blender's subdivision modifier.
+    """A cage after Blender's subdivision modifier."""
 
-    Attributes
-    ----------
-    positions, normals : (n, 3)
-        Of the vertices, in float32: points of the limit surface, and normals for smooth shading.
-    quads : (m, 4)
-        Vertices of each face.
-    version : str
-        Of Blender, two numbers.
-    """
-
+    # (n, 3): of the vertices, in float32: points of the limit surface, and normals for smooth shading
     positions: NDArray[np.float64]
     normals: NDArray[np.float64]
-    quads: NDArray[np.int32]
-    version: str
+    quads: NDArray[np.int32]  # (m, 4): vertices of each face
+    version: str  # Of Blender, two numbers
 
 
 def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:

@@ -28,22 +28,13 @@ LABEL_SIZE = 9
 
 @dataclass(frozen=True, eq=False)
 class RefinementStep:
-    """A patch's control points before and after one refinement, in the plane of the characteristic map.
-
-    Attributes
-    ----------
-    characteristic : CharacteristicMap
-    old : (K, 2)
-        Control points of the patch.
-    new : (M, 2)
-        Control points of its four children: the different rows of A and of the matrices of the regular ones.
-    old_edges, new_edges : (.., 2, 2)
-        Both ends of the edges between the control points.
-    """
+    """A patch's control points before and after one refinement, in the plane of the characteristic map."""
 
     characteristic: CharacteristicMap
-    old: FloatArray
+    old: FloatArray  # (K, 2): control points of the patch
+    # (M, 2): control points of its four children: the different rows of A and of the matrices of the regular ones
     new: FloatArray
+    # (.., 2, 2): both ends of the edges between the control points
     old_edges: FloatArray
     new_edges: FloatArray
 

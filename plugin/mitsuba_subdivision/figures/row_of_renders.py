@@ -19,7 +19,6 @@ def draw_row(
 
     Parameters
     ----------
-    options : FigureOptions
     name : str
         Of the scene and of the figure.
     cases : mapping of str to mapping

@@ -53,21 +53,11 @@ LINE_POINTS = 33
 
 @dataclass(frozen=True, eq=False)
 class TangentView:
-    """The surface around the extraordinary point, seen along its normal.
+    """The surface around the extraordinary point, seen along its normal."""
 
-    Attributes
-    ----------
-    surface : LimitSurface
-        Vertex 0 of its cage is extraordinary, and elements 0 to ``valence - 1`` lie around it.
-    point : (3,)
-        The limit point.
-    frame : (3, 3)
-        Columns: two directions in the tangent plane, and the normal.
-    """
-
-    surface: LimitSurface
-    point: NDArray[np.float64]
-    frame: NDArray[np.float64]
+    surface: LimitSurface  # Vertex 0 of its cage is extraordinary, and elements 0 to ``valence - 1`` lie around it
+    point: NDArray[np.float64]  # (3,): the limit point
+    frame: NDArray[np.float64]  # (3, 3): columns: two directions in the tangent plane, and the normal
 
     @classmethod
     def of(cls, cage: ControlCage) -> TangentView:
@@ -137,18 +127,11 @@ def parameter_extent(magnification: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage.
+    """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage."""
 
-    Attributes
-    ----------
-    uv : (s, 2)
-        Parameters, the same in each element.
-    triangles : (m, 3)
-    positions, normals : (valence, s, 3)
-    """
-
-    uv: NDArray[np.float64]
-    triangles: NDArray[np.integer]
+    uv: NDArray[np.float64]  # (s, 2): parameters, the same in each element
+    triangles: NDArray[np.integer]  # (m, 3)
+    # (valence, s, 3)
     positions: NDArray[np.float64]
     normals: NDArray[np.float64]
 
@@ -172,21 +155,12 @@ def _nearest(stage: mi.Scene, samples: _Samples, resolution: int) -> NDArray[np.
 
 @dataclass(frozen=True, eq=False)
 class _Magnified:
-    """The magnified surface with normals by one method.
+    """The magnified surface with normals by one method."""
 
-    Attributes
-    ----------
-    scene
-        Scene of Mitsuba.
-    errors : (valence, s)
-        Angles between the normals and the exact normals of the samples, in degrees.
-    median : float
-        Median of the errors inside the image.
-    """
-
-    scene: mi.Scene
+    scene: mi.Scene  # Scene of Mitsuba
+    # (valence, s): angles between the normals and the exact normals of the samples, in degrees
     errors: NDArray[np.float64]
-    median: float
+    median: float  # Median of the errors inside the image
 
 
 def _magnified(

@@ -17,7 +17,6 @@ def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
 
     Parameters
     ----------
-    path : str or Path
     parts : dict of str to bool
         Names of parts, and whether each is lost.
     """

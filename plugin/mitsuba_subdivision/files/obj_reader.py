@@ -39,14 +39,6 @@ def read_obj(path: str | Path) -> CageContents:
 
     All other statements are skipped. A backslash at the end of a line continues the line, except in a comment.
 
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    CageContents
-
     Raises
     ------
     CageError

@@ -95,8 +95,6 @@ def take_plain_tags(tags: ObjTags, obj: ObjText, statements: IntArray) -> NDArra
 
     Parameters
     ----------
-    tags : ObjTags
-    obj : ObjText
     statements : (n,) int
         Numbers of the statements that are tags.
 
@@ -135,7 +133,6 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
 
     Parameters
     ----------
-    tags : ObjTags
     file : str
         Name of the file in messages.
     line : int

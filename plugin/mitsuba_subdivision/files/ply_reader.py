@@ -45,14 +45,6 @@ def read_ply(path: str | Path) -> CageContents:
     Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
     or "" for negative numbers.
 
-    Parameters
-    ----------
-    path : str or Path
-
-    Returns
-    -------
-    CageContents
-
     Raises
     ------
     CageError

@@ -105,7 +105,6 @@ def write_polygons(
 
     Parameters
     ----------
-    path : str or Path
     properties : dict of str to (n,) float32 or float64 array
         Properties of vertices by name.
     face_sizes : (n_f,) int

@@ -70,8 +70,6 @@ def read_primvars(
 
     Parameters
     ----------
-    reader : AttributeReader
-    mesh : UsdGeom.Mesh
     order : (n_h,) int64, optional
         If the orientation of faces is reversed: which face corner of the file becomes each face corner.
     topology : Topology, optional

@@ -44,7 +44,6 @@ def read_usd(
 
     Parameters
     ----------
-    path : str or Path
     prim : str, optional
         Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default, the file's
         only mesh.
@@ -53,10 +52,6 @@ def read_usd(
         a mesh has no points or faces at its first time, it is read at the first time at which it has both.
     rules : dict of str to str, optional
         Rules and scheme that replace the mesh's own, which are then not read.
-
-    Returns
-    -------
-    CageContents
 
     Raises
     ------
@@ -98,7 +93,6 @@ class MeshReader:
 
     Parameters
     ----------
-    mesh : UsdGeom.Mesh
     location : str
         Beginning of messages.
     time, rules
@@ -198,11 +192,8 @@ class MeshReader:
 
         Parameters
         ----------
-        attribute : Usd.Attribute
         consequence : str
             End of the message, such as "the creases are left out".
-        read : callable
-        otherwise : object
 
         Raises
         ------

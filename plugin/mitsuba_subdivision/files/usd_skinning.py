@@ -51,7 +51,6 @@ class Skinning:
 
         Parameters
         ----------
-        mesh : UsdGeom.Mesh
         points : (n, 3) float64
         corners : (n_h,) int64
             The point of each face corner.

@@ -47,7 +47,6 @@ def open_stage(
 
     Parameters
     ----------
-    path : str or Path
     name : str
         Beginning of messages.
     completed : callable, optional
@@ -170,7 +169,6 @@ def chosen_meshes(
 
     Parameters
     ----------
-    stage : Usd.Stage
     path : str or None
         Path of the mesh, or of a prim with one mesh below it; "*" for all meshes; None for the only mesh of the stage.
     name : str

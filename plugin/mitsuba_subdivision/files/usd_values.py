@@ -70,7 +70,6 @@ def local_to_world(
 
     Parameters
     ----------
-    prim : Usd.Prim
     time_of : callable
         Time code at which an attribute is read. Operations may have different ones.
     known : dict, optional

@@ -26,21 +26,13 @@ State = Mapping[str, NDArray]
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A fit after some steps.
+    """A fit after some steps."""
 
-    Attributes
-    ----------
-    refinements, since : int
-        How often the cage was refined, and steps since the last time.
-    losses : (n,) float64
-    states : dict of str to dict
-        What the steps have changed, as arrays by their names.
-    """
-
+    # How often the cage was refined, and steps since the last time
     refinements: int
     since: int
-    losses: NDArray[np.float64]
-    states: Mapping[str, State]
+    losses: NDArray[np.float64]  # (n,) float64
+    states: Mapping[str, State]  # What the steps have changed, as arrays by their names
 
     def save(self, path: Path) -> None:
         """Write a NumPy file, ``.npz``."""

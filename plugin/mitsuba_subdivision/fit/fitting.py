@@ -35,7 +35,6 @@ class Fit(ABC):
     ----------
     cage : ControlCage
         Where to begin. Its topology, tags and rules stay, but for refinement.
-    scheme : str or None
     refine : sequence of int, or int
         Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
     callbacks : sequence of callable
@@ -118,10 +117,8 @@ class Fit(ABC):
 
         Parameters
         ----------
-        steps : int
         checkpoint : path, optional
             Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end.
-        every : int
         """
         for number in counted(range(1, steps + 1), "Steps"):
             self.step()
@@ -138,13 +135,7 @@ class Fit(ABC):
         return bool(now > (1 - LEAST_FALL) * before)
 
     def refine(self) -> None:
-        """Refine the cage once: the same surface, with four times as many control points, about.
-
-        Raises
-        ------
-        CageError, SchemeError
-            As `ControlCage.refinement`.
-        """
+        """Refine the cage once: the same surface, with four times as many control points, about."""
         refinement = self.cage.refinement(self._scheme)
         self._follow(refinement)
         self._start = refinement.cage.with_positions(refinement.matrix @ self._start.positions)

@@ -56,10 +56,6 @@ class LargeSteps:
         Parameters
         ----------
         points : (n, 3) array, or flat Dr.Jit array
-
-        Returns
-        -------
-        mi.Float
         """
         given = np.array(points, dtype=np.float64).reshape(-1, 3)
         return upload(mi.Float, self.matrix @ given)

@@ -52,18 +52,10 @@ MATRICES: dict[str, Callable[[LimitSurface], sparse.csr_array]] = {
 
 @dataclass(frozen=True, eq=False)
 class Regularizer:
-    """Half of ``(x - x0)^T Q (x - x0)``, added up over the three coordinates of control points x.
+    """Half of ``(x - x0)^T Q (x - x0)``, added up over the three coordinates of control points x."""
 
-    Attributes
-    ----------
-    matrix : (n, n) CSR array of float64
-        Q: symmetric and positive semi-definite.
-    origin : (n, 3) float64
-        x0.
-    """
-
-    matrix: sparse.csr_array
-    origin: FloatArray
+    matrix: sparse.csr_array  # (n, n) CSR array of float64: Q: symmetric and positive semi-definite
+    origin: FloatArray  # (n, 3) float64: x0
 
     @classmethod
     def named(cls, name: str, start: LimitSurface) -> Regularizer:

@@ -39,7 +39,6 @@ def to_mesh(
         Of `PointFit`.
     count : int, optional
         Points on the mesh, uniform by area; by default eight for each control point in the end.
-    seed : int
     **options
         Of `PointFit`, such as ``refine``.
 
@@ -47,8 +46,6 @@ def to_mesh(
     ------
     ValueError
         If the mesh is malformed or has no area, or as `PointFit`.
-    CageError, SchemeError
-        As `PointFit`.
     """
     refine = options.get("refine", ())
     if count is None:
@@ -89,8 +86,6 @@ def triangle_samples(positions: FloatArray, triangles: IntArray, count: int, see
     positions : (n, 3) array
     triangles : (m, 3) int array
         0-based; some of them have an area.
-    count : int
-    seed : int
 
     Returns
     -------

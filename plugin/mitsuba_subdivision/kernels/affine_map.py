@@ -14,20 +14,11 @@ from .vectors import cross, dot, like, unit
 
 @dataclass(frozen=True, eq=False)
 class AffineMap:
-    """A linear map, then a translation.
+    """A linear map, then a translation."""
 
-    Attributes
-    ----------
-    rows : tuple of three rows of three numbers
-        The linear map.
-    translation : three numbers
-    inverse : tuple of three rows of three numbers
-        Of the linear map.
-    """
-
-    rows: tuple[Sequence[Float], ...]
+    rows: tuple[Sequence[Float], ...]  # The linear map
     translation: Sequence[Float]
-    inverse: tuple[Sequence[Float], ...]
+    inverse: tuple[Sequence[Float], ...]  # Of the linear map
 
     @classmethod
     def of(cls, matrix: Matrix4, inverse: Matrix4 | None = None) -> AffineMap:
@@ -67,14 +58,7 @@ class AffineMap:
 def placed(
     positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4, vector3: type
 ) -> tuple[FloatBuffer, FloatBuffer]:
-    """Map flat positions and unit normals; differentiable with respect to all.
-
-    Parameters
-    ----------
-    positions, normals : flat Dr.Jit arrays
-    matrix : 4x4 Dr.Jit matrix
-    vector3 : type
-    """
+    """Map flat positions and unit normals; differentiable with respect to all."""
     p: Vector3 = dr.unravel(vector3, positions)
     n: Vector3 = dr.unravel(vector3, normals)
     if dr.grad_enabled(matrix):

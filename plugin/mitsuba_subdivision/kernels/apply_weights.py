@@ -33,7 +33,6 @@ class WeightKernel:
 
     Parameters
     ----------
-    table : VertexTable
     float_type : type
         Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights have its precision.
     """
@@ -133,7 +132,6 @@ class WeightKernel:
 
         Parameters
         ----------
-        values : flat arrays of 3-vectors, one for each vertex
         finish : callable
             Computes from these, for a vertex, the three vectors that the weights of its point and tangents multiply.
         """
@@ -180,16 +178,10 @@ def _padded_size(stencils: ClassStencils) -> int:
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedVertices:
-    """Vertices of a tessellation, with the tangents that their derivatives by the control points need.
-
-    Attributes
-    ----------
-    kernel : WeightKernel
-    positions, normals, du, dv : flat Dr.Jit float arrays, (3 vertex_count)
-        Points, unit normals and tangents; detached.
-    """
+    """Vertices of a tessellation, with the tangents that their derivatives by the control points need."""
 
     kernel: WeightKernel
+    # flat Dr.Jit float arrays, (3 vertex_count): points, unit normals and tangents; detached
     positions: FloatBuffer
     normals: FloatBuffer
     du: FloatBuffer

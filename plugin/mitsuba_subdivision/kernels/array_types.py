@@ -24,14 +24,9 @@ _UPLOADED: Shared[SharedArray] = Shared()
 
 @dataclass(frozen=True)
 class ArrayTypes:
-    """Types of one backend and precision.
+    """Types of one backend and precision."""
 
-    Attributes
-    ----------
-    float, index, vector2, vector3, vector4, index2, index4 : type
-        ``index``, ``index2`` and ``index4`` hold unsigned 32-bit integers.
-    """
-
+    # ``index``, ``index2`` and ``index4`` hold unsigned 32-bit integers
     float: type
     index: type
     vector2: type
@@ -106,8 +101,6 @@ class ArrayTypes:
         ----------
         kind : type
             One of the attributes. Vectors are stored consecutively.
-        buffer : flat array
-        index : index array
         active : mask
             Inactive lanes read zero.
         """

@@ -66,17 +66,9 @@ class SubdividedChannelKernel:
 
 @dataclass(frozen=True, eq=False)
 class BilinearPiece:
-    """Values linear along both parameters, with the interface of `Piece`.
+    """Values linear along both parameters, with the interface of `Piece`."""
 
-    Attributes
-    ----------
-    coefficients : sequence of arrays
-        Of 1, u, v and, on the square, u v.
-    monomials : Monomials
-    u, v : float arrays
-    """
-
-    coefficients: Sequence[Value]
+    coefficients: Sequence[Value]  # Of 1, u, v and, on the square, u v
     monomials: Monomials
     u: Float
     v: Float
@@ -98,10 +90,6 @@ class LinearChannelKernel:
         Over the surface's elements.
     float_type : type
         Flat Dr.Jit array, or ``float``.
-
-    Attributes
-    ----------
-    values : ControlValues
     """
 
     def __init__(self, channel: LinearChannel, walk: ElementWalk, float_type: type) -> None:

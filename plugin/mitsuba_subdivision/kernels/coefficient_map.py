@@ -25,7 +25,6 @@ class CoefficientMap:
 
     Parameters
     ----------
-    table : PieceTable
     float_type : type
         Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
     """
@@ -96,11 +95,6 @@ class CoefficientMap:
 
 class _Steps:
     """The stages of the map on a device: refinement, control points of parts, coefficients.
-
-    Parameters
-    ----------
-    table : PieceTable
-    types : ArrayTypes
 
     Attributes
     ----------
@@ -217,7 +211,6 @@ class _Rows:
 
     Parameters
     ----------
-    types : ArrayTypes
     width : int
         As in `_Blocks`.
     columns : (b, 8) int

@@ -82,7 +82,6 @@ class ControlValues:
     ----------
     values : (n, k) float64
         Of a cage.
-    types : ArrayTypes
     make : callable, optional
         Computes the gathered values, flat, from the cage's, which are flat on a device, else ``(n, k)`` float64. The
         default is the identity.
@@ -161,7 +160,6 @@ class SparseMatrix:
 
         Parameters
         ----------
-        flat : flat array
         size : int
             Number of components, at most 4.
         """

@@ -40,7 +40,6 @@ class Heights(Protocol):
         ----------
         value, du, dv : arrays
             The channel's value, and its derivatives by the parameters.
-        active : mask
         """
         ...
 
@@ -89,21 +88,11 @@ def displaced(surface: PatchValues, height: tuple[Float, Float, Float]) -> Patch
 
 @dataclass(eq=False)
 class Displacement:
-    """Heights and scale of a displacement.
+    """Heights and scale of a displacement."""
 
-    Attributes
-    ----------
-    channel : ChannelKernel
-        Channel that heights depend on, such as texture coordinates.
-    heights : Heights
-        Of this channel's values.
-    scale : float array
-        Factor of the heights.
-    """
-
-    channel: ChannelKernel
-    heights: Heights
-    scale: Float
+    channel: ChannelKernel  # Channel that heights depend on, such as texture coordinates
+    heights: Heights  # Of this channel's values
+    scale: Float  # Factor of the heights
 
     def variables(self) -> list:
         """Arrays that derivatives reach."""
@@ -117,20 +106,10 @@ class Displacement:
 
 @dataclass(frozen=True, eq=False)
 class DisplacedPiece:
-    """A piece of the displaced surface, with the members of `Piece`.
+    """A piece of the displaced surface, with the members of `Piece`."""
 
-    Attributes
-    ----------
-    surface : Piece
-        The undisplaced piece.
-    channel : Piece or BilinearPiece
-        Channel that heights depend on, at the same location.
-    displacement : Displacement
-    active : mask
-    """
-
-    surface: Piece
-    channel: AnyChannelPiece
+    surface: Piece  # The undisplaced piece
+    channel: AnyChannelPiece  # Channel that heights depend on, at the same location
     displacement: Displacement
     active: Mask
 

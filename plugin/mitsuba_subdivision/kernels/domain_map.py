@@ -35,8 +35,6 @@ def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> 
 
     Parameters
     ----------
-    domain : ParameterDomain
-    types : ArrayTypes
     u, v : float arrays
         Where `ParameterDomain.extent` of them is a half or more, it is not the first copy.
 
@@ -74,7 +72,6 @@ def doublings(types: ArrayTypes, x: Float, most: Index) -> tuple[Index, Float]:
 
     Parameters
     ----------
-    types : ArrayTypes
     x : float array
         Has no derivatives here.
     most : index array

@@ -19,13 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """Locations of samples: parameters, seen from a half-edge of their element.
-
-    Attributes
-    ----------
-    half_edge : index array
-    u, v : float arrays
-    """
+    """Locations of samples: parameters, seen from a half-edge of their element."""
 
     half_edge: Index
     u: Float
@@ -44,14 +38,8 @@ class Location:
 class ElementWalk:
     """The elements of a piece table on the device, and their adjacency.
 
-    Parameters
-    ----------
-    table : PieceTable
-    types : ArrayTypes
-
     Attributes
     ----------
-    types : ArrayTypes
     domain : ParameterDomain
         Of the elements.
     """
@@ -96,8 +84,6 @@ class ElementWalk:
 
         Parameters
         ----------
-        location : Location
-        active : mask
         row : index array, optional
             `row` of the half-edges, if it is known.
         """

@@ -45,7 +45,6 @@ class Batch(Protocol):
         fetch : callable
             Returns a sample's three vectors, one for its point and one for each tangent. Called within a loop over the
             samples of every lane.
-        sums : flat Dr.Jit float array, 3 for each control point
         """
         ...
 
@@ -55,7 +54,6 @@ class Lanes:
 
     Parameters
     ----------
-    types : ArrayTypes
     vertices : VertexStencils
         Of one class or several.
     controls : Dr.Jit index array
@@ -99,7 +97,6 @@ class Lanes:
 
         Parameters
         ----------
-        kind : index array
         origin : 3-vector
             A control point of each lane's patch.
         relative : iterable of 3-vectors

@@ -36,38 +36,21 @@ _ENDED = 4
 
 @dataclass(frozen=True, eq=False)
 class LineHits:
-    """Hits of lines on a surface.
+    """Hits of lines on a surface."""
 
-    Attributes
-    ----------
-    location : Location
-        In whole elements seen from the first corner.
-    kind : index array
-        `ON_LINE`; `ON_NORMAL`, also where a border or a crease is nearest; or `MISSED`.
-    values : PatchValues
-        The surface there, without derivatives by control points and without second ones.
-    """
-
-    location: Location
-    kind: Index
-    values: PatchValues
+    location: Location  # In whole elements seen from the first corner
+    kind: Index  # `ON_LINE`; `ON_NORMAL`, also where a border or a crease is nearest; or `MISSED`
+    values: PatchValues  # The surface there, without derivatives by control points and without second ones
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Lines that surface points stay on when control points or the lines themselves change.
+    """Lines that surface points stay on when control points or the lines themselves change."""
 
-    Attributes
-    ----------
-    o, d : 3-vectors
-        A point of each, in the space of the control points, and the direction.
-    hold : mask
-        Which lines hold their points: a point that is not on its line keeps its location on the surface.
-    """
-
+    # A point of each, in the space of the control points, and the direction
     o: Vector3
     d: Vector3
-    hold: Mask
+    hold: Mask  # Which lines hold their points: a point that is not on its line keeps its location on the surface
 
     def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton's step at given values of the surface, with derivatives that follow the line."""
@@ -77,28 +60,15 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """Newton's steps within a piece.
+    """Newton's steps within a piece."""
 
-    Attributes
-    ----------
-    d : 3-vector
-        The direction of the line, which may be turned to the normal.
-    u, v : float arrays
-        Sum of the steps.
-    length : float array
-        Of the last one.
-    is_along_surface : mask
-        Where it was a step along the surface, to the other intersection of the line.
-    values : PatchValues
-        The surface before the last step.
-    """
-
-    d: Vector3
+    d: Vector3  # The direction of the line, which may be turned to the normal
+    # Sum of the steps
     u: Float
     v: Float
-    length: Float
-    is_along_surface: Mask
-    values: PatchValues
+    length: Float  # Of the last one
+    is_along_surface: Mask  # Where it was a step along the surface, to the other intersection of the line
+    values: PatchValues  # The surface before the last step
 
 
 class LineIntersection:
@@ -116,7 +86,6 @@ class LineIntersection:
 
     Parameters
     ----------
-    types : ArrayTypes
     walk : ElementWalk
         Over the surface's elements.
     piece : callable

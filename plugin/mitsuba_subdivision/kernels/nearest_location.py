@@ -28,21 +28,13 @@ ON_SIDE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class NearestPoints:
-    """Given points, whose nearest surface points follow them when they or the control points change.
-
-    Attributes
-    ----------
-    p : 3-vector
-    along_u, along_v : float arrays
-        The direction in which a surface point may move that lies on a border or a crease; zero at a corner.
-    is_free : mask
-        Surface points that may move in all directions.
-    """
+    """Given points, whose nearest surface points follow them when they or the control points change."""
 
     p: Vector3
+    # The direction in which a surface point may move that lies on a border or a crease; zero at a corner
     along_u: Float
     along_v: Float
-    is_free: Mask
+    is_free: Mask  # Surface points that may move in all directions
 
     def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton's step at given values of the surface, with derivatives that follow the nearest point."""
@@ -60,8 +52,6 @@ class NearestLocation:
 
     Parameters
     ----------
-    types : ArrayTypes
-    walk : ElementWalk
     piece : callable
         Takes a half-edge, parameters and a mask, and returns the `Piece` there, without derivatives.
     """
@@ -79,7 +69,6 @@ class NearestLocation:
             Without derivatives.
         start : Location
             Where to begin.
-        active : mask
 
         Returns
         -------

@@ -53,26 +53,17 @@ _UNEVEN = int(FrameKind.UNEVEN)
 
 @dataclass(frozen=True, eq=False)
 class PatchValues:
-    """What a patch is at some parameters.
-
-    Attributes
-    ----------
-    value : vector
-    du, dv : vectors
-        Derivatives by the parameters, as seen from the half-edge that was given. At an extraordinary point, where they
-        vanish or are infinite, tangents of arbitrary length.
-    normal : 3-vector
-        Along the normal, of any length: the cross product of the derivatives, or where these do not serve, of a frame.
-        Zeros for values other than points.
-    second : tuple of three vectors, or empty
-        Derivatives by uu, uv and vv.
-    """
+    """What a patch is at some parameters."""
 
     value: Value
+    # Derivatives by the parameters, as seen from the half-edge that was given. At an extraordinary point, where they
+    # vanish or are infinite, tangents of arbitrary length.
     du: Value
     dv: Value
+    # Along the normal, of any length: the cross product of the derivatives, or where these do not serve, of a frame.
+    # Zeros for values other than points.
     normal: Vector3
-    second: tuple[Value, ...] = ()
+    second: tuple[Value, ...] = ()  # Derivatives by uu, uv and vv
 
     def shifted(self, du: Float, dv: Float) -> PatchValues:
         """The value and its first derivatives, with first derivatives of parameters that move; needs second ones.
@@ -106,74 +97,38 @@ class PatchValues:
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """What is summed at the deeper levels of a tip, see `PieceTree.blocks`.
+    """What is summed at the deeper levels of a tip, see `PieceTree.blocks`."""
 
-    Attributes
-    ----------
-    control_count : index array
-        Of the one-ring; 0 where a sample lies in no tip, or in a piece of it.
-    ring : index array
-        First packet of the control points.
-    row : index array
-        First row of the block.
-    frame : TipFrame, or None
-        Where derivatives do not serve as tangents; None where they always do.
-    """
-
-    control_count: Index
-    ring: Index
-    row: Index
-    frame: TipFrame | None
+    control_count: Index  # Of the one-ring; 0 where a sample lies in no tip, or in a piece of it
+    ring: Index  # First packet of the control points
+    row: Index  # First row of the block
+    frame: TipFrame | None  # Where derivatives do not serve as tangents; None where they always do
 
 
 @dataclass(frozen=True, eq=False)
 class TipFrame:
-    """Tangents in place of the derivatives.
+    """Tangents in place of the derivatives."""
 
-    Attributes
-    ----------
-    row : index array
-        First row of the block whose derivatives they are.
-    is_needed, is_uneven : masks
-        Where they are; and where they are those of `uneven_frame`.
-    """
-
-    row: Index
+    row: Index  # First row of the block whose derivatives they are
+    # Where they are; and where they are those of `uneven_frame`
     is_needed: Mask
     is_uneven: Mask
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The piece that some parameters lie in.
-
-    Attributes
-    ----------
-    kernel : PieceKernel
-    buffer : flat array
-        The coefficients of all pieces.
-    coefficients : list of lists of float arrays
-        Those of this piece, of each coordinate; zeros in the deeper levels of tips.
-    s, t : float arrays
-        Parameters in the piece, from the middle of the domain.
-    jacobian : tuple of four float arrays
-        Derivatives of s by the parameters that were given, and of t.
-    magnification : float array
-        How many times as fast as these s and t run: a power of two.
-    tip : Tip, or None
-    size : int
-        Of a value.
-    """
+    """The piece that some parameters lie in."""
 
     kernel: PieceKernel
-    buffer: FloatBuffer
-    coefficients: list[list[Float]]
+    buffer: FloatBuffer  # The coefficients of all pieces
+    coefficients: list[list[Float]]  # Those of this piece, of each coordinate; zeros in the deeper levels of tips
+    # Parameters in the piece, from the middle of the domain
     s: Float
     t: Float
-    jacobian: tuple[Float, Float, Float, Float]
-    magnification: Float
+    jacobian: tuple[Float, Float, Float, Float]  # Derivatives of s by the parameters that were given, and of t
+    magnification: Float  # How many times as fast as these s and t run: a power of two
     tip: Tip | None
-    size: int = 3
+    size: int = 3  # Of a value
 
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """Whether parameters so far on are in the piece, or no further outside than a tolerance."""
@@ -191,7 +146,6 @@ class Piece:
         du, dv : float arrays
             How far on from the parameters that were given, maybe outside of the piece. Without derivatives: see
             `PatchValues.shifted`.
-        derivatives : 1 or 2
         """
         s, t = self._parameters(du, dv)
         kernel = self.kernel
@@ -280,7 +234,6 @@ class PieceKernel:
 
     Parameters
     ----------
-    table : PieceTable
     float_type : type
         Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
     use_stam : bool
@@ -288,14 +241,10 @@ class PieceKernel:
 
     Attributes
     ----------
-    types : ArrayTypes
-    domain : ParameterDomain
     walk : ElementWalk
         Over the table's elements.
-    monomials : Monomials
     centre : tuple of two floats
         The middle of the domain.
-    first_term : FirstTerm, or None
     """
 
     def __init__(self, table: PieceTable, float_type: type, *, use_stam: bool = False) -> None:
@@ -347,7 +296,6 @@ class PieceKernel:
             Of an element.
         u, v : float arrays
             Inside the domain, seen from the half-edge.
-        active : mask
         row : index array, optional
             `ElementWalk.row` of the half-edges, if it is known.
         size : int
@@ -519,15 +467,9 @@ class FirstTerm:
     The first eigenvector is one everywhere. So the term of the point is ``ĉ_1`` times the sum of the basis functions,
     which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times sums of their derivatives, which are zero. In single
     precision these sums are not quite.
-
-    Attributes
-    ----------
-    functions : list of R lists of m floats
-        Coefficients of each function of the scheme's basis.
-    monomials : Monomials
     """
 
-    functions: list[list[float]]
+    functions: list[list[float]]  # Coefficients of each function of the scheme's basis
     monomials: Monomials
 
     def __call__(self, s: Float, t: Float, active: Mask) -> tuple[Float, Float, Float]:

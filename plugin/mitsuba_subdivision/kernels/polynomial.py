@@ -33,8 +33,6 @@ class Monomials:
         ----------
         coefficients : sequence of m arrays
             Numbers or vectors.
-        s, t : float arrays
-        derivatives : 1 or 2
 
         Returns
         -------

@@ -386,8 +386,6 @@ class AreaSampler:
 
     Parameters
     ----------
-    cells : SamplingCells
-    types : ArrayTypes
     walk : ElementWalk
         Over the surface's elements.
     """

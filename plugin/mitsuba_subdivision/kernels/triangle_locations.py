@@ -26,7 +26,6 @@ class TriangleLocations(Protocol):
 
         Parameters
         ----------
-        triangle : index array
         b1, b2 : float arrays
             Barycentric coordinates of the triangle's second and third corner.
         """
@@ -38,10 +37,8 @@ def triangle_locations(table: VertexTable, walk: ElementWalk, types: ArrayTypes)
 
     Parameters
     ----------
-    table : VertexTable
     walk : ElementWalk
         Over the same elements.
-    types : ArrayTypes
     """
     if isinstance(table.grid, UniformGrid):
         return UniformLocations(table.grid, walk, types)
@@ -53,7 +50,6 @@ class AdaptiveLocations:
 
     Parameters
     ----------
-    grid : AdaptiveGrid
     walk, types
         As for `triangle_locations`.
     """
@@ -76,7 +72,6 @@ class UniformLocations:
 
     Parameters
     ----------
-    grid : UniformGrid
     walk, types
         As for `triangle_locations`.
     """
@@ -129,7 +124,6 @@ class SomeTriangles:
         Of all.
     kept : (n,) int64
         Their numbers.
-    types : ArrayTypes
     """
 
     def __init__(self, locations: TriangleLocations, kept: IntArray, types: ArrayTypes) -> None:

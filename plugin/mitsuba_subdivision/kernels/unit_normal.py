@@ -18,19 +18,12 @@ LEAST_EXTENT = {dr.VarType.Float32: normals.LEAST_EXTENT[32], dr.VarType.Float64
 
 @dataclass(frozen=True)
 class RoundingBound:
-    """What rounding may leave of two tangents, as sums of weighted points.
+    """What rounding may leave of two tangents, as sums of weighted points."""
 
-    Attributes
-    ----------
-    weight_u, weight_v : float
-        Sum of the absolute weights in either tangent, times what rounding may leave of such a sum.
-    extent : 3-vector
-        Of the weighted points along each axis, from one of them.
-    """
-
+    # Sum of the absolute weights in either tangent, times what rounding may leave of such a sum
     weight_u: Float
     weight_v: Float
-    extent: Vector3
+    extent: Vector3  # Of the weighted points along each axis, from one of them
 
 
 class UnitNormal:
@@ -43,11 +36,6 @@ class UnitNormal:
     bound : RoundingBound, optional
         Of the tangents. Where rounding alone could have made the plane that the tangents span,
         the normal is zero, too, as in `evaluation.normals.unit_normals`.
-
-    Attributes
-    ----------
-    value : 3-vector
-    exists : mask
     """
 
     def __init__(self, du: Vector3, dv: Vector3, bound: RoundingBound | None = None) -> None:

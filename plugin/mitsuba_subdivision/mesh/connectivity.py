@@ -53,7 +53,6 @@ class Topology:
 
     Parameters
     ----------
-    vertex_count : int
     face_sizes : (n_f,) int64
         Number of corners of each face.
     face_vertices : (n_h,) int32

@@ -17,45 +17,24 @@ from .sharpness import Sharpness
 
 @dataclass(frozen=True, eq=False)
 class CutMesh:
-    """A mesh cut along some of its edges. Faces and half-edges keep their numbers.
+    """A mesh cut along some of its edges. Faces and half-edges keep their numbers."""
 
-    Attributes
-    ----------
-    topology : Topology
-        Every edge of the cut is a border edge of each of its faces. A vertex has a copy for each of its sides, which
-        are the faces between two cuts; the first copy keeps the vertex's number.
-    vertex : (n,) int64
-        The vertex that each vertex of the cut mesh is a copy of.
-    """
-
+    # Every edge of the cut is a border edge of each of its faces. A vertex has a copy for each of its sides, which
+    # are the faces between two cuts; the first copy keeps the vertex's number.
     topology: Topology
-    vertex: IntArray
+    vertex: IntArray  # (n,) int64: the vertex that each vertex of the cut mesh is a copy of
 
 
 @dataclass(frozen=True, eq=False)
 class SharpMesh:
-    """A mesh and its sharp features.
-
-    Attributes
-    ----------
-    topology : Topology
-    sharpness : Sharpness
-    is_corner : (n_v,) bool
-        Vertices that are corners, whatever edges end there.
-    is_boundary_vertex : (n_v,) bool
-        Whether an edge ends there that belongs to one face only.
-    crease_method : "uniform" or "chaikin"
-        How semi-sharp edges decay.
-    non_manifold : NonManifold or None
-        Where the mesh is no manifold, if anywhere.
-    """
+    """A mesh and its sharp features."""
 
     topology: Topology
     sharpness: Sharpness
-    is_corner: NDArray[np.bool_]
-    is_boundary_vertex: NDArray[np.bool_]
-    crease_method: CreaseMethod = "uniform"
-    non_manifold: NonManifold | None = None
+    is_corner: NDArray[np.bool_]  # (n_v,) bool: vertices that are corners, whatever edges end there
+    is_boundary_vertex: NDArray[np.bool_]  # (n_v,) bool: whether an edge ends there that belongs to one face only
+    crease_method: CreaseMethod = "uniform"  # How semi-sharp edges decay
+    non_manifold: NonManifold | None = None  # Where the mesh is no manifold, if anywhere
 
     @cached_property
     def cut(self) -> CutMesh:
@@ -111,7 +90,6 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
 
     Parameters
     ----------
-    mesh : SharpMesh
     is_border : (n_h,) bool
         Whether each half-edge lies on a border after the cut.
 

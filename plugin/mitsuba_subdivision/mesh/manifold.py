@@ -29,30 +29,19 @@ class NonManifold:
     non-manifold if it has such an edge or several fans. Then it is a corner, with one exception: a vertex of two
     non-manifold edges and three fans or more, each of which runs from one of these edges to the other, lies on a crease
     along the two.
-
-    Attributes
-    ----------
-    is_edge : (n_h,) bool
-        Whether each half-edge belongs to a non-manifold edge. None of these have twins.
-    is_own_edge : (n_h,) bool
-        Whether no other face shares the edge of each of these half-edges. An edge that joins a vertex to itself is the
-        face's own, and so is an edge that the face has a second time.
-    edge : (n_h,) int32
-        A number for each half-edge that it shares with all half-edges between the same two vertices.
-    is_vertex : (n_v,) bool
-        Whether each vertex is non-manifold.
-    is_crease : (n_v,) bool
-        Whether it lies on a crease of two non-manifold edges; the other non-manifold vertices are corners.
-    closed_fans : (n,) int64
-        The lowest half-edge of every closed fan, at vertices of several fans.
     """
 
+    # (n_h,) bool: whether each half-edge belongs to a non-manifold edge. None of these have twins.
     is_edge: NDArray[np.bool_]
+    # (n_h,) bool: whether no other face shares the edge of each of these half-edges. An edge that joins a vertex to
+    # itself is the face's own, and so is an edge that the face has a second time.
     is_own_edge: NDArray[np.bool_]
+    # (n_h,) int32: A number for each half-edge that it shares with all half-edges between the same two vertices
     edge: NDArray[np.int32]
-    is_vertex: NDArray[np.bool_]
+    is_vertex: NDArray[np.bool_]  # (n_v,) bool: whether each vertex is non-manifold
+    # (n_v,) bool: whether it lies on a crease of two non-manifold edges; the other non-manifold vertices are corners
     is_crease: NDArray[np.bool_]
-    closed_fans: IntArray
+    closed_fans: IntArray  # (n,) int64: the lowest half-edge of every closed fan, at vertices of several fans
 
     @property
     def is_corner(self) -> NDArray[np.bool_]:

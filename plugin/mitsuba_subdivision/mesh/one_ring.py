@@ -36,25 +36,18 @@ FEW_ELEMENTS = 4
 
 @dataclass(frozen=True, eq=False)
 class OneRing:
-    """An unfolded one-ring: its local mesh and how to walk to its vertices.
+    """An unfolded one-ring: its local mesh and how to walk to its vertices."""
 
-    Attributes
-    ----------
-    topology : Topology
-        The local mesh, which has a border. Half-edge 0 names the element; the element's own vertices come first.
-    faces : tuple of (corner, turns)
-        For each local face, the corner of the element and the counter-clockwise turns about it that lead there. In
-        the order of the corners.
-    slots : tuple of (local face, steps)
-        For each local vertex, a local face and the steps along it from the half-edge where the walk arrived.
-    cut_fans : list of [local vertex, local vertex, local vertex]
-        Corners of the element in whose fans faces may have been left out (`TaggedFan.near`), each with its two
-        neighbours on the border, as `Topology.border_neighbours` has them.
-    """
-
+    # The local mesh, which has a border. Half-edge 0 names the element; the element's own vertices come first.
     topology: Topology
+    # tuple of (corner, turns): for each local face, the corner of the element and the counter-clockwise turns about
+    # it that lead there. In the order of the corners.
     faces: tuple[tuple[int, int], ...]
+    # tuple of (local face, steps): for each local vertex, a local face and the steps along it from the half-edge
+    # where the walk arrived
     slots: tuple[tuple[int, int], ...]
+    # Corners of the element in whose fans faces may have been left out (`TaggedFan.near`), each with its two
+    # neighbours on the border, as `Topology.border_neighbours` has them
     cut_fans: list[list[int]]
 
     @property
@@ -236,7 +229,6 @@ class JoinedRings:
 
     Attributes
     ----------
-    topology : Topology
     half_edges, vertices : list of int
         The first half-edge and the first vertex of each one-ring. Its others follow in the order that they have in the
         one-ring alone.

@@ -62,7 +62,6 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> tuple[Topology,
 
     Parameters
     ----------
-    mesh : SharpMesh
     mode : str
         Which values are corners, as listed above.
     indices : (n_h,) int64
@@ -177,7 +176,6 @@ def _corner_conditions(
 
     Parameters
     ----------
-    mesh : SharpMesh
     vertex : (c,) int
         The mesh's vertex of each value.
     copy_count, face_count : (c,) int

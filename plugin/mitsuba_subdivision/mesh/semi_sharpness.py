@@ -21,32 +21,20 @@ class SemiSharpness:
 
     Copies of a vertex on the two sides of a cut must move alike. So each also knows the semi-sharp edges *across* the
     cut, which end at another copy of the vertex; it has a row for each of them.
-
-    Attributes
-    ----------
-    edges : (n_h,) float64
-        Sharpness of the edge of each half-edge: both half-edges of an edge have the same. 0 for smooth edges and on
-        borders.
-    edges_refined : (n_h,) float64
-        Sharpness that the next refinement gives the half of the edge at which the half-edge begins.
-    vertices : (n_v,) float64
-        Sharpness of each vertex.
-    across_vertex : (m,) int64
-        Of semi-sharp edges across the cut, the vertex of the cut mesh that knows of the edge.
-    across_sharpness : (m,) float64
-        Sharpness of the edge.
-    across_refined : (m,) float64
-        Sharpness that the next refinement gives the half at the vertex.
-    across_sharpens : (m,) bool
-        Whether the edge makes the vertex sharp. If not, it only takes part in the averages of Chaikin's method.
     """
 
+    # (n_h,) float64: sharpness of the edge of each half-edge: both half-edges of an edge have the same. 0 for smooth
+    # edges and on borders.
     edges: FloatArray
+    # (n_h,) float64: sharpness that the next refinement gives the half of the edge at which the half-edge begins
     edges_refined: FloatArray
-    vertices: FloatArray
+    vertices: FloatArray  # (n_v,) float64: sharpness of each vertex
+    # (m,) int64: of semi-sharp edges across the cut, the vertex of the cut mesh that knows of the edge
     across_vertex: IntArray
-    across_sharpness: FloatArray
-    across_refined: FloatArray
+    across_sharpness: FloatArray  # (m,) float64: sharpness of the edge
+    across_refined: FloatArray  # (m,) float64: sharpness that the next refinement gives the half at the vertex
+    # (m,) bool: whether the edge makes the vertex sharp. If not, it only takes part in the averages of Chaikin's
+    # method.
     across_sharpens: NDArray[np.bool_]
 
     @classmethod

@@ -29,18 +29,11 @@ INFINITE = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Sharpness:
-    """Sharpness of a mesh's edges and vertices: 0 smooth, `INFINITE` or more infinitely sharp, between them semi-sharp.
+    """Sharpness of edges and vertices: 0 smooth, `INFINITE` or more infinitely sharp, between them semi-sharp."""
 
-    Attributes
-    ----------
-    edges : (n_h,) float64
-        Sharpness of the edge of each half-edge: both half-edges of an edge have the same.
-    vertices : (n_v,) float64
-        Sharpness of each vertex.
-    """
-
+    # (n_h,) float64: sharpness of the edge of each half-edge: both half-edges of an edge have the same
     edges: FloatArray
-    vertices: FloatArray
+    vertices: FloatArray  # (n_v,) float64: sharpness of each vertex
 
     @property
     def is_infinite(self) -> NDArray[np.bool_]:

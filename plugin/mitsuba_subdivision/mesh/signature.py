@@ -34,7 +34,6 @@ class TaggedFan(NamedTuple):
         Sizes of the faces from this one on, counter-clockwise up to the border, or all around.
     behind : tuple of int
         Sizes of the faces on its other side, clockwise up to the border, without this one.
-    rule : VertexRule
     is_closed : bool
         Whether the faces go all around.
     sharpness : FanSharpness or None
@@ -280,7 +279,6 @@ class FanSharpnessRows:
 
     Parameters
     ----------
-    topology : Topology
     around : (e, n) int
         The result of `half_edges_around` for each element.
     semi : SemiSharpness

@@ -36,21 +36,12 @@ TIP_LEVELS = 2
 
 @dataclass(frozen=True, eq=False)
 class SurfaceAreas:
-    """Areas of a surface's pieces.
+    """Areas of a surface's pieces."""
 
-    Attributes
-    ----------
-    regular : (n,) float64
-        Of `SurfacePieces.regular`.
-    tips : tuple of (levels, 3, t) float64
-        For each of `SurfacePieces.tips`, of its levels and their regular pieces.
-    rest : float
-        Of the surface beyond these levels.
-    """
-
-    regular: FloatArray
+    regular: FloatArray  # (n,) float64: of `SurfacePieces.regular`
+    # tuple of (levels, 3, t) float64: for each of `SurfacePieces.tips`, of its levels and their regular pieces
     tips: tuple[FloatArray, ...]
-    rest: float
+    rest: float  # Of the surface beyond these levels
 
     @classmethod
     def of(cls, pieces: SurfacePieces) -> SurfaceAreas:
@@ -226,22 +217,14 @@ def _area_elements_at(pieces: PolynomialPieces, which: IntArray, uv: FloatArray)
 
 @dataclass(frozen=True, eq=False)
 class SamplingCells:
-    """Parallelograms, or triangles, of parameters that cover a surface.
+    """Parallelograms, or triangles, of parameters that cover a surface."""
 
-    Attributes
-    ----------
-    half_edge : (n,) int64
-        The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
-    matrices, offsets : (n, 2, 2), (n, 2) float64
-        From the whole domain to the cell, in the element's parameters.
-    areas : (n,) float64
-        Of the surface there.
-    """
-
+    # (n,) int64: the corner of an element where parameters begin, a half-edge of `PatchTable.elements`
     half_edge: IntArray
+    # (n, 2, 2), (n, 2) float64: from the whole domain to the cell, in the element's parameters
     matrices: FloatArray
     offsets: FloatArray
-    areas: FloatArray
+    areas: FloatArray  # (n,) float64: of the surface there
 
     @classmethod
     def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplingCells:

@@ -40,20 +40,13 @@ class ChannelLayout:
 
     Attributes of equal indices, of cages of the same topology, tags and rules, share a layout while it is
     referenced.
-
-    Attributes
-    ----------
-    kind : type
-        `SubdividedChannel` or `LinearChannel`, which describe the other attributes.
-    patches : PatchTable
-    value_index : (n,) int64
-    seam : (n_h,) bool or None
     """
 
+    # `SubdividedChannel` or `LinearChannel`, which describe the other attributes
     kind: type[SubdividedChannel] | type[LinearChannel]
     patches: PatchTable
-    value_index: IntArray
-    seam: NDArray[np.bool_] | None = None
+    value_index: IntArray  # (n,) int64
+    seam: NDArray[np.bool_] | None = None  # (n_h,) bool or None
 
     @classmethod
     def of(
@@ -67,8 +60,6 @@ class ChannelLayout:
             The attribute's name in error messages.
         attribute : Attribute
             Of the cage, validated.
-        cage : ControlCage
-        scheme : Scheme
         patches : PatchTable
             Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
 
@@ -249,7 +240,6 @@ def contracts_alike(channel: Channel, patches: PatchTable, half_edge: IntArray) 
 
     Parameters
     ----------
-    channel : Channel
     patches : PatchTable
         Of the surface.
     half_edge : (s,) int64
@@ -343,7 +333,6 @@ class PatchSampler:
 
     Parameters
     ----------
-    patches : PatchTable
     control_values : (n, k) float64
     control_of_vertex : (n_v,) int64
         0-based row of ``control_values`` at each mesh vertex.

@@ -78,10 +78,6 @@ class ClosestPointSearch:
     The surface is divided into flat polynomial pieces, each in a turned box. A first distance is that to the piece with
     the nearest middle. All pieces whose boxes are no further away than that are tried, by Newton's method within them;
     around an extraordinary point, pieces of one level after the other.
-
-    Parameters
-    ----------
-    pieces : SurfacePieces
     """
 
     def __init__(self, pieces: SurfacePieces) -> None:
@@ -360,17 +356,10 @@ def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPi
 
 @dataclass(frozen=True, eq=False)
 class BoxTree:
-    """Boxes with sides along the axes, sorted along a curve; ``WIDTH`` consecutive ones share a parent.
+    """Boxes with sides along the axes, sorted along a curve; ``WIDTH`` consecutive ones share a parent."""
 
-    Attributes
-    ----------
-    order : (n,) int64
-        The boxes in the order of the leaves.
-    levels : tuple of ((m, 3), (m, 3)) float64
-        Corners of the boxes of all nodes, the leaves first.
-    """
-
-    order: IntArray
+    order: IntArray  # (n,) int64: the boxes in the order of the leaves
+    # tuple of ((m, 3), (m, 3)) float64: corners of the boxes of all nodes, the leaves first
     levels: tuple[tuple[FloatArray, FloatArray], ...]
 
     @classmethod

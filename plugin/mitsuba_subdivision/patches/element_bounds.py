@@ -44,7 +44,6 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
 
     Parameters
     ----------
-    pieces : SurfacePieces
     elements : Topology
         `PatchTable.elements`.
     """

@@ -46,12 +46,10 @@ def energy_matrix(
 
     Parameters
     ----------
-    patches : PatchTable
     control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     control_points : (n, 3) float64
         Of the surface.
-    density : `gradients` or `hessians`
     order : int
         Gauss nodes along each parameter of a piece.
 
@@ -59,11 +57,6 @@ def energy_matrix(
     -------
     (n, n) CSR array of float64
         Symmetric.
-
-    Raises
-    ------
-    SchemeError
-        As `divided_elements`.
     """
     from scipy import sparse
 

@@ -42,7 +42,6 @@ def nearest_in_pieces(
 
     Parameters
     ----------
-    pieces : PolynomialPieces
     which : (s,) int64
         The piece for each point.
     points : (s, 3) float64
@@ -82,32 +81,16 @@ def _nearest(found: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 @dataclass(eq=False)
 class _Descent:
-    """The descent of some points to the least distance.
-
-    Attributes
-    ----------
-    pieces : PolynomialPieces
-    which : (s,) int64
-    points : (s, 3) float64
-    uv : (s, 2) float64
-    part : (s,) float64
-        Of Newton's step that is taken.
-    difference : (s, 3) float64
-        From the point to the surface.
-    tangents : (s, 2, 3) float64
-    second : (s, 3) float64
-        The difference's parts along the second derivatives by uu, uv and vv.
-    size : float
-    """
+    """The descent of some points to the least distance."""
 
     pieces: PolynomialPieces
-    which: IntArray
-    points: FloatArray
-    uv: FloatArray
-    part: FloatArray
-    difference: FloatArray
-    tangents: FloatArray
-    second: FloatArray
+    which: IntArray  # (s,) int64
+    points: FloatArray  # (s, 3) float64
+    uv: FloatArray  # (s, 2) float64
+    part: FloatArray  # (s,) float64: of Newton's step that is taken
+    difference: FloatArray  # (s, 3) float64: from the point to the surface
+    tangents: FloatArray  # (s, 2, 3) float64
+    second: FloatArray  # (s, 3) float64: the difference's parts along the second derivatives by uu, uv and vv
     size: float
 
     @classmethod

@@ -28,7 +28,6 @@ def fan_codes(topology: Topology, *, near: bool = False) -> IntArray:
 
     Parameters
     ----------
-    topology : Topology
     near : bool
         Whether the codes are those of fans that have the faces of `TaggedFan.near` only.
     """

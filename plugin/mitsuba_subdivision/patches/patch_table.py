@@ -31,22 +31,13 @@ FEWER = 4
 
 @dataclass(frozen=True, eq=False)
 class PatchClass:
-    """The patches whose one-rings have the same signature: their stencils are the same.
-
-    Attributes
-    ----------
-    signature : Signature
-    corners : (p,) int32
-        The corner of its element that each patch begins at, a half-edge of `PatchTable.elements`.
-    controls : (p, K) int32
-        0-based mesh vertices of each patch's one-ring.
-    first_control : int
-        Index of the first of these in `PatchTable.controls`, where the others follow, column by column.
-    """
+    """The patches whose one-rings have the same signature: their stencils are the same."""
 
     signature: Signature
+    # (p,) int32: the corner of its element that each patch begins at, a half-edge of `PatchTable.elements`
     corners: IndexArray
-    controls: IndexArray
+    controls: IndexArray  # (p, K) int32: 0-based mesh vertices of each patch's one-ring
+    # Index of the first of these in `PatchTable.controls`, where the others follow, column by column
     first_control: int
 
 
@@ -57,7 +48,6 @@ class PatchTable:
     ----------
     topology : Topology
         The mesh: the cage, cut along its creases.
-    scheme : Scheme
     is_hole : (n_f,) bool, optional
         Faces that are no elements.
     may_turn : bool
@@ -191,7 +181,6 @@ class PatchTable:
         ----------
         control_of_vertex : (n_v,) int64
             0-based control value at each mesh vertex.
-        control_count : int
 
         Returns
         -------
@@ -327,17 +316,10 @@ class RefinedPatches:
     2.8 s and 129 MB, for 10,000 quadrilaterals with valences from 3 to 9 (336 classes). To evaluate the table again
     takes from half to 1.2 times as long. Normals in float32 are 2 to 5 times less exact, as the refined cage's vertices
     are rounded.
-
-    Attributes
-    ----------
-    table : PatchTable
-        Of the refined cage, whose faces are all elements, and whole.
-    matrix : (n, n_v) sparse array
-        The refined cage's vertices as weights over the mesh's.
     """
 
-    table: PatchTable
-    matrix: sparse.csr_array
+    table: PatchTable  # Of the refined cage, whose faces are all elements, and whole
+    matrix: sparse.csr_array  # (n, n_v) sparse array: the refined cage's vertices as weights over the mesh's
 
     def corners(self, patch_class: PatchClass) -> IndexArray:
         """``(p,)`` the corner of an element of the cage that each patch covers, a half-edge of its `elements`."""

@@ -47,41 +47,27 @@ class PieceTable:
     *Coefficients* depend on the control points: the polynomials of the pieces of all patches, three numbers for each
     monomial, padded to whole packets of four; then for each patch with tips the control points of its one-ring, each
     padded to a packet and all but the first relative to that; padded to whole pieces.
-
-    Attributes
-    ----------
-    patches : PatchTable
-    control_count : int
-    piece_levels : int
-        Number of levels of tips that are pieces.
-    patch_starts : (p, 2) uint32
-        Of each patch its first piece and its first node.
-    rings : (p,) uint32
-        First packet of the control points of each patch; any number for patches without tips.
-    nodes : (n, 4) uint32
-        `PieceTree.kinds` plus `TURN` times the turn; first child, or the piece, counted from the patch's first; first
-        row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
-        `CONTROL` times the number of control points in the one-ring.
-    trees : tuple of PieceTree
-        Of each class.
-    classes : (c, 7) uint32
-        Of each class the index of its first control in ``controls``, its numbers of patches and of controls, its first
-        piece, how many pieces each patch has, its first packet of control points, and how many of these each patch has.
-    controls : (n,) uint32
-        `PatchTable.controls`, as indices of control values; of refined ones if there is a ``refinement``.
-    refinement : (n, control_count) sparse array or None
-        Makes refined control values, where the patches are those of the cage refined once.
     """
 
     patches: PatchTable
     control_count: int
-    piece_levels: int
-    patch_starts: NDArray[np.uint32]
+    piece_levels: int  # Number of levels of tips that are pieces
+    patch_starts: NDArray[np.uint32]  # (p, 2) uint32: of each patch its first piece and its first node
+    # (p,) uint32: first packet of the control points of each patch; any number for patches without tips
     rings: NDArray[np.uint32]
+    # (n, 4) uint32: `PieceTree.kinds` plus `TURN` times the turn; first child, or the piece, counted from the patch's
+    # first; first row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
+    # `CONTROL` times the number of control points in the one-ring
     nodes: NDArray[np.uint32]
-    trees: tuple[PieceTree, ...]
+    trees: tuple[PieceTree, ...]  # Of each class
+    # (c, 7) uint32: of each class the index of its first control in ``controls``, its numbers of patches and of
+    # controls, its first piece, how many pieces each patch has, its first packet of control points, and how many of
+    # these each patch has
     classes: NDArray[np.uint32]
+    # (n,) uint32: `PatchTable.controls`, as indices of control values; of refined ones if there is a ``refinement``
     controls: NDArray[np.uint32]
+    # (n, control_count) sparse array or None: makes refined control values, where the patches are those of the cage
+    # refined once
     refinement: sparse.csr_array | None
 
     @classmethod
@@ -96,17 +82,10 @@ class PieceTable:
 
         Parameters
         ----------
-        patches : PatchTable
         control_of_vertex : (n_v,) int64
             0-based control value at each mesh vertex.
-        control_count : int
         piece_levels : int
             Number of levels of tips that are pieces, if these do not take too much memory.
-
-        Raises
-        ------
-        SchemeError
-            As `piece_tree`.
         """
         key = patches, Content(control_of_vertex), control_count, piece_levels
         return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))

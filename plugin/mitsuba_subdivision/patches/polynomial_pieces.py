@@ -40,27 +40,16 @@ _Any = TypeVar("_Any")
 
 @dataclass(frozen=True, eq=False)
 class PolynomialPieces:
-    """Parts of a surface that are polynomials.
-
-    Attributes
-    ----------
-    basis : BernsteinBasis
-    half_edge : (n,) int64
-        The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
-    matrices, offsets : (n, 2, 2), (n, 2) float64
-        From a piece's own parameters, over the whole domain, to those of the element.
-    origins : (n, 3) float64
-        Points near the pieces, so that small ones lose no digits.
-    coefficients : (n, b, 3) float64
-        Relative to these.
-    """
+    """Parts of a surface that are polynomials."""
 
     basis: BernsteinBasis
+    # (n,) int64: the corner of an element where parameters begin, a half-edge of `PatchTable.elements`
     half_edge: IntArray
+    # (n, 2, 2), (n, 2) float64: from a piece's own parameters, over the whole domain, to those of the element
     matrices: FloatArray
     offsets: FloatArray
-    origins: FloatArray
-    coefficients: FloatArray
+    origins: FloatArray  # (n, 3) float64: points near the pieces, so that small ones lose no digits
+    coefficients: FloatArray  # (n, b, 3) float64: relative to these
 
     def __len__(self) -> int:
         return len(self.half_edge)
@@ -127,22 +116,14 @@ class PolynomialPieces:
 
 @dataclass(frozen=True, eq=False)
 class Tips:
-    """The surface around extraordinary points of the same patch: at every level, three polynomials.
-
-    Attributes
-    ----------
-    patch : IrregularPatch
-    half_edge, matrices, offsets
-        As in `PolynomialPieces`, from the tip's parameters.
-    coordinates : (t, K, 3) float64
-        Eigen-coordinates; the first is the extraordinary point.
-    """
+    """The surface around extraordinary points of the same patch: at every level, three polynomials."""
 
     patch: IrregularPatch
+    # As in `PolynomialPieces`, from the tip's parameters
     half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
-    coordinates: FloatArray
+    coordinates: FloatArray  # (t, K, 3) float64: eigen-coordinates; the first is the extraordinary point
 
     def __len__(self) -> int:
         return len(self.half_edge)
@@ -198,21 +179,15 @@ class Tips:
 
 @dataclass(frozen=True, eq=False)
 class ElementParts:
-    """Parts of a surface that are divided alike, not yet divided.
-
-    Attributes
-    ----------
-    element : DividedElement
-    half_edge, matrices, offsets
-        As in `PolynomialPieces`, from the part's parameters.
-    controls : (n, K, 3) float64
-        Control points of their one-rings. Where rules are convex, the parts lie within the hull of these.
-    """
+    """Parts of a surface that are divided alike, not yet divided."""
 
     element: DividedElement
+    # As in `PolynomialPieces`, from the part's parameters
     half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
+    # (n, K, 3) float64: control points of their one-rings. Where rules are convex, the parts lie within the hull of
+    # these.
     controls: FloatArray
 
     def __len__(self) -> int:
@@ -258,23 +233,14 @@ class ElementParts:
 
 @dataclass(frozen=True, eq=False)
 class SurfacePieces:
-    """A whole surface.
-
-    Attributes
-    ----------
-    scheme : Scheme
-    regular : PolynomialPieces
-    tips : tuple of Tips
-    undivided : tuple of ElementParts
-        The rest: parts along semi-sharp creases that have very many pieces.
-    sizes : (n_e, 3) float64
-        Largest absolute coordinates of the control points of each element's patches; zero where there is no element.
-    """
+    """A whole surface."""
 
     scheme: Scheme
     regular: PolynomialPieces
     tips: tuple[Tips, ...]
-    undivided: tuple[ElementParts, ...]
+    undivided: tuple[ElementParts, ...]  # The rest: parts along semi-sharp creases that have very many pieces
+    # (n_e, 3) float64: largest absolute coordinates of the control points of each element's patches; zero where there
+    # is no element
     sizes: FloatArray
 
     @classmethod
@@ -283,14 +249,8 @@ class SurfacePieces:
 
         Parameters
         ----------
-        patches : PatchTable
         control_points : (n_v, 3) float64
             At each mesh vertex.
-
-        Raises
-        ------
-        SchemeError
-            As `divided_elements`.
         """
         refined = patches.refined
         table = patches if refined is None else refined.table
@@ -373,7 +333,6 @@ def _seen(
 
     Parameters
     ----------
-    patches : PatchTable
     corners : (p,) int
         Corners of elements where the patches begin.
     domain : AffineMap

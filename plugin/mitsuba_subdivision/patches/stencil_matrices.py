@@ -50,20 +50,11 @@ class StencilMatrices(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StencilRows:
-    """Some rows of several matrices.
+    """Some rows of several matrices."""
 
-    Attributes
-    ----------
-    rows : (n,) int
-    columns : (n, K) int
-        Entries of a row with the same column add up.
-    weights : (d, n, K) float64
-        Of ``d`` matrices.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    weights: FloatArray
+    rows: IntArray  # (n,) int
+    columns: IntArray  # (n, K) int: entries of a row with the same column add up
+    weights: FloatArray  # (d, n, K) float64: of ``d`` matrices
 
 
 def joined_matrices(parts: Iterable[StencilRows], count: int, shape: tuple[int, int]) -> list[sparse.csr_array]:
@@ -93,13 +84,10 @@ def sample_matrices(
 
     Parameters
     ----------
-    patches : PatchTable
     control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
-    control_count : int
     half_edge, uv
         Locations of the samples.
-    derivatives : 1 or 2
     """
     parts = _sample_rows(patches, control_of_vertex, half_edge, uv, derivatives)
     return StencilMatrices(*joined_matrices(parts, 3 if derivatives == 1 else 6, (len(uv), control_count)))

@@ -22,39 +22,22 @@ SHORTEST = 1e-100
 
 @dataclass(frozen=True, eq=False)
 class TurnedBoxes:
-    """Boxes around pieces, turned to lie along them.
+    """Boxes around pieces, turned to lie along them."""
 
-    Attributes
-    ----------
-    basis : BernsteinBasis
-        Of the pieces.
-    frames : (n, 3, 3) float64
-        Unit vectors along the sides, the last one across the piece.
-    middles, halves : (n, 3) float64
-        Of the boxes, along these; distances of their sides from the middle.
-    points : (n, 3) float64
-        Of the pieces, at the middle of their domains.
-    back : (n, 2, 3) float64
-        Makes parameters of a displacement along the tangents there.
-    bends : (n, 3) float64
-        Norms of the second derivatives along each side, at most; across the piece, of what they differ from those in
-        the middle. By parameters by which the tangents in the middle are unit vectors at right angles, as all that
-        follows.
-    curvatures : (n, 2) float64
-        The least and the largest eigenvalue of the second derivatives across the piece in the middle.
-    stretch : (n,) float64
-        A lower bound of the squared length of unit displacements anywhere in the piece.
-    """
-
-    basis: BernsteinBasis
-    frames: FloatArray
+    basis: BernsteinBasis  # Of the pieces
+    frames: FloatArray  # (n, 3, 3) float64: unit vectors along the sides, the last one across the piece
+    # (n, 3) float64: of the boxes, along these; distances of their sides from the middle
     middles: FloatArray
     halves: FloatArray
-    points: FloatArray
-    back: FloatArray
+    points: FloatArray  # (n, 3) float64: of the pieces, at the middle of their domains
+    back: FloatArray  # (n, 2, 3) float64: makes parameters of a displacement along the tangents there
+    # (n, 3) float64: norms of the second derivatives along each side, at most; across the piece, of what they differ
+    # from those in the middle. By parameters by which the tangents in the middle are unit vectors at right angles, as
+    # all that follows.
     bends: FloatArray
+    # (n, 2) float64: the least and the largest eigenvalue of the second derivatives across the piece in the middle
     curvatures: FloatArray
-    stretch: FloatArray
+    stretch: FloatArray  # (n,) float64: A lower bound of the squared length of unit displacements anywhere in the piece
 
     @property
     def _arrays(self) -> tuple[FloatArray, ...]:

@@ -70,7 +70,6 @@ def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinemen
 
     Parameters
     ----------
-    cage : ControlCage
     chosen : str or Scheme, optional
         As for `adapted_scheme`. If it is given, the refined cage names it.
 

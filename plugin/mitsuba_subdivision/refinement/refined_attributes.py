@@ -48,12 +48,10 @@ def refined_attributes(
     ----------
     cage, refined : ControlCage
         The refined one without attributes, but with all tags.
-    scheme : Scheme
     refinement : Refinement
         Of the cut mesh.
     matrix : (n, n_v) sparse array
         The refined cage's vertices over the cage's.
-    corners : RefinedCorners
 
     Returns
     -------
@@ -126,24 +124,14 @@ def _named(cage: ControlCage) -> dict[str, Attribute]:
 
 @dataclass(frozen=True, eq=False)
 class _RefinedValues:
-    """Face-varying values that are subdivided, refined once.
+    """Face-varying values that are subdivided, refined once."""
 
-    Attributes
-    ----------
-    value_index : (n_v,) int64
-        Of the attribute's values at each vertex of the value mesh.
-    refinement : Refinement
-        Of the value mesh.
-    stays : (n_c,) bool
-        Whether a refined corner is in the middle of a border between two corners: where it stays, as a corner does.
-    indices : (n_c,) int64
-        Of the refined values.
-    """
-
-    value_index: IntArray
-    refinement: Refinement
+    value_index: IntArray  # (n_v,) int64: of the attribute's values at each vertex of the value mesh
+    refinement: Refinement  # Of the value mesh
+    # (n_c,) bool: whether a refined corner is in the middle of a border between two corners: where it stays, as a
+    # corner does
     stays: NDArray[np.bool_]
-    indices: IntArray
+    indices: IntArray  # (n_c,) int64: of the refined values
 
     @classmethod
     def of(

@@ -22,21 +22,12 @@ class RefinedCorners:
 
     First come the faces at the old corners, one for each, listed from the old vertex on; then perhaps others, with the
     points of edges at their corners.
-
-    Attributes
-    ----------
-    cage : ControlCage
-    refined : Topology
-        Of the cut mesh.
-    kind : (n_c,) int
-        Whether there is the point of a vertex, an edge or a face at each refined corner.
-    half_edge : (n_c,) int
-        Of the cage: one that begins at this vertex, runs along this edge, or lies in this face.
     """
 
     cage: ControlCage
-    refined: Topology
-    kind: IntArray
+    refined: Topology  # Of the cut mesh
+    kind: IntArray  # (n_c,) int: whether there is the point of a vertex, an edge or a face at each refined corner
+    # (n_c,) int: of the cage: one that begins at this vertex, runs along this edge, or lies in this face
     half_edge: IntArray
 
     @classmethod

@@ -39,20 +39,12 @@ class Estimate:
     A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
     samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
     and a renderer needs to output images only.
-
-    Attributes
-    ----------
-    mean : (height, width, 3) float64
-    variance : (height, width, 3) float64
-        Of one sample. Zero if there is one batch only, from which it cannot be estimated.
-    count : (height, width) int64
-        Samples of each pixel.
-    batches : int
     """
 
-    mean: NDArray[np.float64]
+    mean: NDArray[np.float64]  # (height, width, 3) float64
+    # (height, width, 3) float64: of one sample. Zero if there is one batch only, from which it cannot be estimated.
     variance: NDArray[np.float64]
-    count: NDArray[np.int64]
+    count: NDArray[np.int64]  # (height, width) int64: samples of each pixel
     batches: int
 
     @classmethod
@@ -104,29 +96,16 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A linear RGB image, and the further data of its file.
+    """A linear RGB image, and the further data of its file."""
 
-    Attributes
-    ----------
-    name : str
-        For messages: the path of the file, in most cases.
-    pixels : (height, width, 3) float64
-    estimate : Estimate or None
-        Variance and number of samples; the mean of the estimate is ``pixels``.
-    paired : (height, width, 3) float64 or None
-        The first batch alone. A later render of the same scene repeats its samples one by one.
-    probe : Probe or None
-        What the ray through the centre of each pixel hits.
-    metadata : dict
-        How the image was made.
-    """
-
-    name: str
-    pixels: NDArray[np.float64]
-    estimate: Estimate | None = None
+    name: str  # For messages: the path of the file, in most cases
+    pixels: NDArray[np.float64]  # (height, width, 3) float64
+    estimate: Estimate | None = None  # Variance and number of samples; the mean of the estimate is ``pixels``
+    # (height, width, 3) float64 or None: the first batch alone. A later render of the same scene repeats its samples
+    # one by one.
     paired: NDArray[np.float64] | None = None
-    probe: Probe | None = None
-    metadata: dict[str, Any] = field(default_factory=dict)
+    probe: Probe | None = None  # What the ray through the centre of each pixel hits
+    metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
 
     @property
     def size(self) -> tuple[int, int]:

@@ -24,22 +24,17 @@ PROBE_CHANNELS = (*(name for names in _FLOATS.values() for name in names), *_INT
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """First hits of the rays through pixel centres.
+    """First hits of the rays through pixel centres."""
 
-    Attributes
-    ----------
-    position, normal : (height, width, 3) float32
-        World space; the normal is the shading normal, of unit length. Zero where the ray hits nothing.
-    uv : (height, width, 2) float32
-        Surface parameters by the renderer: for a mesh without texture coordinates, those of the triangle.
-    shape, triangle, element : (height, width) uint32
-        Indices of the shape, of the triangle, and of the face of the cage that the triangle belongs to; `NOTHING`
-        where there is none.
-    """
-
+    # (height, width, 3) float32: world space; the normal is the shading normal, of unit length. Zero where the ray
+    # hits nothing.
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
+    # (height, width, 2) float32: surface parameters by the renderer: for a mesh without texture coordinates, those of
+    # the triangle
     uv: NDArray[np.float32]
+    # (height, width) uint32: indices of the shape, of the triangle, and of the face of the cage that the triangle
+    # belongs to; `NOTHING` where there is none
     shape: NDArray[np.uint32]
     triangle: NDArray[np.uint32]
     element: NDArray[np.uint32]

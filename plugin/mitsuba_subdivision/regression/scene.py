@@ -29,30 +29,16 @@ SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A scene of the current variant.
-
-    Attributes
-    ----------
-    scene : mi.Scene
-    path : Path or None
-        The scene's file; None for a scene from a dictionary or from memory.
-    filter : str
-        Name of the film's reconstruction filter.
-    files : dict of str
-        SHA-256 checksums of the scene's file and of all files that the scene names. Keys are paths relative to the
-        scene's folder.
-    parameters : dict of str
-        Values of the scene file's parameters that were given.
-    sensor_index : int
-        Which of the scene's sensors renders, from 0 on.
-    """
+    """A scene of the current variant."""
 
     scene: mi.Scene
-    path: Path | None
-    filter: str
+    path: Path | None  # The scene's file; None for a scene from a dictionary or from memory
+    filter: str  # Name of the film's reconstruction filter
+    # SHA-256 checksums of the scene's file and of all files that the scene names. Keys are paths relative to the
+    # scene's folder.
     files: dict[str, str] = field(default_factory=dict)
-    parameters: dict[str, str] = field(default_factory=dict)
-    sensor_index: int = 0
+    parameters: dict[str, str] = field(default_factory=dict)  # Values of the scene file's parameters that were given
+    sensor_index: int = 0  # Which of the scene's sensors renders, from 0 on
 
     @property
     def sensor(self) -> mi.Sensor:
@@ -80,7 +66,6 @@ def load_scene(
 
     Parameters
     ----------
-    source : path of an XML file, dictionary, or mi.Scene
     parameters : dict, optional
         Values for parameters of the file, which it declares by ``<default name=".."/>``.
     filter_name : str, optional

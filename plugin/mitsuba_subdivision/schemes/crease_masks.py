@@ -36,26 +36,17 @@ CREASE_NEIGHBOUR = 1 / 8
 
 @dataclass(frozen=True, eq=False)
 class CreaseMasks:
-    """Masks of all vertices and edges, as shares of the scheme's smooth masks and weights besides.
+    """Masks of all vertices and edges, as shares of the scheme's smooth masks and weights besides."""
 
-    Attributes
-    ----------
-    smooth : (n_v,) float64
-        Share of the scheme's smooth mask in the mask of each vertex.
-    own : (n_v,) float64
-        Weight of the vertex itself in the rest of its mask.
-    rows, columns : (m,) int64;  weights : (m,) float64
-        Further weights in the rest: of vertex ``columns`` in the mask of vertex ``rows``.
-    midpoint : (n_h,) float64
-        Share of the edge's midpoint in the point of each half-edge's edge; the rest is the scheme's smooth mask. Equal
-        on both half-edges of an edge, 1 on borders.
-    """
-
-    smooth: FloatArray
-    own: FloatArray
+    smooth: FloatArray  # (n_v,) float64: share of the scheme's smooth mask in the mask of each vertex
+    own: FloatArray  # (n_v,) float64: weight of the vertex itself in the rest of its mask
+    # (m,) int64;  weights : (m,) float64: further weights in the rest: of vertex ``columns`` in the mask of vertex
+    # ``rows``
     rows: IntArray
     columns: IntArray
     weights: FloatArray
+    # (n_h,) float64: share of the edge's midpoint in the point of each half-edge's edge; the rest is the scheme's
+    # smooth mask. Equal on both half-edges of an edge, 1 on borders.
     midpoint: FloatArray
 
 

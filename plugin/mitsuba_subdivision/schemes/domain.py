@@ -52,7 +52,6 @@ class ParameterDomain:
 
     Parameters
     ----------
-    name : str
     corners : (m, 2) float64
         Counter-clockwise from (0, 0). Edge i begins at corner i.
     children : tuple of AffineMap

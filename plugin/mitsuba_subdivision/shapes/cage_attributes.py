@@ -51,8 +51,6 @@ class CageAttributes:
 
     Parameters
     ----------
-    variant : module
-    surface : LimitSurface
     names : iterable of str
         Of the attributes that `traverse` exposes.
 

@@ -37,21 +37,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class VertexLocations:
-    """Locations of the vertices of a tessellation on the surface.
+    """Locations of the vertices of a tessellation on the surface."""
 
-    Attributes
-    ----------
-    corner : (n,) int64
-        Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
-    uv : (n, 2) float64
-        Samples at corners of elements have (0, 0).
-    weld_target : (n,) int64
-        The first copy of each vertex; the vertex itself where it has no copies.
-    """
-
+    # (n,) int64: corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`
     corner: IntArray
-    uv: FloatArray
-    weld_target: IntArray
+    uv: FloatArray  # (n, 2) float64: samples at corners of elements have (0, 0)
+    weld_target: IntArray  # (n,) int64: the first copy of each vertex; the vertex itself where it has no copies
 
     @cached_property
     def copies(self) -> IntArray:
@@ -99,7 +90,6 @@ class DeviceDisplacement:
 
     Parameters
     ----------
-    locations : VertexLocations
     slopes : (n,) bool
         See `VertexLocations.follow_slopes`.
     surface : SurfaceKernel
@@ -183,11 +173,8 @@ class HostDisplacement:
 
     Parameters
     ----------
-    locations : VertexLocations
     slopes : (n,) bool
         See `VertexLocations.follow_slopes`.
-    surface : LimitSurface
-    displacement : ShapeDisplacement
     has_normals : bool
         Whether normals are needed.
     """

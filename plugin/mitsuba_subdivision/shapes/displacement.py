@@ -47,13 +47,10 @@ class ShapeDisplacement:
 
     Parameters
     ----------
-    variant : module
-    surface : LimitSurface
     positions : (n, 3) float64
         Its control points, relative to the centre of `RecentredPoints`.
     given : str or mi.Texture
         The parameter ``displacement``.
-    scale : float
     exact : ExactShading, optional
         Exact shading, whose surface is displaced as well.
 
@@ -61,7 +58,6 @@ class ShapeDisplacement:
     ----------
     attribute : str
         Name of the cage's channel that the heights depend on: an attribute, or "texcoords".
-    heights : SurfaceHeights
     channel : Channel
         Its interpolation and its current values, which are read from the device.
     scale : flat array of one number

@@ -80,8 +80,6 @@ class ExactShading:
 
     Parameters
     ----------
-    variant : module
-    surface : LimitSurface
     positions : (n, 3) float64
         Its control points, relative to the centre of `RecentredPoints`.
     use_stam : bool
@@ -395,7 +393,6 @@ def _welded(table: VertexTable, split: AttributeLayout | None = None, first: Int
 
     Parameters
     ----------
-    table : VertexTable
     split : AttributeLayout, optional
         Triangles with copies of vertices along seams, if there are seams.
     first : (n,) int64, optional

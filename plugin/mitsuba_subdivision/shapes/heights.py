@@ -36,14 +36,9 @@ _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 @dataclass(frozen=True)
 class HeightRange:
-    """Interval of the heights of a displacement, without its scale.
+    """Interval of the heights of a displacement, without its scale."""
 
-    Attributes
-    ----------
-    low, high : float
-        Of textures that are no bitmap, of samples.
-    """
-
+    # Of textures that are no bitmap, of samples
     low: float
     high: float
 
@@ -90,11 +85,6 @@ class TextureHeights:
 
     The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
     Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives.
-
-    Parameters
-    ----------
-    variant : module
-    texture : mi.Texture
 
     Raises
     ------

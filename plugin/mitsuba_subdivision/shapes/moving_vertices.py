@@ -38,16 +38,8 @@ class MovingVertices:
 
     Parameters
     ----------
-    vertices : Vertices
-    points : RecentredPoints
     name : str
         What warnings call the shape.
-    shading : ExactShading, optional
-    displacement : ShapeDisplacement, optional
-
-    Attributes
-    ----------
-    are_differentiable : bool
     """
 
     def __init__(
@@ -74,7 +66,6 @@ class MovingVertices:
         ----------
         control_points : flat array
             The parameter.
-        placement : Placement
         on_backward : callable
             Called with gradients, by name, after reverse mode has reached the moving arrays.
         moves_points : bool

@@ -36,40 +36,19 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """A row of the shape's parameter table.
+    """A row of the shape's parameter table."""
 
-    Attributes
-    ----------
-    name : str
-        ``NAME`` in it stands for an attribute's name.
-    type : str
-        As Mitsuba's documentation names it: "string", "float", "int", "bool", "tensor", "transform", "texture" or
-        "float[]"; several are joined by " or ".
-    description : str
-        With literals between double backticks, without a full stop at the end.
-    default : object
-        None if there is none.
-    default_text : str
-        Describes a default that is not one value.
-    choices : tuple of str
-        Values that a string may have; empty for any.
-    accepts : callable or None
-        Whether a value of the right type is allowed.
-    expected : str
-        Description of accepted values, for messages.
-    flags : tuple of str
-        Empty if the parameter is read at load time only.
-    """
-
-    name: str
+    name: str  # ``NAME`` in it stands for an attribute's name
+    # As Mitsuba's documentation names it: "string", "float", "int", "bool", "tensor", "transform", "texture" or
+    # "float[]"; several are joined by " or "
     type: str
-    description: str
-    default: Any = None
-    default_text: str = ""
-    choices: tuple[str, ...] = ()
-    accepts: Callable[[Any], bool] | None = None
-    expected: str = ""
-    flags: tuple[str, ...] = ()
+    description: str  # With literals between double backticks, without a full stop at the end
+    default: Any = None  # None if there is none
+    default_text: str = ""  # Describes a default that is not one value
+    choices: tuple[str, ...] = ()  # Values that a string may have; empty for any
+    accepts: Callable[[Any], bool] | None = None  # Whether a value of the right type is allowed
+    expected: str = ""  # Description of accepted values, for messages
+    flags: tuple[str, ...] = ()  # Empty if the parameter is read at load time only
 
     @property
     def text(self) -> str:

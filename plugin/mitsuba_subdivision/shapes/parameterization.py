@@ -24,8 +24,6 @@ class Parameterization:
 
     Parameters
     ----------
-    variant : module
-    shape : mi.Mesh
     exact : ExactShading
         Of the shape, with its current texture coordinates.
     """

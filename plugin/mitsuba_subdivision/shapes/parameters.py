@@ -51,47 +51,23 @@ _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Checked parameters of a shape.
+    """Checked parameters of a shape."""
 
-    Attributes
-    ----------
-    surface : LimitSurface
-        In object space.
-    source : str
-        Name of the cage, of its file, or "control cage". Messages begin with it.
-    to_world : (4, 4) float64
-    tessellation : UniformTessellation or AdaptiveTessellation
-    shading : "vertex", "exact" or "auto"
-    face_normals : bool
-    evaluator : "stabilized" or "stam"
-    sample_offset : float
-        Extraordinary vertices are sampled at ``u = v = sample_offset``.
-    displacement : str, mi.Texture or None
-        Texture, or mesh attribute ``vertex_NAME``, with the heights.
-    displacement_scale : float
-    shown : (n_f,) bool or None
-        Elements whose triangles are kept; None for all.
-    """
-
-    surface: LimitSurface
-    source: str
-    to_world: NDArray[np.float64]
+    surface: LimitSurface  # In object space
+    source: str  # Name of the cage, of its file, or "control cage". Messages begin with it.
+    to_world: NDArray[np.float64]  # (4, 4) float64
     tessellation: Tessellation
     shading: str
     face_normals: bool
     evaluator: Evaluator
-    sample_offset: float
-    displacement: Any
+    sample_offset: float  # Extraordinary vertices are sampled at ``u = v = sample_offset``
+    displacement: Any  # Texture, or mesh attribute ``vertex_NAME``, with the heights
     displacement_scale: float
-    shown: NDArray[np.bool_] | None
+    shown: NDArray[np.bool_] | None  # (n_f,) bool or None: elements whose triangles are kept; None for all
 
 
 def read_parameters(props: mi.Properties) -> Parameters:
     """Read and check the parameters that a scene gives to the shape.
-
-    Parameters
-    ----------
-    props : mi.Properties
 
     Raises
     ------
@@ -259,11 +235,6 @@ def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarr
 def cage_of_file(path: str, **options: Any) -> ControlCage:
     """`ControlCage.from_file`, returning the cage of a living shape if the file is unchanged.
 
-    Raises
-    ------
-    CageError, OSError
-        As `ControlCage.from_file`.
-
     Warns
     -----
     CageWarning
@@ -296,11 +267,6 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
         What messages call the cage. If there is one, the cage's warnings were given before, and are not repeated.
     **arguments
         Of `ControlCage.from_arrays`.
-
-    Raises
-    ------
-    CageError
-        As `ControlCage.from_arrays`.
 
     Warns
     -----

@@ -93,24 +93,12 @@ class RecentredPoints:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The map of ``to_world`` for points relative to their centre.
+    """The map of ``to_world`` for points relative to their centre."""
 
-    Attributes
-    ----------
-    matrix : 4x4 matrix
-        Of Dr.Jit, with derivatives if the parameter has any; of NumPy in scalar variants.
-    inverse : 4x4 matrix
-        Of the parameter alone, without derivatives.
-    is_identity : bool
-        Whether it is the identity and has no derivatives.
-    mirrors : bool
-        Whether it is a reflection, which turns triangles inside out.
-    """
-
-    matrix: Matrix4
-    inverse: Matrix4
-    is_identity: bool
-    mirrors: bool
+    matrix: Matrix4  # Of Dr.Jit, with derivatives if the parameter has any; of NumPy in scalar variants
+    inverse: Matrix4  # Of the parameter alone, without derivatives
+    is_identity: bool  # Whether it is the identity and has no derivatives
+    mirrors: bool  # Whether it is a reflection, which turns triangles inside out
 
     @classmethod
     def of(
@@ -120,7 +108,6 @@ class Placement:
 
         Parameters
         ----------
-        to_world : mi.AffineTransform4f
         value : (4, 4) float64
             Its matrix.
         centre : (3,) float64 or None

@@ -58,8 +58,6 @@ def make_subdivision(variant: Variant) -> type:
 
         Parameters
         ----------
-        mesh : mi.Mesh
-        names : collection of str
         values : dict of str to arrays, optional
             Values to assign; if omitted, buffers are read into it.
         """

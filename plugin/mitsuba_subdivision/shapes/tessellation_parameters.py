@@ -25,12 +25,7 @@ ADAPTIVE = (*LIMITS, "max_rate", *SENSOR, "outline")
 
 @dataclass(frozen=True, eq=False)
 class UniformTessellation:
-    """The same number of segments on every edge of the cage.
-
-    Attributes
-    ----------
-    rate : int
-    """
+    """The same number of segments on every edge of the cage."""
 
     rate: int
 
@@ -51,21 +46,11 @@ class UniformTessellation:
 
 @dataclass(frozen=True, eq=False)
 class ViewingSensor:
-    """A sensor as the shape's parameters describe it.
+    """A sensor as the shape's parameters describe it."""
 
-    Attributes
-    ----------
-    to_world : (4, 4) float64
-        Camera-to-world transformation.
-    fov : float
-        Field of view along the film's width, in degrees; 0 if the sensor is orthographic.
-    film_size : (int, int)
-        Width and height in pixels.
-    """
-
-    to_world: NDArray[np.float64]
-    fov: float
-    film_size: tuple[int, int]
+    to_world: NDArray[np.float64]  # (4, 4) float64: camera-to-world transformation
+    fov: float  # Field of view along the film's width, in degrees; 0 if the sensor is orthographic
+    film_size: tuple[int, int]  # (int, int): width and height in pixels
 
     def in_world(self) -> Sensor:
         """The sensor in the form that error criteria take."""
@@ -84,26 +69,13 @@ class ViewingSensor:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveTessellation:
-    """The fewest triangles that meet an error limit.
+    """The fewest triangles that meet an error limit."""
 
-    Attributes
-    ----------
-    limit : str
-        One of `LIMITS`.
-    error : float
-        Value of the limit.
-    max_rate : int
-        Most segments along an edge of the cage.
-    sensor : ViewingSensor or None
-    fits_outline : bool
-        Whether the limit holds only where the sensor may see the surface edge-on.
-    """
-
-    limit: str
-    error: float
-    max_rate: int
+    limit: str  # One of `LIMITS`
+    error: float  # Value of the limit
+    max_rate: int  # Most segments along an edge of the cage
     sensor: ViewingSensor | None
-    fits_outline: bool
+    fits_outline: bool  # Whether the limit holds only where the sensor may see the surface edge-on
 
     def table(
         self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, bound: DisplacementBound | None = None
@@ -112,7 +84,6 @@ class AdaptiveTessellation:
 
         Parameters
         ----------
-        surface : LimitSurface
         control_points : (n, 3) float64
             In object space.
         to_world : (4, 4) float64

@@ -24,19 +24,10 @@ class Triangles:
 
     Parameters
     ----------
-    variant : module
-    table : VertexTable
     attributes : AttributeTable
         Its vertices, with copies along seams or without.
     kept : (n,) int64, optional
         The triangles that the mesh has; by default all.
-
-    Attributes
-    ----------
-    table : VertexTable
-    layout : AttributeLayout
-    patch_count : int
-    has_texcoords : bool
     """
 
     def __init__(

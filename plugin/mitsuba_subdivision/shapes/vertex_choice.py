@@ -40,10 +40,6 @@ def vertices_of(
 
     Parameters
     ----------
-    table : VertexTable
-    attributes : AttributeTable
-    parameters : Parameters
-    displacement : ShapeDisplacement, optional
     float_type : type or None
         Flat Dr.Jit array of a JIT variant; None in scalar variants.
     is_exact : bool

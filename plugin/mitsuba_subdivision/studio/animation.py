@@ -65,7 +65,6 @@ class SceneSource(Protocol[C]):
 
         Parameters
         ----------
-        contents
         points : (n, 3) float64, optional
             Points that the camera must see in all frames; by default, the points of the contents.
         follows_sensor : bool
@@ -88,7 +87,6 @@ class StillPicture:
 
     Parameters
     ----------
-    source : SceneSource
     follows_sensor : bool
         Whether the scene is rendered by its own sensor only.
     """
@@ -113,7 +111,6 @@ class Turntable:
 
     Parameters
     ----------
-    source : SceneSource
     count : int
         Number of frames.
     follows_sensor : bool
@@ -161,7 +158,6 @@ class FrameRange:
 
     Parameters
     ----------
-    source : SceneSource
     numbers : range
         Times or numbers of files.
 
@@ -226,10 +222,6 @@ class FrameFiles:
         If the name has no number in it.
     FileNotFoundError
         If there is no file for a frame.
-
-    Attributes
-    ----------
-    numbers : range
     """
 
     def __init__(self, path: Path, numbers: range) -> None:

@@ -56,7 +56,6 @@ class CageScenes:
     ----------
     cage : ControlCage, str or Path
         A cage, or the file of one. For frames, a USD file, or a name with a number in it, such as "frame_%04d.obj".
-    look : Look
     prim, time, scheme : optional
         As for `ControlCage.from_file`.
     numbers : range, optional

@@ -19,20 +19,11 @@ NEAREST = 0.25
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera in the studio's axes.
+    """A perspective camera in the studio's axes."""
 
-    Attributes
-    ----------
-    axes : (3, 3) float64
-        Columns right, up and forward.
-    origin : (3,) float64
-    distance : float
-        From the camera to the middle of the points, along the view.
-    """
-
-    axes: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    distance: float
+    axes: NDArray[np.float64]  # (3, 3) float64: columns right, up and forward
+    origin: NDArray[np.float64]  # (3,) float64
+    distance: float  # From the camera to the middle of the points, along the view
 
 
 def framed(

@@ -133,7 +133,6 @@ class Model:
         ----------
         triangles : dict
             Parameters of its tessellation.
-        shading : str
         in_memory : bool
             Whether the shape gets the cage itself, rather than its file.
         """
@@ -179,13 +178,7 @@ def up_axis_of(path: Path) -> str:
 
 
 class CageWire:
-    """Rods and balls that follow the control points of a cage.
-
-    Parameters
-    ----------
-    cage : ControlCage
-    model_radius : float
-    """
+    """Rods and balls that follow the control points of a cage."""
 
     def __init__(self, cage: ControlCage, model_radius: float) -> None:
         self._edges, self._vertices = cage.edges, np.unique(cage.edges)

@@ -34,28 +34,17 @@ _EXPECTED = "Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns,
 
 @dataclass
 class Picture:
-    """A picture that is mapped onto a surface.
-
-    Attributes
-    ----------
-    path : Path
-    scale, offset : list of float
-        The picture is looked up at ``scale * uv + offset``.
-    base, gain : float
-        Its linear values ``c`` become ``base + gain * c``.
-    is_clamped : bool
-        Whether it is continued by its edges, rather than repeated.
-    is_blended : bool
-        Whether pixels are interpolated.
-    """
+    """A picture that is mapped onto a surface."""
 
     path: Path
+    # The picture is looked up at ``scale * uv + offset``
     scale: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
     offset: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    # Its linear values ``c`` become ``base + gain * c``
     base: float = 0.0
     gain: float = 1.0
-    is_clamped: bool = False
-    is_blended: bool = True
+    is_clamped: bool = False  # Whether it is continued by its edges, rather than repeated
+    is_blended: bool = True  # Whether pixels are interpolated
 
     def texture(self) -> SceneNode:
         """The picture as a texture of Mitsuba."""

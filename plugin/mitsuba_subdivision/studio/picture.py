@@ -69,7 +69,6 @@ def segments_for(
 
     Parameters
     ----------
-    cage : ControlCage
     to_world : (n, 4, 4) float64
         Of each copy of the cage.
     outline : dict

@@ -24,7 +24,6 @@ class PolygonMesh:
 
     Parameters
     ----------
-    name : str
     triangles : (n_t, 3) int
     vertices : dict of str to (n_v, k) array
         Buffers of Mitsuba's mesh by name: ``vertex_positions``, and if it has them ``vertex_normals``,

@@ -225,7 +225,6 @@ def backdrop(front: float, bend: float, wall: float, height: float, half_width: 
         Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height ``wall - bend``.
     height : float
         Of the wall; more than ``2 * (wall - bend)``.
-    half_width : float
     """
     # A cubic spline is straight where four control points in a row are.
     step = wall - bend
@@ -239,36 +238,17 @@ def backdrop(front: float, bend: float, wall: float, height: float, half_width: 
 
 @dataclass(frozen=True)
 class Look:
-    """Display options of a model or a stage.
+    """Display options of a model or a stage."""
 
-    Attributes
-    ----------
-    view : str or (azimuth, elevation)
-        From where the studio's camera looks.
-    size : (width, height) or None
-        Of the film, in pixels. None for 640 by 480, or what a stage's render settings or its camera ask for.
-    spp : int
-        Samples per pixel.
-    up : "y", "z" or None
-        Axis of a cage that points up; None for that of its file.
-    rate : int or None
-        Segments on each edge of a cage; None for as many as a picture needs.
-    shading : "vertex" or "exact"
-        Of a cage.
-    checker : bool
-        Whether texture coordinates of a cage are shown as a checkerboard.
-    cage : bool
-        Whether the control cage is drawn over its surface.
-    texture_size : int or None
-        Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows.
-    """
-
-    view: View = DEFAULT_VIEW
+    view: View = DEFAULT_VIEW  # str or (azimuth, elevation): from where the studio's camera looks
+    # (width, height) or None: of the film, in pixels. None for 640 by 480, or what a stage's render settings or its
+    # camera ask for.
     size: tuple[int, int] | None = None
-    spp: int = DEFAULT_SPP
-    up: str | None = None
-    rate: int | None = None
-    shading: str = "vertex"
-    checker: bool = False
-    cage: bool = False
+    spp: int = DEFAULT_SPP  # Samples per pixel
+    up: str | None = None  # Axis of a cage that points up; None for that of its file
+    rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
+    shading: str = "vertex"  # Of a cage
+    checker: bool = False  # Whether texture coordinates of a cage are shown as a checkerboard
+    cage: bool = False  # Whether the control cage is drawn over its surface
+    # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
     texture_size: int | None = None

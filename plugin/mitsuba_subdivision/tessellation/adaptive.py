@@ -34,12 +34,10 @@ def adaptive_table(
 
     Parameters
     ----------
-    patches : PatchTable
     control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
     control_points : (n, 3) float64
         Control points for which the criterion is met. The table can be applied to others.
-    criterion : Criterion
     max_rate : int
         Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`.
     cage_name : str

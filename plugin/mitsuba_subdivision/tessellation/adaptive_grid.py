@@ -21,23 +21,12 @@ from .tiles import UNIT, Tiles
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveGrid:
-    """An adaptive tessellation: vertices where spans begin come first, then those inside spans, then those in tiles.
-
-    Attributes
-    ----------
-    frames : PatchFrames
-    spans : Spans
-        All sides of the tiles.
-    topology : Topology
-        Of the elements; its edges and vertices identify the tessellation's vertices.
-    keeps_corner : (t, m) bool or None
-        As for `stitched`.
-    """
+    """An adaptive tessellation: vertices where spans begin come first, then those inside spans, then those in tiles."""
 
     frames: PatchFrames
-    spans: Spans
-    topology: Topology
-    keeps_corner: NDArray[np.bool_] | None
+    spans: Spans  # All sides of the tiles
+    topology: Topology  # Of the elements; its edges and vertices identify the tessellation's vertices
+    keeps_corner: NDArray[np.bool_] | None  # (t, m) bool or None: as for `stitched`
 
     @classmethod
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:

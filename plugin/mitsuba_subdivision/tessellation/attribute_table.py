@@ -24,25 +24,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class AttributeLayout:
-    """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values.
+    """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values."""
 
-    Attributes
-    ----------
-    surface_vertex : (n,) int64 or None
-        For each split vertex, the vertex of the `VertexTable` whose position and normal it has. None without seams,
-        when both tables have the same vertices.
-    find_triangles : callable
-        Computes `triangles` on demand.
-    evaluate : tuple of callables
-        Each computes the values at the vertices, ``(n, k)`` float64, of a channel of one layout.
-    locate : callable, or None
-        Finds the locations of split vertices, each on its own side of seams, as `Grid.locations`. None if both
-        tables have the same vertices.
-    """
-
+    # (n,) int64 or None: for each split vertex, the vertex of the `VertexTable` whose position and normal it has.
+    # None without seams, when both tables have the same vertices.
     surface_vertex: IntArray | None
-    find_triangles: Callable[[], NDArray[np.uint32]]
+    find_triangles: Callable[[], NDArray[np.uint32]]  # Computes `triangles` on demand
+    # Each computes the values at the vertices, ``(n, k)`` float64, of a channel of one layout
     evaluate: tuple[Callable[[Channel], FloatArray], ...] = ()
+    # Finds the locations of split vertices, each on its own side of seams, as `Grid.locations`. None if both tables
+    # have the same vertices.
     locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
 
     @cached_property
@@ -56,17 +47,11 @@ _LAYOUTS: Shared[AttributeLayout] = Shared()
 
 @dataclass(frozen=True, eq=False)
 class AttributeTable:
-    """A tessellation whose vertices have attributes.
+    """A tessellation whose vertices have attributes."""
 
-    Attributes
-    ----------
-    layout : AttributeLayout
-        Tables of the same tessellation, with attributes of the same layouts, share it.
-    values : dict of str to (n, k) float64
-        At the vertices, by the name of the attribute; read-only, as tables of the same values share them.
-    """
-
-    layout: AttributeLayout
+    layout: AttributeLayout  # Tables of the same tessellation, with attributes of the same layouts, share it
+    # dict of str to (n, k) float64: at the vertices, by the name of the attribute; read-only, as tables of the same
+    # values share them
     values: Mapping[str, FloatArray]
 
     @classmethod
@@ -85,7 +70,6 @@ class AttributeTable:
             Of the tessellation.
         patches, control_of_vertex
             The inputs that the table was built from.
-        channels : dict of str to Channel
         """
         layouts = tuple(channel.layout for channel in channels.values())
 

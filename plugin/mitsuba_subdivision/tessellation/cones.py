@@ -32,21 +32,11 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class TangentCone:
-    """Directions that contain all derivatives by a parameter of some patches, or of each part of these.
+    """Directions that contain all derivatives by a parameter of some patches, or of each part of these."""
 
-    Attributes
-    ----------
-    axis : (.., 3, t) float
-        Unit vectors; zero where there is none.
-    sine : (.., t) float
-        Of half the angle of the cone; one where derivatives may have any direction.
-    shortest : (.., t) float
-        Least extent of a derivative along the axis.
-    """
-
-    axis: FloatArray
-    sine: FloatArray
-    shortest: FloatArray
+    axis: FloatArray  # (.., 3, t) float: unit vectors; zero where there is none
+    sine: FloatArray  # (.., t) float: of half the angle of the cone; one where derivatives may have any direction
+    shortest: FloatArray  # (.., t) float: least extent of a derivative along the axis
 
     @classmethod
     def of(cls, derivative: FloatArray) -> TangentCone:
@@ -62,18 +52,10 @@ class TangentCone:
 
 @dataclass(frozen=True, eq=False)
 class NormalCone:
-    """Directions that contain all normals of some patches, or of each part of these.
+    """Directions that contain all normals of some patches, or of each part of these."""
 
-    Attributes
-    ----------
-    axis : (.., 3, t) float
-        Unit vectors; zero where there is none.
-    sine : (.., t) float
-        Of half the angle of the cone; one where normals may have any direction.
-    """
-
-    axis: FloatArray
-    sine: FloatArray
+    axis: FloatArray  # (.., 3, t) float: unit vectors; zero where there is none
+    sine: FloatArray  # (.., t) float: of half the angle of the cone; one where normals may have any direction
 
     @classmethod
     def of(cls, u: TangentCone, v: TangentCone) -> NormalCone:

@@ -48,21 +48,12 @@ class Measure(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """Viewpoint and pixel size of a sensor.
+    """Viewpoint and pixel size of a sensor."""
 
-    Attributes
-    ----------
-    eye : (3,) float64
-        In the space of the control points.
-    pixel : float
-        Size of a pixel at a distance of one, the least over the picture; or everywhere, if the sensor is orthographic.
-    direction : (3,) float64 or None
-        Of view, if the sensor is orthographic.
-    """
-
-    eye: FloatArray
+    eye: FloatArray  # (3,) float64: in the space of the control points
+    # Size of a pixel at a distance of one, the least over the picture; or everywhere, if the sensor is orthographic
     pixel: float
-    direction: FloatArray | None = None
+    direction: FloatArray | None = None  # (3,) float64 or None: of view, if the sensor is orthographic
 
     def pixel_size(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
         """``(.., t)`` least size of a pixel anywhere in boxes ``(.., 3, t)``."""
@@ -92,18 +83,11 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class DisplacementBound:
-    """Heights of a displacement, and their bound.
+    """Heights of a displacement, and their bound."""
 
-    Attributes
-    ----------
-    heights : callable
-        Finds heights ``(s,)`` of samples, given as for `PatchSampler.evaluate`.
-    extent : float
-        Largest distance that any point moves; of a texture that is no bitmap, that any sample does.
-    """
-
+    # Finds heights ``(s,)`` of samples, given as for `PatchSampler.evaluate`
     heights: Callable[[IntArray, FloatArray], FloatArray]
-    extent: float
+    extent: float  # Largest distance that any point moves; of a texture that is no bitmap, that any sample does
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +96,6 @@ class Criterion:
 
     Attributes
     ----------
-    measure : Measure
     error : float
         The limit; in pixels, if there is a ``sensor``.
     sensor : Sensor or None
@@ -187,7 +170,6 @@ class Criterion:
             Bernstein coefficients of the derivatives by u, v, uu, uv and vv; of some parts of patches.
         tangents : two TangentCone
             Along u and v.
-        cone : NormalCone
         corner_count : int
             Of the domain.
 

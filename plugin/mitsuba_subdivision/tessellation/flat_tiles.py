@@ -23,23 +23,12 @@ FOLDED = 1e-6
 
 
 class PatchGroup(NamedTuple):
-    """One-rings of one class.
-
-    Attributes
-    ----------
-    signature : Signature
-    at : (n,) int64
-        The tile that each is of.
-    points : (K, 3, n) float64
-        Control points.
-    slots : (K,) int64 or None
-        The vertices of a one-ring that these are; None if they are all.
-    """
+    """One-rings of one class."""
 
     signature: Signature
-    at: IntArray
-    points: FloatArray
-    slots: IntArray | None = None
+    at: IntArray  # (n,) int64: the tile that each is of
+    points: FloatArray  # (K, 3, n) float64: control points
+    slots: IntArray | None = None  # (K,) int64 or None: the vertices of a one-ring that these are; None if they are all
 
     def chosen(self, which: NDArray[np.bool_]) -> PatchGroup:
         """Some of them."""

@@ -15,30 +15,19 @@ from ..schemes.domain import FloatArray, ParameterDomain
 
 @dataclass(frozen=True, eq=False)
 class PatchFrames:
-    """Placement of patches in the elements of a cage.
+    """Placement of patches in the elements of a cage."""
 
-    Attributes
-    ----------
-    topology : Topology
-        Of the elements.
-    domain : ParameterDomain
-    is_whole : (n_f,) bool
-        Whether the patches of each element are the element itself. Others lie at a corner, reach half way along its
-        edges, and to the element's centre.
-    scale : (n_f,) float64
-        From a patch's parameters to those of its element, seen from the same corner.
-    edge, vertex : (n_h,) int32
-        Numbers of the edge of each half-edge, and of the vertex where it begins: of both sides of a crease the same.
-    is_backward : (n_h,) bool
-        Whether positions along the edge of a half-edge are counted from its end.
-    """
-
-    topology: Topology
+    topology: Topology  # Of the elements
     domain: ParameterDomain
+    # (n_f,) bool: whether the patches of each element are the element itself. Others lie at a corner, reach half way
+    # along its edges, and to the element's centre.
     is_whole: NDArray[np.bool_]
-    scale: FloatArray
+    scale: FloatArray  # (n_f,) float64: from a patch's parameters to those of its element, seen from the same corner
+    # (n_h,) int32: numbers of the edge of each half-edge, and of the vertex where it begins: of both sides of a
+    # crease the same
     edge: IndexArray
     vertex: IndexArray
+    # (n_h,) bool: whether positions along the edge of a half-edge are counted from its end
     is_backward: NDArray[np.bool_]
 
     @cached_property
@@ -72,7 +61,6 @@ class PatchFrames:
 
         Parameters
         ----------
-        patches : PatchTable
         control_of_vertex : (n_v,) int64
             0-based control point at each mesh vertex.
         """

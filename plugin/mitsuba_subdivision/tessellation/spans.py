@@ -97,34 +97,17 @@ def _numbers(order: IndexArray, begins: NDArray[np.bool_]) -> IndexArray:
 
 @dataclass(frozen=True, eq=False)
 class Spans:
-    """Spans of all sides of all tiles: in the order of the sides, along each side counter-clockwise around the tile.
+    """Spans of all sides of all tiles: in the order of the sides, along each side counter-clockwise around the tile."""
 
-    Attributes
-    ----------
-    tiles : Tiles
-        Without `Tiles.sides`, as rates say what these did.
-    frames : PatchFrames
-        Of the tiles' patches.
-    side : (s,) int32
-        ``m`` times the tile, plus the corner at which its side begins.
-    rate : (s,) int16
-        Segments.
-    node : (s,) unsigned integer
-        Which part of its side each span is, in the tree of halves: 1 is the whole side, ``2 n`` and ``2 n + 1`` are the
-        halves of part ``n``.
-    is_backward : (s,) bool
-        Whether the numbers of the vertices inside fall along the side.
-    at : (s,) int32
-        0-based number shared by all spans at the same location.
-    """
-
-    tiles: Tiles
-    frames: PatchFrames
-    side: IndexArray
-    rate: NDArray[np.int16]
+    tiles: Tiles  # Without `Tiles.sides`, as rates say what these did
+    frames: PatchFrames  # Of the tiles' patches
+    side: IndexArray  # (s,) int32: ``m`` times the tile, plus the corner at which its side begins
+    rate: NDArray[np.int16]  # (s,) int16: segments
+    # (s,) unsigned integer: which part of its side each span is, in the tree of halves: 1 is the whole side, ``2 n``
+    # and ``2 n + 1`` are the halves of part ``n``
     node: NDArray[np.unsignedinteger]
-    is_backward: NDArray[np.bool_]
-    at: IndexArray
+    is_backward: NDArray[np.bool_]  # (s,) bool: whether the numbers of the vertices inside fall along the side
+    at: IndexArray  # (s,) int32: 0-based number shared by all spans at the same location
 
     def samples(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
         """The span of each sample along all sides, and its position along the span; for a block of spans."""
@@ -248,28 +231,13 @@ class Spans:
 
 @dataclass(frozen=True, eq=False)
 class SpanVertices:
-    """Vertices of the tessellation where spans begin, which are numbered first, and those inside spans.
+    """Vertices of the tessellation where spans begin, which are numbered first, and those inside spans."""
 
-    Attributes
-    ----------
-    point : (s,) int32
-        The vertex where each span begins.
-    span : (s,) int32
-        0-based number shared by all equal spans.
-    first_inside : (k,) int32
-        The vertex with the least number inside each of these.
-    of_point : (p,) int32
-        The first span that begins at each vertex.
-    of_span : (k,) int32
-        The first of the spans with each number.
-    vertex_count : int
-    """
-
-    point: IndexArray
-    span: IndexArray
-    first_inside: IndexArray
-    of_point: IndexArray
-    of_span: IndexArray
+    point: IndexArray  # (s,) int32: the vertex where each span begins
+    span: IndexArray  # (s,) int32: 0-based number shared by all equal spans
+    first_inside: IndexArray  # (k,) int32: the vertex with the least number inside each of these
+    of_point: IndexArray  # (p,) int32: the first span that begins at each vertex
+    of_span: IndexArray  # (k,) int32: the first of the spans with each number
     vertex_count: int
 
 

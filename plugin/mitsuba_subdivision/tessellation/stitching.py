@@ -27,19 +27,12 @@ PARAMETER_ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class SideSamples:
-    """Samples along the sides of tiles.
+    """Samples along the sides of tiles."""
 
-    Attributes
-    ----------
-    side_start : (m t + 1,) int64
-        The first sample of each side of each tile; the last one of a side is the first one of the next.
-    along : (n,) float64
-        Position of each sample along its side, in [0, 1).
-    corner_count : int
-    """
-
+    # (m t + 1,) int64: the first sample of each side of each tile; the last one of a side is the first one of the
+    # next
     side_start: IntArray
-    along: FloatArray
+    along: FloatArray  # (n,) float64: position of each sample along its side, in [0, 1)
     corner_count: int
 
     @cached_property
@@ -91,7 +84,6 @@ def stitched(rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_
     Parameters
     ----------
     rates : (t, 2) int64
-    sides : SideSamples
     keeps_corner : (t, m) bool, optional
         Corners that no triangle cuts off, of tiles with inner samples.
 

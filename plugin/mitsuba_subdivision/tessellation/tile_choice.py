@@ -60,13 +60,11 @@ def choose_tiles(
 
     Parameters
     ----------
-    patches : PatchTable
     frames : PatchFrames
         Of these.
     control_points : (n, 3) float64
     control_of_vertex : (n_v,) int64
         0-based control point at each mesh vertex.
-    criterion : Criterion
     max_rate : int
         Most segments along an edge of the cage; around extraordinary points, along each ring.
     cage_name : str

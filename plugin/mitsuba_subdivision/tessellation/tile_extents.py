@@ -33,23 +33,12 @@ ROUNDING = 2.0**-14
 
 
 class TileParts(NamedTuple):
-    """Parts of tiles with the same subdivision.
-
-    Attributes
-    ----------
-    tile : DividedTile
-    values : (K, d, p) float
-        Coordinates of their control points, along d axes.
-    owner : (p,) int64
-        The tile, or side of a tile, that each belongs to.
-    side : int or None
-        The corner that a side begins at, if only the curve along that is asked for.
-    """
+    """Parts of tiles with the same subdivision."""
 
     tile: DividedTile
-    values: FloatArray
-    owner: IntArray
-    side: int | None = None
+    values: FloatArray  # (K, d, p) float: coordinates of their control points, along d axes
+    owner: IntArray  # (p,) int64: the tile, or side of a tile, that each belongs to
+    side: int | None = None  # The corner that a side begins at, if only the curve along that is asked for
 
     def chosen(self, which: NDArray[np.bool_]) -> TileParts:
         """Some of the parts."""
@@ -80,7 +69,6 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
 
     Parameters
     ----------
-    scheme : Scheme
     limit : (n,) float64
         How far the surface over each tile may extend: along one axis, or the size of a box of several; negative where
         it may not.
@@ -162,23 +150,15 @@ class _Child(NamedTuple):
 
 
 class _Division(NamedTuple):
-    """A tile divided, or a side of it.
+    """A tile divided, or a side of it."""
 
-    Attributes
-    ----------
-    rows : (r, K) float32
-        Over the control points of the tile: points of the surface, at corners of the tile and of pieces; all other
-        Bernstein coefficients of pieces, or of curves; and one-rings of the children.
-    point_count, hull_count : int
-        Where the first two kinds of rows end.
-    children : list of _Child
-        Parts that are no pieces.
-    """
-
+    # (r, K) float32: over the control points of the tile: points of the surface, at corners of the tile and of
+    # pieces; all other Bernstein coefficients of pieces, or of curves; and one-rings of the children
     rows: NDArray[np.float32]
+    # Where the first two kinds of rows end
     point_count: int
     hull_count: int
-    children: list[_Child]
+    children: list[_Child]  # Parts that are no pieces
 
 
 @lru_cache(maxsize=4096)

@@ -33,22 +33,12 @@ HEIGHT_SAMPLES = 9
 
 @dataclass(frozen=True, eq=False)
 class TileRates:
-    """Rates of tiles for a criterion.
-
-    Attributes
-    ----------
-    scheme : Scheme
-    frames : PatchFrames
-        Of the patches that the tiles are parts of.
-    criterion : Criterion
-    max_rate : int
-        Most segments along an edge of the cage.
-    """
+    """Rates of tiles for a criterion."""
 
     scheme: Scheme
-    frames: PatchFrames
+    frames: PatchFrames  # Of the patches that the tiles are parts of
     criterion: Criterion
-    max_rate: int
+    max_rate: int  # Most segments along an edge of the cage
 
     @property
     def basis(self) -> BernsteinBasis:
@@ -72,7 +62,6 @@ class TileRates:
 
         Parameters
         ----------
-        tiles : Tiles
         lower, upper : (3, t) float64
             Boxes of the hulls.
         axis : (3, t) float64
@@ -93,7 +82,6 @@ class TileRates:
 
         Parameters
         ----------
-        tiles : Tiles
         coefficients : (b, 3, t) float64
             Bernstein coefficients over the tiles.
         triangle_count : int

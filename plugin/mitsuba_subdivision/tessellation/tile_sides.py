@@ -47,22 +47,11 @@ def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) ->
 
 @dataclass(frozen=True, eq=False)
 class SidePoints:
-    """Points on one side of their patches.
+    """Points on one side of their patches."""
 
-    Attributes
-    ----------
-    on : (n,) int64
-        Which of them lie there.
-    edge : (n,) int32
-        Half-edge of the element along that side; for a spoke, in whose middle it begins.
-    at : (n,) int32
-        Position along the half-edge, or along the spoke.
-    is_spoke : bool
-    """
-
-    on: IntArray
-    edge: IntArray
-    at: IntArray
+    on: IntArray  # (n,) int64: which of them lie there
+    edge: IntArray  # (n,) int32: half-edge of the element along that side; for a spoke, in whose middle it begins
+    at: IntArray  # (n,) int32: position along the half-edge, or along the spoke
     is_spoke: bool
 
 
@@ -98,26 +87,13 @@ def _of_patch_at_corner(t: Topology, side: int, corner: IntArray, along: IntArra
 
 
 class SideLines(NamedTuple):
-    """On which lines the sides of tiles lie, and where; side by side of each tile.
+    """On which lines the sides of tiles lie, and where; side by side of each tile."""
 
-    Attributes
-    ----------
-    line : (n,) int64
-    low : (n,) int32
-        From where on along the line.
-    halvings : (n,) int32
-        How often `EDGE` is halved to their length.
-    is_backward : (n,) bool
-        Whether they lead towards lower positions.
-    half_edge : (n,) int32
-        Of an element, along which they lie; -1 elsewhere.
-    """
-
-    line: IntArray
-    low: IndexArray
-    halvings: IndexArray
-    is_backward: NDArray[np.bool_]
-    half_edge: IndexArray
+    line: IntArray  # (n,) int64
+    low: IndexArray  # (n,) int32: from where on along the line
+    halvings: IndexArray  # (n,) int32: how often `EDGE` is halved to their length
+    is_backward: NDArray[np.bool_]  # (n,) bool: whether they lead towards lower positions
+    half_edge: IndexArray  # (n,) int32: of an element, along which they lie; -1 elsewhere
 
 
 def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:

@@ -21,32 +21,23 @@ class Tiles:
     """Parts of patches, each with a grid of its own.
 
     A tile is a copy of its patch's domain, ``2^depth`` times smaller.
-
-    Attributes
-    ----------
-    corner : (t,) int32
-        Corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`.
-    depth : (t,) int8
-    origin : (t, 2) int32
-        Where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``.
-    is_flipped : (t,) bool
-        Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is then
-        at ``origin + 1``.
-    halvings : (t,) int8
-        How often an edge of the cage is halved to a tile's side; around extraordinary points, an edge of a ring.
-    rates : (t, 2) int32
-        Segments along u and v; over triangles both are the same.
-    sides : (t, m) int16
-        Least segments on each side: more than the rates where an outline may run along a border of the mesh, which the
-        boundary of the cage and the sides of creases are. 0 inside. Spans have them instead, see `Spans`.
     """
 
+    # (t,) int32: corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`
     corner: IndexArray
-    depth: NDArray[np.int8]
+    depth: NDArray[np.int8]  # (t,) int8
+    # (t, 2) int32: where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``
     origin: IndexArray
+    # (t,) bool: whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0,
+    # 0) is then at ``origin + 1``.
     is_flipped: NDArray[np.bool_]
+    # (t,) int8: how often an edge of the cage is halved to a tile's side; around extraordinary points, an edge of a
+    # ring
     halvings: NDArray[np.int8]
-    rates: IndexArray
+    rates: IndexArray  # (t, 2) int32: segments along u and v; over triangles both are the same
+    # (t, m) int16: least segments on each side: more than the rates where an outline may run along a border of the
+    # mesh, which the boundary of the cage and the sides of creases are. 0 inside. Spans have them instead, see
+    # `Spans`.
     sides: NDArray[np.int16]
 
     def __len__(self) -> int:

@@ -34,7 +34,6 @@ def uniform_table(
 
     Parameters
     ----------
-    patches : PatchTable
     rate : int
         Segments per edge, at least 1.
     control_of_vertex : (n_v,) int64, optional
@@ -65,13 +64,7 @@ _TABLES: Shared[VertexTable] = Shared()
 
 
 def _checked_grid(patches: PatchTable, rate: int) -> UniformGrid:
-    """The grid over the elements of some patches, which is known to fit into buffers and memory.
-
-    Raises
-    ------
-    ValueError, MemoryError
-        As `uniform_table`.
-    """
+    """The grid over the elements of some patches, which is known to fit into buffers and memory."""
     checked = checked_rate(rate)
     grid = _grid(patches, checked)
     if grid.vertex_count > MOST_VERTICES:

@@ -29,26 +29,14 @@ class GridPart:
 
     In every patch, the samples of the part are successive vertices. Where patches share samples, at corners and along
     edges, only one of the patches is in the part: the one that evaluates them.
-
-    Attributes
-    ----------
-    samples : (S,) int64
-        Indices into the parameters of `UniformGrid.layout`.
-    patches : (P,) int32
-        Ascending.
-    first_vertex : (P,) uint32
-        Vertex of the first sample in each patch; sample ``samples[i]`` is vertex ``first_vertex + i``.
-    corners : (P,) int32
-        A corner of each patch's element, not always the one that the patch begins at.
-    uv : (S, 2) float64
-        The samples' parameters, seen from these corners.
     """
 
-    samples: IntArray
-    patches: IntArray
+    samples: IntArray  # (S,) int64: indices into the parameters of `UniformGrid.layout`
+    patches: IntArray  # (P,) int32: ascending
+    # (P,) uint32: vertex of the first sample in each patch; sample ``samples[i]`` is vertex ``first_vertex + i``
     first_vertex: IntArray
-    corners: IntArray
-    uv: FloatArray
+    corners: IntArray  # (P,) int32: A corner of each patch's element, not always the one that the patch begins at
+    uv: FloatArray  # (S, 2) float64: the samples' parameters, seen from these corners
 
     @classmethod
     def of(

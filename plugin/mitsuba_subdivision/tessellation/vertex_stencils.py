@@ -24,26 +24,15 @@ class ClassStencils:
     Let ``C`` be the control points and ``o = C[controls[p, 0]]``. Then sample ``s`` of patch ``p`` is the point
     ``o + weights[0, s] @ (C[controls[p]] - o)``, with the tangents ``weights[1, s] @ (C[controls[p]] - o)`` and
     ``weights[2, s] @ (C[controls[p]] - o)``.
-
-    Attributes
-    ----------
-    weights : (3, S, K) float64
-        Rows of the first sum to one, of the others to zero.
-    controls : (P, K) uint32
-        Control points of each patch's one-ring.
-    first_control : int
-        Index of the first of these in `VertexTable.controls`, where the others follow, column by column.
-    uv : (S, 2) float64
-        The samples' parameters in each patch.
-    product : ProductPatch or None
-        For a regular patch whose basis is a product: the same surface by one-dimensional weights. Its tangents span the
-        same plane with the same outside, but may be turned or of other lengths.
     """
 
-    weights: FloatArray
-    controls: NDArray[np.uint32]
+    weights: FloatArray  # (3, S, K) float64: rows of the first sum to one, of the others to zero
+    controls: NDArray[np.uint32]  # (P, K) uint32: control points of each patch's one-ring
+    # Index of the first of these in `VertexTable.controls`, where the others follow, column by column
     first_control: int
-    uv: FloatArray
+    uv: FloatArray  # (S, 2) float64: the samples' parameters in each patch
+    # For a regular patch whose basis is a product: the same surface by one-dimensional weights. Its tangents span the
+    # same plane with the same outside, but may be turned or of other lengths.
     product: ProductPatch | None
 
     @classmethod
@@ -67,31 +56,15 @@ class VertexStencils:
 
     A run has successive vertices: some samples of one patch. All runs of a kind have the same samples, on different
     patches of one class.
-
-    Attributes
-    ----------
-    classes : tuple of ClassStencils
-    class_of_kind : (k,) int64
-        Index into ``classes``; ascending.
-    counts : (k,) int64
-        Samples in each run of a kind.
-    samples : (n,) int64 or int32
-        Indices of the samples in their class, for all kinds, concatenated.
-    run_counts : (k,) int64
-        Number of runs of each kind; they are consecutive.
-    patch : (r,) int32
-        Of each run, counted from the first patch of the class.
-    first_vertex : (r,) uint32
-        Vertex of the first sample of each run; those of the others follow.
     """
 
     classes: tuple[ClassStencils, ...]
-    class_of_kind: IntArray
-    counts: IntArray
-    samples: IntArray
-    run_counts: IntArray
-    patch: IndexArray
-    first_vertex: NDArray[np.uint32]
+    class_of_kind: IntArray  # (k,) int64: index into ``classes``; ascending
+    counts: IntArray  # (k,) int64: samples in each run of a kind
+    samples: IntArray  # (n,) int64 or int32: indices of the samples in their class, for all kinds, concatenated
+    run_counts: IntArray  # (k,) int64: number of runs of each kind; they are consecutive
+    patch: IndexArray  # (r,) int32: of each run, counted from the first patch of the class
+    first_vertex: NDArray[np.uint32]  # (r,) uint32: vertex of the first sample of each run; those of the others follow
 
     @property
     def starts(self) -> IntArray:

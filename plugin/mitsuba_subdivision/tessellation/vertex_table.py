@@ -37,29 +37,20 @@ class VertexTable:
 
     A vertex is a limit stencil of a class of patches times the control points of one of these patches. Weights do not
     depend on where control points are; of an adaptive tessellation, the triangles do.
-
-    Attributes
-    ----------
-    control_count, patch_count : int
-    grid : Grid
-        Numbers the vertices and triangles, and says where on the surface they lie.
-    vertex_stencils : VertexStencils
-        The stencil and the patch of each vertex.
-    controls : (n,) uint32
-        `ClassStencils.controls` of all classes: control points or, if there is a ``refinement``, refined ones.
-    copies : (2, n) int64
-        Vertices that take their position from another one, and that one. Along a crease, either side has vertices of
-        its own, with normals of their own but the same positions, bit by bit.
-    refinement : (n, control_count) sparse array or None
-        Makes refined control points of the cage's, where the patches are those of the cage refined once.
     """
 
     control_count: int
     patch_count: int
-    grid: Grid
-    vertex_stencils: VertexStencils
+    grid: Grid  # Numbers the vertices and triangles, and says where on the surface they lie
+    vertex_stencils: VertexStencils  # The stencil and the patch of each vertex
+    # (n,) uint32: `ClassStencils.controls` of all classes: control points or, if there is a ``refinement``, refined
+    # ones
     controls: NDArray[np.uint32]
+    # (2, n) int64: vertices that take their position from another one, and that one. Along a crease, either side has
+    # vertices of its own, with normals of their own but the same positions, bit by bit.
     copies: IntArray
+    # (n, control_count) sparse array or None: makes refined control points of the cage's, where the patches are those
+    # of the cage refined once
     refinement: sparse.csr_array | None = None
 
     @property
@@ -237,23 +228,13 @@ class VertexMatrices(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """Vertices on patches with as many control points; vertices and patches come last, so that NumPy's loops are long.
+    """Vertices on patches with as many control points. Vertices and patches come last: NumPy's loops are then long."""
 
-    Attributes
-    ----------
-    vertices : (n,) int64
-    weights : (3, K, S) float64
-        Of some samples.
-    controls : (K, p) uint32
-        Of some patches.
-    sample : (n,) int64 or None
-        Of each vertex, which has a column of ``controls`` of its own. If None, there is a vertex for each sample on
-        each of the patches: those of the first sample come first.
-    """
-
-    vertices: IntArray
-    weights: FloatArray
-    controls: NDArray[np.uint32]
+    vertices: IntArray  # (n,) int64
+    weights: FloatArray  # (3, K, S) float64: of some samples
+    controls: NDArray[np.uint32]  # (K, p) uint32: of some patches
+    # (n,) int64 or None: of each vertex, which has a column of ``controls`` of its own. If None, there is a vertex
+    # for each sample on each of the patches: those of the first sample come first.
     sample: IntArray | None
 
     @property

@@ -61,7 +61,6 @@ def trial_problem(variant: Variant, attach: Callable[[mi.Mesh, Trial], None]) ->
 
     Parameters
     ----------
-    variant : module
     attach : callable
         Hooks a shape's functions.
     """

@@ -101,10 +101,6 @@ class Trampoline:
     equal : (2,) tuple of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
 
-    Attributes
-    ----------
-    address : int
-
     Raises
     ------
     OSError
@@ -133,10 +129,6 @@ class TaggingTrampoline:
     ----------
     original, function, fail
         As for `Trampoline`; when Python is called, no object exists yet.
-
-    Attributes
-    ----------
-    address : int
     """
 
     def __init__(
