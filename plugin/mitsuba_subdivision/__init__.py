@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from . import fit as fit
     from .cage import Attribute, CageError, CageWarning, ControlCage
     from .device_arrays import upload
-    from .evaluation.limit_stencil import limit_stencil
+    from .evaluation.element import limit_stencil
     from .evaluation.scheme_laws import check_scheme
     from .examples import example_file
     from .fit.views import loss_of_views
@@ -85,7 +85,7 @@ _MODULES = {
     "VertexMatrices": "tessellation",
     "check_scheme": "evaluation.scheme_laws",
     "example_file": "examples",
-    "limit_stencil": "evaluation.limit_stencil",
+    "limit_stencil": "evaluation.element",
     "loss_of_views": "fit.views",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "schemes",

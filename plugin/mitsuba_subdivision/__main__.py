@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextvars
 import os
 import signal
@@ -10,9 +11,11 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+from . import __version__
 from .cage import CageWarning
-from .commands.command_line import parsed
-from .messages import USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
+from .commands import cage, compare, doctor, figure, render
+from .commands.arguments import CommandParser
+from .messages import PROGRAM, USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
 from .whole_file import remove_unfinished
 
 INTERRUPTED = 130
@@ -91,6 +94,38 @@ def interruptible(work: Callable[[], T]) -> T:
             # The error's traceback would keep alive the objects that the work used.
             found.clear()
     return found["result"]
+
+
+def parser() -> CommandParser:
+    """The parser of the whole command line."""
+    program = CommandParser(
+        prog=PROGRAM,
+        description="Exact subdivision surfaces for Mitsuba 3.",
+        allow_abbrev=False,
+        epilog=f'"{PROGRAM} COMMAND --help" describes a command.',
+    )
+    program.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    program.set_defaults(error_status=1)
+    commands = program.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for module in (figure, render, cage, compare, doctor):
+        module.add_parser(commands)
+    return program
+
+
+def parsed(arguments: list[str] | None) -> argparse.Namespace:
+    """The options of a command line, or of this process.
+
+    Raises
+    ------
+    SystemExit
+        If they are wrong, or ask for help or the version.
+    """
+    program = parser()
+    options, unknown = program.parse_known_args(arguments)
+    if unknown:
+        # The command's own parser reports them, with its usage and exit status.
+        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+    return options
 
 
 if __name__ == "__main__":

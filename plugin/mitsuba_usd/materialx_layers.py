@@ -9,13 +9,13 @@ that somebody else may have open.
 
 from __future__ import annotations
 
+import importlib.util
 import posixpath
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsuba_subdivision.cage import warn
-
-from .materialx_library import has_materialx, library
 
 if TYPE_CHECKING:
     import MaterialX
@@ -28,6 +28,11 @@ _TYPES = {
     "vector2": "Float2", "vector3": "Float3", "vector4": "Float4", "color3": "Color3f", "color4": "Color4f",
     "matrix33": "Matrix3d", "matrix44": "Matrix4d",
 }  # fmt: skip
+
+# Files that other renderers' shaders are in are left: only definitions and graphs are read.
+_FOLDERS = ("stdlib", "pbrlib", "bxdf", "cmlib", "nprlib")
+# What is said where the package is missing.
+MISSING = 'MaterialX materials are ignored, as the package materialx is missing; pip install "mitsuba-subdivision[usd]"'
 
 
 def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
@@ -287,3 +292,33 @@ def _sdf_type(kind: str) -> Sdf.ValueTypeName:
 def _prim_name(name: str) -> str:
     """Name of a prim; MaterialX has colons for namespaces."""
     return name.replace(":", "__")
+
+
+def has_materialx() -> bool:
+    """Whether the package materialx is there."""
+    return importlib.util.find_spec("MaterialX") is not None
+
+
+@cache
+def library() -> MaterialX.Document:
+    """Definitions of all nodes of the standard libraries."""
+    import MaterialX
+
+    document = MaterialX.createDocument()
+    path = MaterialX.getDefaultDataSearchPath()
+    folders = [f"{root}/{name}" for root in MaterialX.getDefaultDataLibraryFolders() for name in _FOLDERS]
+    MaterialX.loadLibraries(folders, path, document)
+    return document
+
+
+def numbers(text: str, kind: str) -> float | list[float] | str:
+    """Value of MaterialX, of a type, as numbers; what is no number is an option."""
+    if kind == "boolean":
+        return float(text == "true")
+    try:
+        found = [float(each) for each in text.replace(",", " ").split()]
+    except ValueError:
+        return text
+    if kind in ("string", "filename") or not found:
+        return text
+    return found[0] if len(found) == 1 else found

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
-from .materialx_library import MISSING, has_materialx
+from .materialx_layers import MISSING, has_materialx
 from .stage_networks import NetworkReader, note_unknown_inputs, source_of
 from .stage_warnings import StageWarnings
 from .surface_models import MODELS, PREVIEW, left_out

@@ -12,7 +12,7 @@ from mitsuba_subdivision.srgb import decoded
 from numpy.typing import NDArray
 
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
-from .materialx_library import library, numbers
+from .materialx_layers import library, numbers
 from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
 from .stage_warnings import StageWarnings
 from .texture_image import UDIM

@@ -35,7 +35,7 @@ from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .limit_surfaces import Surfaces
 from .loaded_shapes import LoadedShapes
-from .materialx_library import library
+from .materialx_layers import library
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
 from .scene_entries import SceneEntries
 from .sensors import NO_BLUR, sensor

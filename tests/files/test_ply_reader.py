@@ -8,10 +8,9 @@ import threading
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
-from mitsuba_subdivision.cage.equality import same
+from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
-from mitsuba_subdivision.files.ply_names import grouped
-from mitsuba_subdivision.files.ply_reader import read_ply
+from mitsuba_subdivision.files.ply_reader import grouped, read_ply
 from mitsuba_subdivision.files.ply_writer import write_polygons
 
 plyfile = pytest.importorskip("plyfile")

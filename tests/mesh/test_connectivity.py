@@ -23,7 +23,7 @@ def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
 def runs(request, monkeypatch):
     """Long arrays are worked on in runs."""
     if request.param:
-        monkeypatch.setattr("mitsuba_subdivision.mesh.chunks.CHUNK_LENGTH", request.param)
+        monkeypatch.setattr("mitsuba_subdivision.mesh.ragged.CHUNK_LENGTH", request.param)
 
 
 @pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
@@ -53,7 +53,7 @@ def test_walks_go_on_from_where_they_arrived():
 
 def test_many_quadrilaterals_are_tessellated_without_tables_of_neighbours(monkeypatch):
     """They would be a third of what a large cage takes."""
-    monkeypatch.setattr("mitsuba_subdivision.mesh.chunks.CHUNK_LENGTH", 4 * 8 * 6 - 1)
+    monkeypatch.setattr("mitsuba_subdivision.mesh.ragged.CHUNK_LENGTH", 4 * 8 * 6 - 1)
     cage = torus(8, 6)
     LimitSurface(cage).sampling(3)
     tables = {"next", "prev", "face", "_turned"}

@@ -7,7 +7,7 @@ import mitsuba as mi
 import pytest
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import subdivision_shape
-from mitsuba_subdivision.shapes.garbage_collection import paused_collection
+from mitsuba_subdivision.shapes.device_state import paused_collection
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 

@@ -16,10 +16,9 @@ from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
-from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, framed, outermost
+from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, VIEWS, framed, outermost
 from mitsuba_subdivision.studio.model import CageWire
 from mitsuba_subdivision.studio.studio_entries import sampler
-from mitsuba_subdivision.studio.view import VIEWS
 
 CAGES = scene_path("human").parent / "cages"
 # How far outside the margin rounding may put a point, in parts of the picture.

@@ -3,7 +3,7 @@
 import numpy as np
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.mesh import chunks
+from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.tessellation import tile_choice
 from mitsuba_subdivision.tessellation.tile_choice import _interleaved
 from tessellation.test_adaptive_grid import table_of
@@ -35,8 +35,8 @@ def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
 def test_tessellations_do_not_depend_on_the_chunks_that_fit_a_cache(monkeypatch):
     named = surface_named("mixed torus")
     tables = []
-    for length in (chunks.CHUNK_LENGTH, 5):
-        monkeypatch.setattr(chunks, "CHUNK_LENGTH", length)
+    for length in (ragged.CHUNK_LENGTH, 5):
+        monkeypatch.setattr(ragged, "CHUNK_LENGTH", length)
         # Tables of its own: a surface keeps what it has made.
         surface = LimitSurface(named.cage, named.scheme)
         adaptive = table_of(surface)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
-from mitsuba_usd.materialx_library import library
+from mitsuba_usd.materialx_layers import library
 from mitsuba_usd.stage_scenes import StageReader
 
 pytest.importorskip("MaterialX")

@@ -10,7 +10,7 @@ from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_usd import surface_models
 from mitsuba_usd.bsdfs import Bsdfs, interior
 from mitsuba_usd.contents import ShapeContents, TextureContents
-from mitsuba_usd.materialx_library import library, numbers
+from mitsuba_usd.materialx_layers import library, numbers
 from mitsuba_usd.materialx_nodes import node
 from mitsuba_usd.stage_warnings import StageWarnings
 from mitsuba_usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance

@@ -10,7 +10,7 @@ import OpenEXR
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
-from mitsuba_subdivision.cage.equality import same
+from mitsuba_subdivision.cage.contents import same
 from mitsuba_usd import materialx_layers, stage_meshes
 from mitsuba_usd.stage_walk import read_stage
 from mitsuba_usd.texture_image import read_texture_image

@@ -1,9 +1,8 @@
 """Control cages: validation, tags, attributes, what files hold of them, and named examples."""
 
 from .attributes import Attribute
-from .contents import CageContents
+from .contents import CageContents, same, same_topology
 from .control_cage import ControlCage
-from .equality import same, same_topology
 from .errors import CageError, CageWarning, in_digits, shortened, warn
 from .source import CageSource
 from .validation import require_range

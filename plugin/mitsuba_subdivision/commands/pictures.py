@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageWarning, warn
+from ..studio.camera import DEFAULT_VIEW, VIEWS
 from ..studio.scene_parts import SceneParts
-from ..studio.view import DEFAULT_VIEW, VIEWS
 from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..files.formats import FORMATS
 from ..messages import print_remark, print_result
 from ..shapes.parameter_table import SHADINGS
-from ..studio.view import DEFAULT_VIEW, UP_AXES, VIEWS
+from ..studio.camera import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..whole_file import require_writable, whole_file
 from .arguments import add_cage_options, add_variant, finite, positive, seed, set_variant
 from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes

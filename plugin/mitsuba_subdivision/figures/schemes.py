@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .figure_scenes import draw_row
 from .output import FigureOptions
-from .row_of_renders import draw_row
 
 TITLES = {"catmull_clark": "Catmull-Clark", "doo_sabin": "Doo-Sabin", "loop": "Loop"}
 

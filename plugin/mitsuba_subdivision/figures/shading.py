@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .figure_scenes import draw_row
 from .output import FigureOptions
-from .row_of_renders import draw_row
 
 PANELS = (("vertex", 2), ("vertex", 8), ("exact", 2))
 TITLES = {"vertex": "normals of vertices", "exact": "exact at every hit"}

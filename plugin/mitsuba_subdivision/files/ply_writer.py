@@ -15,7 +15,7 @@ from ..cage.rules import RULES
 from ..mesh import ragged
 from ..whole_file import whole_file
 from .losses import warn_of_losses
-from .ply_names import MATERIAL, NORMAL, POSITION, TEXCOORDS, columns, is_possible
+from .ply_reader import MATERIAL, NORMAL, POSITION, TEXCOORDS, columns, is_possible
 
 _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}
 

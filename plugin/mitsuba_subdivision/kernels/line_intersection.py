@@ -11,10 +11,9 @@ import drjit as dr
 from .array_types import ArrayTypes
 from .domain_map import turned
 from .element_walk import ElementWalk, Location
-from .newton import LONGEST_STEP, STEP_TOLERANCE, over, rounding, step_along
 from .piece_kernel import PatchValues
 from .types import Float, Index, Mask, Vector3
-from .vectors import dot
+from .vectors import LONGEST_STEP, STEP_TOLERANCE, dot, over, rounding, step_along
 
 if TYPE_CHECKING:
     from .displacement import DisplacedPiece

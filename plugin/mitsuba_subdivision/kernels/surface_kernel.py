@@ -18,11 +18,10 @@ from .coefficient_map import CoefficientMap
 from .element_walk import ElementWalk, Location
 from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
 from .nearest_location import NearestLocation, NearestPoints
-from .newton import over, rounding
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
-from .vectors import cross, unit
+from .vectors import cross, over, rounding, unit
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplingCells

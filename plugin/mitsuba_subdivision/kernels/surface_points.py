@@ -8,9 +8,8 @@ import drjit as dr
 
 from .affine_map import AffineMap
 from .element_walk import Location
-from .newton import over
 from .types import Float, Vector3
-from .vectors import unit
+from .vectors import over, unit
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from typing import Any, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from . import chunks, ragged
-from .chunks import chunks_of, first_indices, gathered
+from . import ragged
+from .ragged import chunks_of, first_indices, gathered
 from .semi_sharpness import SemiSharpness
 
 # Integers of any width; docstrings name it where it matters.
@@ -264,7 +264,7 @@ class Topology:
 
     @cached_property
     def _is_computed(self) -> bool:
-        return self.common_size == 4 and self.half_edge_count > chunks.CHUNK_LENGTH
+        return self.common_size == 4 and self.half_edge_count > ragged.CHUNK_LENGTH
 
     @overload
     def face_of(self, half_edges: np.integer | int) -> np.integer | int: ...

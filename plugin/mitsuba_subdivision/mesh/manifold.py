@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .chunks import chunks_of, gathered
 from .connectivity import IntArray, Topology
+from .ragged import chunks_of, gathered
 
 # Faces with more corners than this are checked by sorting, vertices with more faces by pointer doubling.
 FEW_CORNERS = 8

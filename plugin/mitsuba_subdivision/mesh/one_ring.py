@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .chunks import chunks_of
 from .connectivity import IntArray, Topology
 from .glued_faces import GluedFaces
+from .ragged import chunks_of
 from .semi_sharpness import SemiSharpness
 from .signature import (
     NEAR_FACES,

@@ -24,6 +24,9 @@ Number = TypeVar("Number", int, IntArray)
 # Faces of a fan between two borders that matter to any one of them, see `TaggedFan.near`.
 NEAR_FACES = 64
 
+# The half-edges at which the faces of a `TaggedFan` begin: those behind, then those ahead.
+FanHalfEdges = tuple[list[int], list[int]]
+
 
 class TaggedFan(NamedTuple):
     """Faces around a vertex on a border, with a rule of its own or semi-sharp features, as one of them sees the others.
@@ -211,10 +214,6 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
     if semi is None:
         return smooth
     return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
-
-
-# The half-edges at which the faces of a `TaggedFan` begin: those behind, then those ahead.
-FanHalfEdges = tuple[list[int], list[int]]
 
 
 def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:

@@ -10,11 +10,10 @@ if TYPE_CHECKING:
     from .area_samples import AreaSamples, SamplingCells, SurfaceAreas, uniform_locations
     from .channel import Channel, ChannelLayout, LinearChannel, PatchSampler, SubdividedChannel, contracts_alike
     from .closest_points import ClosestPoints, ClosestPointSearch
-    from .element_bounds import ElementBounds
     from .energies import energy_matrix, gradients, hessians
     from .patch_table import PatchClass, PatchTable
     from .piece_table import PieceTable
-    from .polynomial_pieces import SurfacePieces
+    from .polynomial_pieces import ElementBounds, SurfacePieces
     from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
 
 __all__ = [
@@ -51,7 +50,7 @@ __getattr__ = deferred(
         "ChannelLayout": "channel",
         "ClosestPointSearch": "closest_points",
         "ClosestPoints": "closest_points",
-        "ElementBounds": "element_bounds",
+        "ElementBounds": "polynomial_pieces",
         "LinearChannel": "channel",
         "PatchClass": "patch_table",
         "PatchSampler": "channel",

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.chunks import gathered
 from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.ragged import gathered
 from ..mesh.signature import NEAR_FACES, near_behind
 from ..schemes.domain import FloatArray
 

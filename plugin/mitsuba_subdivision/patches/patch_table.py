@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.chunks import gathered
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
+from ..mesh.ragged import gathered
 from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
+
+# Tessellations and exact shading refine the same control values.
+_REFINEMENTS: Shared[sparse.csr_array] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +329,3 @@ class RefinedPatches:
         # By `splits_corners` of the scheme, face h of the refined cage lies at half-edge h of the cage, and
         # begins there.
         return self.table.topology.face_of(patch_class.corners)
-
-
-# Tessellations and exact shading refine the same control values.
-_REFINEMENTS: Shared[sparse.csr_array] = Shared()

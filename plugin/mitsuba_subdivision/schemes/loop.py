@@ -28,6 +28,9 @@ _ACROSS_EDGE = {
 }  # fmt: skip
 _BESIDE_CORNER = {(4, 0, 0): 1, (3, 1, 0): 2}
 
+# Twelve polynomials: for each monomial w^i u^j v^k, their coefficients.
+Polynomials = dict[tuple[int, int, int], FloatArray]
+
 
 class Loop(Scheme):
     """Loop subdivision of triangle meshes.
@@ -147,10 +150,6 @@ def _edge_names(topology: Topology) -> IntArray | None:
     first, last = 2 * t.edge.astype(np.int64) + ~is_lowest, 2 * t.edge.astype(np.int64) + is_lowest
     corners = np.stack([first, 2 * n_e + half_edges, last[t.prev]], axis=1)
     return np.concatenate([corners.ravel(), 2 * n_e + t.next])
-
-
-# Twelve polynomials: for each monomial w^i u^j v^k, their coefficients.
-Polynomials = dict[tuple[int, int, int], FloatArray]
 
 
 def _box_spline() -> Polynomials:

@@ -7,8 +7,10 @@ So nothing is read back while it records, checks of values among it, and all tab
 
 from __future__ import annotations
 
+import gc
 import weakref
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from types import MethodType, SimpleNamespace
 from typing import Any
@@ -16,11 +18,25 @@ from typing import Any
 import drjit as dr
 
 from ..mesh.shared import SharedArray
-from .garbage_collection import paused_collection
 
 # Packages whose objects hold Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
 _PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
+
+
+@contextmanager
+def paused_collection() -> Iterator[None]:
+    """Pause the collector; a context manager and a decorator.
+
+    A collector that was disabled stays disabled. With overlapping threads, it runs again at the latest when all end.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def is_recording() -> bool:

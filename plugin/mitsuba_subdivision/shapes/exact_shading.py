@@ -18,12 +18,11 @@ from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.element_walk import Location
 from ..kernels.line_intersection import ON_LINE, Lines
-from ..kernels.newton import over
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
 from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
-from ..kernels.vectors import added, dot
+from ..kernels.vectors import added, dot, over
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray

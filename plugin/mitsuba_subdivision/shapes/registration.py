@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..llvm import warn_if_unusable
 from ..variants import variant_module, variant_name
-from .garbage_collection import paused_collection
+from .device_state import paused_collection
 
 PLUGIN_NAME = "subdivision"
 # In every variant, Mitsuba looks up the kind of a plugin in this variant. It needs the kind because `load_dict` merges

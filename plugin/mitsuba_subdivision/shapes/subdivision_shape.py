@@ -17,14 +17,12 @@ from ..surface import TEXCOORDS
 from ..variants import Variant
 from .attribute_parameters import mesh_attributes, mesh_name
 from .cage_attributes import PREFIX, CageAttributes
-from .device_state import DeviceState, is_recording
-from .garbage_collection import paused_collection
+from .device_state import DeviceState, is_recording, paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
 from .nesting import on_shallow_stack
-from .parameter_table import errors_about
+from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
-from .plugin_page import plugin_page
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .triangles import Triangles
 from .vertex_choice import vertices_of

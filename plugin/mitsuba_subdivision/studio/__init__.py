@@ -2,6 +2,8 @@
 
 from ..regression.scene import LoadedScene
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
+from .cage_scenes import studio_scene
+from .camera import DEFAULT_VIEW, View
 from .denoising import render_denoised
 from .model import frame_table
 from .picture import (
@@ -15,9 +17,7 @@ from .picture import (
     triangles_for,
 )
 from .polygon_mesh import PolygonMesh, box_corners, points_at, with_meshes
-from .scene import studio_scene
 from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, LIGHTS, Look, sampler, studio, variant_in_use
-from .view import DEFAULT_VIEW, View
 
 __all__ = [
     "DEFAULT_SIZE",

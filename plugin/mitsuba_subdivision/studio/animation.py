@@ -20,10 +20,9 @@ from ..cage import CageError, CageWarning
 from ..device_arrays import upload
 from ..regression.scene import LoadedScene, load_scene
 from ..variants import SceneNode
-from .camera import outermost
+from .camera import View, outermost, studio_axes, turned
 from .polygon_mesh import points_at, with_meshes
 from .studio_entries import RIG
-from .view import View, studio_axes, turned
 
 C = TypeVar("C")
 

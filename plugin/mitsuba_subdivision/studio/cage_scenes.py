@@ -16,18 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import CageError, CageWarning, ControlCage
-from ..cage.contents import CageContents
-from ..cage.equality import same_topology
+from ..cage.contents import CageContents, same_topology
 from ..cage.errors import warn
 from ..files.formats import read_file
 from ..regression.scene import LoadedScene
 from ..shapes.attribute_parameters import mesh_name
 from ..variants import SceneNode
-from .animation import FrameFiles, load_quietly, set_parameters
+from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
+from .camera import DEFAULT_VIEW, View
 from .model import Model
 from .obj_materials import material_bsdf, material_emitter
-from .studio_entries import DEFAULT_SIZE, Look, studio
-from .view import View
+from .picture import shading_for
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, Look, studio, variant_in_use
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
@@ -249,3 +249,61 @@ def _material(cage: ControlCage, checker: bool = False) -> SceneNode:
     clay = {"type": "principled", "base_color": colour, "roughness": 0.42, "specular": 0.5}
     # Open surfaces are seen from both sides.
     return {"type": "twosided", "bsdf": clay}
+
+
+def studio_scene(
+    model: ControlCage | str | Path,
+    *,
+    prim: str | None = None,
+    time: float | None = None,
+    scheme: str | None = None,
+    view: View = DEFAULT_VIEW,
+    up: str | None = None,
+    size: tuple[int, int] = DEFAULT_SIZE,
+    spp: int = DEFAULT_SPP,
+    rate: int | None = None,
+    shading: str = "auto",
+    checker: bool = False,
+    cage: bool = False,
+) -> SceneNode:
+    """Scene of one model in a neutral studio, for ``mi.load_dict``; a variant of Mitsuba must be set.
+
+    Parameters
+    ----------
+    model : ControlCage, str or Path
+        A cage, or an OBJ, PLY or USD file.
+    prim, time, scheme : optional
+        As for `ControlCage.from_file`.
+    view : str or (azimuth, elevation)
+        "front", "side", "back", "top", "three-quarter", or angles in degrees: azimuth 0 is the front, which is -y where
+        z is up, and +z where y is up; azimuth 90 is +x; elevation 90 is straight from above.
+    up : "y" or "z", optional
+        Axis that points up. By default that of a USD file; y for OBJ files, z for PLY files and cages in memory.
+    size : (width, height)
+    spp : int
+        Samples per pixel.
+    rate : int, optional
+        Segments per edge of the cage. By default as many as a picture needs: with exact shading, adaptive ones that put
+        outlines within a tenth of a pixel as this camera sees them; else fewer for larger cages.
+    shading : "auto", "vertex" or "exact"
+        If the first is not exact, a line on standard error says why.
+    checker : bool
+        Whether texture coordinates are shown as a checkerboard.
+    cage : bool
+        Whether the control cage is drawn over the surface.
+
+    Returns
+    -------
+    dict
+        The model is the entry "surface", the drawn cage "cage"; the others are those of the studio.
+
+    Raises
+    ------
+    CageError, OSError
+        As `ControlCage.from_file` does; or if ``checker`` is set and there are no texture coordinates.
+    ValueError
+        If the view, the axis or the size is invalid.
+    """
+    shading = shading_for(variant_in_use(), {"shading": shading})
+    look = Look(view, size, spp, up, rate, shading, checker, cage)
+    return StillPicture(CageScenes(model, look, prim=prim, time=time, scheme=scheme)).scene

@@ -17,7 +17,7 @@ import numpy as np
 from ..cage import CageError, CageWarning, ControlCage
 from ..cage.contents import CageContents
 from ..cage.rules import RULES
-from ..files import ply_names, usd_values
+from ..files import ply_reader, usd_values
 from ..files.formats import write_file
 from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
 from ..variants import SceneNode
@@ -132,7 +132,7 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     if (
         not has_tags
         and all(each.interpolation == "vertex" for each in data.values())
-        and all(map(ply_names.is_possible, contents.attributes))
+        and all(map(ply_reader.is_possible, contents.attributes))
         and importlib.util.find_spec("plyfile")
     ):
         return ".ply"

@@ -14,9 +14,8 @@ from ..cage import ControlCage
 from ..cage.errors import in_digits, warn
 from ..cage.source import CageSource
 from ..variants import SceneNode
-from .camera import FIELD_OF_VIEW, Camera, framed
+from .camera import DEFAULT_VIEW, FIELD_OF_VIEW, Camera, View, angles_of, framed, studio_axes, turned
 from .polygon_mesh import box_corners
-from .view import DEFAULT_VIEW, View, angles_of, studio_axes, turned
 
 DEFAULT_SIZE = (640, 480)
 DEFAULT_SPP = 64

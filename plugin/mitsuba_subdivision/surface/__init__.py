@@ -1,6 +1,5 @@
 """The limit surface of a control cage."""
 
-from .limit_surface import TEXCOORDS, LimitSurface
-from .samples import SurfaceSamples
+from .limit_surface import TEXCOORDS, LimitSurface, SurfaceSamples
 
 __all__ = ["TEXCOORDS", "LimitSurface", "SurfaceSamples"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numbers
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -21,7 +21,6 @@ from ..schemes import Scheme
 from ..schemes.domain import FloatArray
 from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
-from .samples import SurfaceSamples
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -416,7 +415,7 @@ class LimitSurface:
 
     @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        from ..patches.element_bounds import element_bounds
+        from ..patches.polynomial_pieces import element_bounds
 
         return element_bounds(self._all_pieces, self.patches.elements)
 
@@ -636,3 +635,43 @@ class LimitSurface:
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
         return samples.p[table.weld_target], samples.n
+
+
+class SurfaceSamples(NamedTuple):
+    """Points of a limit surface.
+
+    Attributes
+    ----------
+    p : (s, 3)
+        Points, in the cage's space.
+    dp_du, dp_dv : (s, 3)
+        Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
+        tangents along the u and the v edge, of arbitrary length.
+    n : (s, 3)
+        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. A surface without a
+        tangent plane at a vertex has a normal by convention there: beside many faces on a border, the limit along the
+        border; at the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero
+        where the tangents are parallel or zero but for rounding: on the fold between two faces glued back to back, at
+        sharp vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
+        The published forms "power" and "stam" return what they compute.
+    level : (s,) int64
+        The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
+        in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
+    d2p_duu, d2p_duv, d2p_dvv : (s, 3) or None
+        Second derivatives, if requested. Not a number at an extraordinary point itself.
+    gaussian_curvature, mean_curvature : (s,) or None
+        If requested. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
+        extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number,
+        because the curvature is unbounded or depends on the direction. Also not a number where there is no normal.
+    """
+
+    p: FloatArray
+    dp_du: FloatArray
+    dp_dv: FloatArray
+    n: FloatArray
+    level: NDArray[np.int64]
+    d2p_duu: FloatArray | None = None
+    d2p_duv: FloatArray | None = None
+    d2p_dvv: FloatArray | None = None
+    gaussian_curvature: FloatArray | None = None
+    mean_curvature: FloatArray | None = None

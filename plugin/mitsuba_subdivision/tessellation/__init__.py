@@ -40,11 +40,10 @@ if TYPE_CHECKING:
     from .adaptive import adaptive_table
     from .attribute_table import AttributeLayout, AttributeTable
     from .criterion import Criterion, DisplacementBound, Measure, Sensor
-    from .triangle_mesh import Tessellation
     from .uniform import uniform_table
     from .uniform_grid import UniformGrid
     from .vertex_stencils import ClassStencils, VertexStencils
-    from .vertex_table import VertexMatrices, VertexTable
+    from .vertex_table import Tessellation, VertexMatrices, VertexTable
 
 # Segments along an edge of the control cage. Triangles are numbered by 32 bits, and memory ends long before that.
 HIGHEST_RATE = 1024
@@ -78,7 +77,7 @@ __getattr__ = deferred(
         "Measure": "criterion",
         "VertexStencils": "vertex_stencils",
         "Sensor": "criterion",
-        "Tessellation": "triangle_mesh",
+        "Tessellation": "vertex_table",
         "UniformGrid": "uniform_grid",
         "VertexMatrices": "vertex_table",
         "VertexTable": "vertex_table",

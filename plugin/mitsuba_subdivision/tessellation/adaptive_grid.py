@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.chunks import chunks_of
 from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.ragged import chunks_of
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
 from .spans import Spans, SpanVertices, cut_into_spans, first_of_each

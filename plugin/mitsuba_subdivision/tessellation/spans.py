@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.chunks import chunks_of, gathered
 from ..mesh.connectivity import IndexArray, IntArray
+from ..mesh.ragged import chunks_of, gathered
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
 from .tile_sides import EDGE, HALVINGS, SidePoints, points_on_sides, side_lines, tile_corners

@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.chunks import gathered
 from ..mesh.connectivity import IntArray, Topology
+from ..mesh.ragged import gathered
 from ..schemes.domain import FloatArray
 
 # Triangles are made in slices of about this many vertices, which stay in a core's cache.

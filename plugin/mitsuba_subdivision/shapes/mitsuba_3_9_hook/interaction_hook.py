@@ -35,7 +35,7 @@ import mitsuba as mi
 
 from ...kernels.types import Mask, Value
 from ...variants import Variant, variant_name
-from ..garbage_collection import paused_collection
+from ..device_state import paused_collection
 from .hook_trial import trial_problem
 from .machine_code import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
