@@ -34,7 +34,6 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
     "bool": (bool, "true or false"),
 }
 
-PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 _PAGE = """\
 .. _shape-subdivision:
 
@@ -388,6 +387,7 @@ PARAMETERS = (
         flags=EXPOSED,
     ),
 )
+PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
 # Further parameters, which only `traverse` exposes.
 STATE_PARAMETERS = (
