@@ -60,10 +60,7 @@ def interruptible(work: Callable[[], T]) -> T:
 
     Python notices Ctrl-C only between two of its instructions, and a single one can be a render of hours.
 
-    Raises
-    ------
-    Abandoned
-        If Ctrl-C is pressed before the work is done.
+    Raises Abandoned if Ctrl-C is pressed before the work is done.
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
@@ -115,10 +112,7 @@ def parser() -> CommandParser:
 def parsed(arguments: list[str] | None) -> argparse.Namespace:
     """The options of a command line, or of this process.
 
-    Raises
-    ------
-    SystemExit
-        If they are wrong, or ask for help or the version.
+    Raises SystemExit if they are wrong, or ask for help or the version.
     """
     program = parser()
     options, unknown = program.parse_known_args(arguments)

@@ -86,17 +86,12 @@ class Inspection:
 
 
 def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
-    """Inspect a cage under a scheme.
+    """Inspect a cage under a scheme. Raises ValueError if the rate is below 1.
 
     Parameters
     ----------
     rate : int
         Segments per edge of the tessellation whose size is predicted, at least 1.
-
-    Raises
-    ------
-    ValueError
-        If the rate is below 1.
     """
     if rate < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")

@@ -127,10 +127,7 @@ def llvm_problem() -> str | None:
 def require_llvm() -> None:
     """Check that kernels of LLVM variants run: with a library that is too old, the first one ends the process.
 
-    Raises
-    ------
-    RuntimeError
-        If they do not; the message is that of `llvm_problem`.
+    Raises RuntimeError if they do not; the message is that of `llvm_problem`.
     """
     problem = llvm_problem()
     if problem:

@@ -22,15 +22,12 @@ EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llv
 def variant_module(mi: ModuleType | str) -> ModuleType:
     """Where a variant's types and functions are.
 
+    Raises ValueError if it is something else, there is no such variant, or none is set.
+
     Parameters
     ----------
     mi : module or str
         ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name.
-
-    Raises
-    ------
-    ValueError
-        If it is something else, there is no such variant, or none is set.
     """
     import mitsuba
 

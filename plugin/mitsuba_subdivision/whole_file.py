@@ -22,12 +22,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     before is as it was. A process that is killed leaves its temporary file, ".NAME.NUMBER.part.SUFFIX". If several
     processes write one file, the last to end wins. Links are followed. Pipes and devices are written to directly.
 
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    OSError
-        If the file cannot be written; the message names ``path``.
+    Raises FileNotFoundError if the folder does not exist. Raises OSError if the file cannot be written; the message
+    names ``path``.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
@@ -55,17 +51,13 @@ def whole_file(path: Path) -> Iterator[Path]:
 def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Check that a file can be written to a path, before its contents are computed; create its folder.
 
+    Raises OSError if ``path`` is a folder, or protected from writing, or the folder cannot be made or written to.
+    Raises ValueError if ``path`` is one of the inputs.
+
     Parameters
     ----------
     inputs : iterable of Path, optional
         Files that the work reads; ``path`` must not be one of them.
-
-    Raises
-    ------
-    OSError
-        If ``path`` is a folder, or protected from writing, or the folder cannot be made or written to.
-    ValueError
-        If ``path`` is one of the inputs.
     """
     for other in inputs:
         if path.exists() and other.exists() and path.samefile(other):
@@ -93,10 +85,7 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
 def require_folder(folder: Path) -> None:
     """Create a folder and its parents unless they exist.
 
-    Raises
-    ------
-    OSError
-        If the path is a file, or the folder cannot be made.
+    Raises OSError if the path is a file, or the folder cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -74,12 +74,7 @@ class Surfaces:
     def of(self, contents: CageContents) -> LimitSurface:
         """The surface of a cage, without warnings; see `note_warnings`.
 
-        Raises
-        ------
-        CageError
-            If the cage is invalid.
-        SchemeError
-            If the scheme cannot subdivide it.
+        Raises CageError if the cage is invalid. Raises SchemeError if the scheme cannot subdivide it.
         """
         return self._found(contents).surface
 

@@ -63,19 +63,15 @@ class LoadedShapes:
     ) -> mi.Object:
         """The object of a shape.
 
+        Raises CageError if the cage is invalid, or its points are not finite. Raises SchemeError if the scheme cannot
+        subdivide it.
+
         Parameters
         ----------
         bsdf : callable
             Makes the entry of its BSDF.
         area : dict or None
             Entry of its emitter.
-
-        Raises
-        ------
-        CageError
-            If the cage is invalid, or its points are not finite.
-        SchemeError
-            If the scheme cannot subdivide it.
         """
         # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
         self._counts[shape.name] += 1

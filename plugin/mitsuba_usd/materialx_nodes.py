@@ -325,12 +325,7 @@ def is_constant(given: Input) -> bool:
 def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
     """Numbers ``(k,)`` of a constant input, maybe repeated to a width.
 
-    Raises
-    ------
-    TypeError
-        If it is no number and no colour.
-    ValueError
-        If it has another width.
+    Raises TypeError if it is no number and no colour. Raises ValueError if it has another width.
     """
     if not isinstance(given, (int, float, list)):
         raise TypeError(f"{given!r} is no number; expected one, or a colour")

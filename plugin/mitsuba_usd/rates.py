@@ -46,6 +46,8 @@ def triangles_for_picture(
 
     With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
 
+    Returns dict of dict by shape: cages that cannot be used are missing.
+
     Parameters
     ----------
     segments : dict of (n,) int array by shape
@@ -56,11 +58,6 @@ def triangles_for_picture(
         Of every limit surface: the shading, and how many segments there are at most.
     follows_sensor : bool
         Whether the scene is rendered by this sensor only.
-
-    Returns
-    -------
-    dict of dict by shape
-        Cages that cannot be used are missing.
     """
     shading, most = parameters["shading"], parameters["tessellation_rate"]
     needed = {shape: int(segments[shape].max()) for shape in contents.all_shapes if shape in segments}

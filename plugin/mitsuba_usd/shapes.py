@@ -26,7 +26,7 @@ def subdivision(
     parameters: dict[str, Any],
     notes: StageWarnings,
 ) -> SceneNode:
-    """A limit surface.
+    """A limit surface. Raises CageError if the cage is invalid. Raises SchemeError if the scheme cannot subdivide it.
 
     Parameters
     ----------
@@ -34,13 +34,6 @@ def subdivision(
         Where its cage is validated.
     parameters : dict
         Of the shape ``subdivision``.
-
-    Raises
-    ------
-    CageError
-        If the cage is invalid.
-    SchemeError
-        If the scheme cannot subdivide it.
     """
     # Validated here, so that messages name the prim.
     surfaces.note_warnings(shape, notes)

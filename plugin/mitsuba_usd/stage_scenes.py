@@ -108,10 +108,7 @@ class StageScenes:
     def at(self, number: int | None = None) -> SceneContents:
         """Visible contents of a frame; by default, at the given time.
 
-        Raises
-        ------
-        CageError, OSError
-            If it cannot be read, or if nothing is visible in a still picture.
+        Raises CageError, OSError if it cannot be read, or if nothing is visible in a still picture.
         """
         if self._first is not None and self._first[0] == number:
             return self._first[1]
@@ -172,13 +169,7 @@ class StageScenes:
         follows_sensor: bool = False,
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
-        """Entries of a scene, with polygon meshes for `with_meshes`.
-
-        Raises
-        ------
-        CageError
-            If no mesh can be used.
-        """
+        """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError if no mesh can be used."""
         notes, rest, parameters = StageWarnings(), None, self._parameters
         triangles: dict[ShapeContents, dict[str, Any]] = {}
         needed: dict[str, float] = {}
@@ -238,10 +229,7 @@ class StageScenes:
     ) -> Iterator[LoadedScene]:
         """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded.
 
-        Raises
-        ------
-        CageError
-            If there are to be sub-frames, and no camera has a shutter that opens.
+        Raises CageError if there are to be sub-frames, and no camera has a shutter that opens.
         """
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
@@ -335,17 +323,14 @@ class StageReader:
 
     Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
 
+    Raises OSError if the file cannot be read.
+
     Parameters
     ----------
     camera : str, optional
         Path of the camera; by default, that of the stage's render settings, or its first one.
     warned : set of str, optional
         Warnings about other files, without their names; those about this one are added.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be read.
     """
 
     def __init__(self, path: str | Path, camera: str | None = None, warned: set[str] | None = None) -> None:
@@ -361,13 +346,7 @@ class StageReader:
         weakref.finalize(self, library.cache_clear)
 
     def at(self, time: float | None = None) -> SceneContents:
-        """Contents of the stage at a time code; see `read_stage`.
-
-        Raises
-        ------
-        ValueError
-            If the time is not finite.
-        """
+        """Contents of the stage at a time code; see `read_stage`. Raises ValueError if the time is not finite."""
         if time is not None and not math.isfinite(time):
             raise ValueError(f'"{self._path}": time {time}; expected a finite number, a time code')
         code = None if time is None else float(time)

@@ -87,17 +87,14 @@ class _Subtree:
 def read_stage(path: str | Path, time: float | None = None, camera: str | None = None) -> SceneContents:
     """Read a stage, in this process.
 
+    Raises CageError if the package usd-core is missing; if the file is malformed; if there is no such camera.
+
     Parameters
     ----------
     time : float, optional
         Time code; by default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional
         Path of the camera; by default, that of the stage's render settings, or its first one.
-
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing; if the file is malformed; if there is no such camera.
 
     Warns
     -----
@@ -108,13 +105,7 @@ def read_stage(path: str | Path, time: float | None = None, camera: str | None =
 
 
 def open_checked(path: str | Path) -> Usd.Stage:
-    """Open a stage in this process.
-
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing, or the file is malformed.
-    """
+    """Open a stage in this process. Raises CageError if the package usd-core is missing, or the file is malformed."""
     name = f'"{path}"'
     require_usd(name)
     with usd_errors_at(name), usd_messages_of(name):
@@ -433,13 +424,7 @@ class _StageWalk:
         return self._numbers[key]
 
     def _camera_contents(self, camera: UsdGeom.Camera, settings: FrameSettings) -> CameraContents:
-        """Parameters of a camera.
-
-        Raises
-        ------
-        CageError
-            If it cannot be used.
-        """
+        """Parameters of a camera. Raises CageError if it cannot be used."""
         try:
             contents = read_camera(camera, self._to_world(camera.GetPrim()), self._code, settings, self._notes)
         except (TypeError, ValueError):
@@ -454,10 +439,7 @@ class _StageWalk:
     def _camera(self, path: str | None) -> UsdGeom.Camera | None:
         """The camera of a path, or by default the first one; None if there is none.
 
-        Raises
-        ------
-        CageError
-            If there is no camera of the path.
+        Raises CageError if there is no camera of the path.
         """
         from pxr import Usd, UsdGeom
 

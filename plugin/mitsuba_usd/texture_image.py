@@ -58,6 +58,8 @@ def read_texture_image(
 ) -> TextureImage:
     """Read the image of a texture.
 
+    Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it cannot be read, or there is no tile.
+
     Parameters
     ----------
     path : str
@@ -68,11 +70,6 @@ def read_texture_image(
         Pixels along the sides of a file that its use needs; files that have more are halved, see `halvings`.
     most : int, optional
         Pixels along the sides of a file at most.
-
-    Raises
-    ------
-    OSError, RuntimeError, KeyError, zipfile.BadZipFile
-        If it cannot be read, or there is no tile.
     """
     if UDIM not in path:
         return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))

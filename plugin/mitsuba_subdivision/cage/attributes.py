@@ -121,10 +121,7 @@ def validated_texcoords(
 ) -> Attribute | None:
     """Check the texture coordinates of a cage; a bare array has a row for each vertex.
 
-    Raises
-    ------
-    CageError
-        If they are invalid.
+    Raises CageError if they are invalid.
     """
     if texcoords is None:
         return None
@@ -139,10 +136,7 @@ def validated_attributes(
 ) -> dict[str, Attribute]:
     """Check all attributes of a cage except its texture coordinates; bare arrays have a row for each vertex.
 
-    Raises
-    ------
-    CageError
-        If one is invalid, or is called "texcoords".
+    Raises CageError if one is invalid, or is called "texcoords".
     """
     if attributes is None:
         return {}

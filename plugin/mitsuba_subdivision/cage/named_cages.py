@@ -32,6 +32,8 @@ def tetrahedron() -> ControlCage:
 def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: float = 1.0) -> ControlCage:
     """Torus about the z axis. All faces are quads, and all vertices have valence 4.
 
+    Raises CageError if there are fewer than 3 columns or rows.
+
     Parameters
     ----------
     columns, rows : int
@@ -41,11 +43,6 @@ def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: floa
     major_radius, minor_radius : float
         The vertices lie on circles of radius ``minor_radius``, with centres at the distance ``major_radius`` from the
         axis.
-
-    Raises
-    ------
-    CageError
-        If there are fewer than 3 columns or rows.
     """
     if columns < 3 or rows < 3:
         raise CageError(f"torus of {columns} columns and {rows} rows; expected at least 3 of each")
@@ -68,23 +65,15 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     its mirror image, and a band joins them. The two poles have the given valence, the ``2 * valence`` corners of the
     prism valence 3, and all other vertices valence 4.
 
+    Returns ControlCage: vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring,
+    counter-clockwise, and each begins at vertex 0. Raises CageError if ``valence < 3``.
+
     Parameters
     ----------
     valence : int
         3 or more.
     closed : bool
         False makes a dome with boundary, without the band and the bottom.
-
-    Returns
-    -------
-    ControlCage
-        Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each
-        begins at vertex 0.
-
-    Raises
-    ------
-    CageError
-        If ``valence < 3``.
     """
     _require_extraordinary(valence)
     top, top_faces, loop = _prism_top(valence)
@@ -111,23 +100,15 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
     The ball is a double pyramid over a regular polygon, each of its triangles cut into ``rows * rows``, pushed out to
     the unit sphere. The poles have the given valence, the polygon's corners valence 4, all other vertices valence 6.
 
+    Returns ControlCage: vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring,
+    counter-clockwise, and each begins at vertex 0. Raises CageError if ``valence < 3``.
+
     Parameters
     ----------
     valence : int
         3 or more.
     rows : int
         With 4 or more, the poles are isolated.
-
-    Returns
-    -------
-    ControlCage
-        Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each
-        begins at vertex 0.
-
-    Raises
-    ------
-    CageError
-        If ``valence < 3``.
     """
     _require_extraordinary(valence)
     # Circle r of the upper half has r vertices per sector. Circle 0 is the pole.
@@ -175,20 +156,12 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
 def extraordinary_face(corners: int) -> ControlCage:
     """Ball with a face of any size on top amid quads, and all vertices of valence 4: the dual of `extraordinary`.
 
+    Returns ControlCage: face 0 is the one on top, and begins at vertex 0. Raises CageError if ``corners < 3``.
+
     Parameters
     ----------
     corners : int
         Number of corners of the face, 3 or more.
-
-    Returns
-    -------
-    ControlCage
-        Face 0 is the one on top, and begins at vertex 0.
-
-    Raises
-    ------
-    CageError
-        If ``corners < 3``.
     """
     cage = extraordinary(corners)
     offsets, half_edges = cage.topology.vertex_fans

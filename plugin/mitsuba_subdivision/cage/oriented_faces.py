@@ -159,10 +159,7 @@ def turning_order(topology: Topology) -> IntArray | None:
     turned; of two equal parts, the one without the piece's lowest face. A turned face keeps its first corner. Faces
     around a Möbius strip cannot all be wound alike; there as few neighbours as possible stay wound against each other.
 
-    Returns
-    -------
-    (n_h,) int64
-        The present number of each corner of the new order.
+    Returns (n_h,) int64: the present number of each corner of the new order.
     """
     t = topology
     one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))

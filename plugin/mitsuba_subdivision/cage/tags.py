@@ -27,10 +27,7 @@ def validated_tags(
 
     As in OpenSubdiv, those that name an edge or a vertex that the mesh does not have are ignored.
 
-    Raises
-    ------
-    CageError
-        If rows are no numbers of vertices, or a sharpness is negative or not a number.
+    Raises CageError if rows are no numbers of vertices, or a sharpness is negative or not a number.
 
     Warns
     -----
@@ -70,10 +67,7 @@ def validated_tags(
 def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) -> IntArray:
     """Check pairs of vertices, and find a half-edge of each.
 
-    Raises
-    ------
-    CageError
-        If a pair is no edge of two faces, or is given twice.
+    Raises CageError if a pair is no edge of two faces, or is given twice.
     """
     t = topology
     ends = _indices(edges, (2,), "edges", source)

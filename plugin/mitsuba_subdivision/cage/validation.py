@@ -25,10 +25,7 @@ MOST_FACE_CORNERS = MOST_VERTICES = (1 << 29) - 1
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
     """Check positions and return a read-only ``(n, 3)`` float64 copy.
 
-    Raises
-    ------
-    CageError
-        If the shape is not ``(n, 3)`` with ``n > 0``, or a coordinate is not a finite number.
+    Raises CageError if the shape is not ``(n, 3)`` with ``n > 0``, or a coordinate is not a finite number.
     """
     expected = "expected an (n, 3) array of numbers"
     try:
@@ -48,16 +45,11 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
 
 
 def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
-    """Sizes and concatenated vertices of faces, not yet validated.
+    """Sizes and concatenated vertices of faces, not yet validated. Raises CageError if ``faces`` are neither.
 
     Parameters
     ----------
     faces : sequence of int sequences, or (f, k) array
-
-    Raises
-    ------
-    CageError
-        If ``faces`` are neither.
     """
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
@@ -81,6 +73,9 @@ def validated_faces(
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
     """Check the faces of a cage, and make them an oriented manifold, as `oriented_faces` returns it.
 
+    Raises CageError if there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is
+    not an integer or out of range; with ``strict``, also as `oriented_faces` does.
+
     Parameters
     ----------
     face_sizes : (n_f,) int
@@ -88,12 +83,6 @@ def validated_faces(
         0-based.
     strict : bool
         Whether the faces must be an oriented 2-manifold, closed or with boundary.
-
-    Raises
-    ------
-    CageError
-        If there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is not an integer
-        or out of range; with ``strict``, also as `oriented_faces` does.
 
     Warns
     -----
@@ -120,10 +109,7 @@ def validated_faces(
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
     """Check the faces that are holes, and return each once, in increasing order.
 
-    Raises
-    ------
-    CageError
-        If an index is not an integer or out of range, or all faces are holes.
+    Raises CageError if an index is not an integer or out of range, or all faces are holes.
     """
     faces = validated_face_indices(topology, holes, "hole", source)
     if len(faces) == topology.face_count:
@@ -134,10 +120,7 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
 def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, source: CageSource) -> IntArray:
     """Check 0-based faces, and return each once, in increasing order; a message calls them ``noun``.
 
-    Raises
-    ------
-    CageError
-        If an index is not an integer or out of range.
+    Raises CageError if an index is not an integer or out of range.
     """
     given = _integers(_flat(indices, f"{noun}s", source), f"{noun}s", source)
     for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:

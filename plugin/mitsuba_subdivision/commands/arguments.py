@@ -33,10 +33,7 @@ def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
 def set_variant(name: str | None) -> None:
     """Set the variant of Mitsuba that ``--variant`` names, or the best if there is none.
 
-    Raises
-    ------
-    RegressionError
-        If the variant cannot run here.
+    Raises RegressionError if the variant cannot run here.
     """
     from ..regression.scene import require_variant
 

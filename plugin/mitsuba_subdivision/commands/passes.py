@@ -97,10 +97,7 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
 
     A model is loaded by ``load``, here and on the workers of a cluster; it must be picklable.
 
-    Raises
-    ------
-    RegressionError
-        If there are fewer batches than passes, or no cluster answers.
+    Raises RegressionError if there are fewer batches than passes, or no cluster answers.
     """
     import mitsuba as mi
 

@@ -191,6 +191,10 @@ def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> lis
     with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
     meshes as PLY files; pictures as PNG or EXR files.
 
+    Returns list of Path: the files that were written; the scene is the last. Raises ValueError if the path does not end
+    in .xml, something in memory can be written to no file, or a file to write is one that the scene reads. Nothing has
+    been written then. Raises OSError if a file cannot be written.
+
     Parameters
     ----------
     scene : dict
@@ -198,19 +202,6 @@ def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> lis
         ``save`` that takes a path.
     inputs : iterable of Path
         Files that must not be written to, besides those that the scene names.
-
-    Returns
-    -------
-    list of Path
-        The files that were written; the scene is the last.
-
-    Raises
-    ------
-    ValueError
-        If the path does not end in .xml, something in memory can be written to no file, or a file to write is one that
-        the scene reads. Nothing has been written then.
-    OSError
-        If a file cannot be written.
     """
     if path.suffix.lower() != ".xml":
         raise ValueError(f'scene "{path}"; expected a name ending in .xml')

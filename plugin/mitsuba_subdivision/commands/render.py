@@ -350,10 +350,7 @@ def _assignment(text: str) -> tuple[str, str]:
 def require_encoder(path: Path) -> None:
     """Check that the packages that write a video are installed, before frames are rendered.
 
-    Raises
-    ------
-    ValueError
-        If a package is missing.
+    Raises ValueError if a package is missing.
     """
     try:
         import imageio.v2  # noqa: F401 - only to find out whether it is there

@@ -122,10 +122,7 @@ class RegularBernstein:
 def regular_bernstein(scheme: Scheme) -> RegularBernstein:
     """Bernstein form of a scheme's regular patches.
 
-    Raises
-    ------
-    SchemeError
-        If these are no polynomials, see `polynomial_basis`.
+    Raises SchemeError if these are no polynomials, see `polynomial_basis`.
     """
     polynomials = polynomial_basis(scheme)
     degree = int(scheme.domain.extent(polynomials.powers).max())

@@ -89,10 +89,7 @@ class DividedElement:
     def domains(self) -> tuple[AffineMap, ...]:
         """From the element's parameters to those of each child: `ParameterDomain.children`, or the identity.
 
-        Raises
-        ------
-        SchemeError
-            If the scheme divides domains in a way of its own.
+        Raises SchemeError if the scheme divides domains in a way of its own.
         """
         found = ring_pattern(self.scheme, self.signature.smoothed).domains
         expected = (IDENTITY,) if len(found) == 1 else self.scheme.domain.children
@@ -200,7 +197,7 @@ class DividedElement:
         dtype: DTypeLike = np.float64,
         known: dict[DividedElement, FloatArray] | None = None,
     ) -> NDArray[np.floating]:
-        """Coefficients of regular pieces over the element's one-ring.
+        """Coefficients of regular pieces over the element's one-ring. Returns (r, m, K).
 
         Parameters
         ----------
@@ -211,10 +208,6 @@ class DividedElement:
         known : dict, optional
             Coefficients of elements below, by the same form: one dictionary for all elements of a cage saves half of
             the time. Without it nothing is kept, as these are by far the largest arrays.
-
-        Returns
-        -------
-        (r, m, K)
         """
         known = {} if known is None else known
         found = np.empty((self.regular_count, len(form), self.control_count), dtype=dtype)
@@ -242,11 +235,8 @@ def element_of(scheme: Scheme, signature: Signature) -> DividedElement:
 def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[DividedElement]:
     """Elements of some signatures, divided completely; equal ones are the same object.
 
-    Raises
-    ------
-    SchemeError
-        If refinement does not separate the irregularities of a one-ring, or the scheme divides domains in a way of its
-        own.
+    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or the scheme divides domains
+    in a way of its own.
     """
     elements = [element_of(scheme, signature) for signature in signatures]
     undivided, mesh = list(dict.fromkeys(elements)), None

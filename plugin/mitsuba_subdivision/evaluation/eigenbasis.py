@@ -93,18 +93,15 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
     put into clusters, and each cluster gets an orthonormal basis of its invariant subspace, by inverse iteration where
     the computed vectors are dependent. In all these bases together the matrix is block-diagonal.
 
+    Raises EigenbasisError if the second eigenvalue is not below one, different eigenvalues are too close to find
+    vectors for each, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
+
     Parameters
     ----------
     matrix : (K, K) float64
         One is a simple eigenvalue and all others are smaller.
     constant : (K,) float64, optional
         The eigenvector of one; where rows sum to one, it is one everywhere.
-
-    Raises
-    ------
-    EigenbasisError
-        If the second eigenvalue is not below one, different eigenvalues are too close to find vectors for each, or one
-        of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
     """
     size = len(matrix)
     eigenvalues, eigenvectors = np.linalg.eig(matrix)

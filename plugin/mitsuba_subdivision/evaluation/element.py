@@ -154,10 +154,8 @@ def derivative_stencils(
 ) -> FloatArray:
     """Weights of points and derivatives over an element's one-ring.
 
-    Returns
-    -------
-    (3 or 6, s, K) float64
-        The point; derivatives by u and v; those by uu, uv and vv, as `evaluate_samples` computes them.
+    Returns (3 or 6, s, K) float64: the point; derivatives by u and v; those by uu, uv and vv, as `evaluate_samples`
+    computes them.
     """
     located = LocatedSamples(scheme, [element_of(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
     rows = located.rows("stabilized", np.float64, derivatives)
@@ -284,17 +282,14 @@ def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
 def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
     """Curvatures from the fundamental forms.
 
+    Returns (2, s): Gaussian and mean, the latter positive where the surface bends towards ``du x dv``.
+
     Parameters
     ----------
     first : (2, s, 3)
         Derivatives by u, by v.
     second : (3, s, 3)
         By uu, uv, vv.
-
-    Returns
-    -------
-    (2, s)
-        Gaussian and mean, the latter positive where the surface bends towards ``du x dv``.
     """
     du, dv = first
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -313,6 +308,9 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
     powers of λ_2 and the heights with powers of λ_4, as the eigenvectors of λ_2 and λ_3 have no height at all. Every
     term of the second fundamental form has one height as a factor, so its power comes out in front.
 
+    Returns (2, s): Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not
+    a number.
+
     Parameters
     ----------
     uv : (s, 2) float64
@@ -321,11 +319,6 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
         Eigen-coordinates of every element.
     which : (s,) int64
         Element of each sample.
-
-    Returns
-    -------
-    (2, s)
-        Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not a number.
     """
     level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])

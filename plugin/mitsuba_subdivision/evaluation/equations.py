@@ -229,6 +229,8 @@ def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, 
 
     Terms of eigenvalues larger than the base become zero; the stabilised forms leave them out.
 
+    Returns (d, s, K) of the same precision.
+
     Parameters
     ----------
     rows : (d, s, K) float
@@ -236,10 +238,6 @@ def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, 
     level : (s,) int64
     base : float
         Positive; the modulus of an eigenvalue.
-
-    Returns
-    -------
-    (d, s, K) of the same precision
     """
     real = rows.dtype.type
     kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)

@@ -65,10 +65,7 @@ class IrregularPatch:
     def basis(self) -> Eigenbasis:
         """Of A, oriented so that the characteristic map keeps the orientation of the parameters.
 
-        Raises
-        ------
-        SchemeError
-            If the rules do not contract the one-ring to a point.
+        Raises SchemeError if the rules do not contract the one-ring to a point.
         """
         structure = self.structure
         try:
@@ -183,10 +180,7 @@ class IrregularPatch:
 def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularPatch:
     """Eigenbasis and tables of an irregular one-ring, in float64.
 
-    Raises
-    ------
-    SchemeError
-        If the rules do not contract the one-ring to a point.
+    Raises SchemeError if the rules do not contract the one-ring to a point.
     """
     patch = IrregularPatch(scheme, structure)
     # Raises if there is none.

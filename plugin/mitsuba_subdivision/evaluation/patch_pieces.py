@@ -172,11 +172,8 @@ def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
 
     Beside a border some of them are phantom points, which the scheme's `phantom_points` make of control points within.
 
-    Returns
-    -------
-    (R, K) float64, or None
-        None if the element is no regular patch. It is one if all its corners are regular, be it inside, on a border or
-        at a corner of the border.
+    Returns (R, K) float64, or None: None if the element is no regular patch. It is one if all its corners are regular,
+    be it inside, on a border or at a corner of the border.
     """
     if not (signature.kind == scheme.element and all(_is_regular_fan(scheme, fan) for fan in signature.fans)):
         return None

@@ -43,10 +43,7 @@ class PolynomialBasis:
 def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     """Find the polynomials that are equal to a scheme's `regular_basis`.
 
-    Raises
-    ------
-    SchemeError
-        If there are none: the basis consists of several pieces, or is of too high a degree.
+    Raises SchemeError if there are none: the basis consists of several pieces, or is of too high a degree.
     """
     centre = scheme.domain.centre
     along = np.linspace(0, 1, 2 * HIGHEST_POWER + 3)

@@ -52,10 +52,7 @@ class ProductPatch:
     def rows(self, uv: FloatArray) -> LatticeRows:
         """Samples ``(s, 2)`` as the rows of a lattice, seen from the corner that makes the rows longest.
 
-        Raises
-        ------
-        ValueError
-            If the samples are not the rows of a lattice, seen from any corner.
+        Raises ValueError if the samples are not the rows of a lattice, seen from any corner.
         """
         longest: LatticeRows | None = None
         for corner in range(4):

@@ -151,10 +151,7 @@ class RefinedRings:
     def stencils(self, ring: int, number: int) -> FloatArray:
         """Control points of a child over those of the element, ``(K_child, K)``.
 
-        Raises
-        ------
-        SchemeError
-            If weights of a control point do not sum to one.
+        Raises SchemeError if weights of a control point do not sum to one.
         """
         vertices = self._pattern.child(number)[1]
         if isinstance(self._stencils, StencilTable):

@@ -68,6 +68,9 @@ class Leaves:
 class LocatedSamples:
     """The leaves in which samples lie.
 
+    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or something always stays
+    semi-sharp.
+
     Parameters
     ----------
     elements : sequence of DividedElement
@@ -87,11 +90,6 @@ class LocatedSamples:
         Number of each sample among those of all leaves.
     jacobian : (2, 2, s) float64
         Derivatives of the parameters in the leaf by the sample's own.
-
-    Raises
-    ------
-    SchemeError
-        If refinement does not separate the irregularities of a one-ring, or something always stays semi-sharp.
     """
 
     def __init__(
@@ -199,17 +197,14 @@ class LocatedSamples:
     def weights(self, of_leaves: Sequence[FloatArray], *, power: bool = False) -> list[FloatArray]:
         """Rows of leaves as weights over the one-rings of the elements.
 
+        Returns list of (s_element, d, K) float64: for each element.
+
         Parameters
         ----------
         of_leaves : sequence of (d, n, K_leaf)
             For each of the `leaves` the rows of its samples, over eigen-coordinates or regular control points.
         power : bool
             Whether rows are over the control points of irregular patches, too.
-
-        Returns
-        -------
-        list of (s_element, d, K) float64
-            For each element.
         """
         by_depth: list[list[FloatArray | None]] = [[None] * len(depth.elements) for depth in self._depths]
 

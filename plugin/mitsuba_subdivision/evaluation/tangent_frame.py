@@ -83,15 +83,13 @@ def uneven_frame(tangents: FloatArray, level: NDArray[np.int64], basis: Eigenbas
     Its cross product is ``(g_u² + g_v²)`` times that of the derivatives. Each of the two is divided by the power of its
     own largest eigenvalue, so that neither fades beside the other.
 
+    Returns (2, s, K).
+
     Parameters
     ----------
     tangents : (2, s, K)
         `child_rows` of the two first derivatives.
     level : (s,) int64
-
-    Returns
-    -------
-    (2, s, K)
     """
     by_u, by_v = tangents
     g_u, g_v = by_u[:, 1:2], by_v[:, 1:2]

@@ -91,15 +91,12 @@ def scene_path(name: str) -> Path:
 def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
     """Make axes in rows and columns over the width of the figure; their heights follow when it is written.
 
+    Raises FigureError if matplotlib is not installed; the message names the extra that brings it.
+
     Parameters
     ----------
     **more
         For `matplotlib.pyplot.subplots`.
-
-    Raises
-    ------
-    FigureError
-        If matplotlib is not installed; the message names the extra that brings it.
     """
     try:
         import matplotlib
@@ -128,15 +125,12 @@ def write_plot(options: FigureOptions, name: str, figure: Figure, *, layouts: in
 
     The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
 
+    Returns list of Path: the files written, each of which appears whole or not at all.
+
     Parameters
     ----------
     layouts : int
         How often the height of the figure is set to that of its contents.
-
-    Returns
-    -------
-    list of Path
-        The files written, each of which appears whole or not at all.
     """
     from matplotlib.image import AxesImage
     from matplotlib.pyplot import close

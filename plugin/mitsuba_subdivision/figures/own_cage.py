@@ -26,6 +26,8 @@ def around_vertices(path: Path, most: int, like: tuple[NDArray[np.float64], ...]
     Vertex 0 of each is extraordinary, the first faces lie around it, and each of them begins with it. The cage is
     moved, turned and scaled so that `frame` of the vertex becomes another one.
 
+    Raises FigureError if the cage has no extraordinary vertex inside of its surface whose faces have no creases.
+
     Parameters
     ----------
     path : Path
@@ -34,11 +36,6 @@ def around_vertices(path: Path, most: int, like: tuple[NDArray[np.float64], ...]
         Number of vertices.
     like : (3,), (3, 3), ()
         As `frame` returns it.
-
-    Raises
-    ------
-    FigureError
-        If the cage has no extraordinary vertex inside of its surface whose faces have no creases.
     """
     cage = read(path)
     for _ in range(REFINEMENTS):

@@ -47,6 +47,8 @@ def osd_samples(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Evaluate OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
 
+    Raises FigureError if the program fails.
+
     Parameters
     ----------
     program : Path
@@ -66,11 +68,6 @@ def osd_samples(
     -------
     points, normals : (s, 3)
         Unit normals, not a number where derivatives are parallel or vanish.
-
-    Raises
-    ------
-    FigureError
-        If the program fails.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
     records: dict[str, NDArray] = {
@@ -103,6 +100,8 @@ class BlenderMesh:
 def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
     """Subdivide a cage in Blender, with the modifier's own defaults but for the level.
 
+    Raises FigureError if Blender fails.
+
     Parameters
     ----------
     program : Path
@@ -111,11 +110,6 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
         Without tags; Catmull-Clark's.
     level : int
         Edges of quads become ``2 ** level`` segments.
-
-    Raises
-    ------
-    FigureError
-        If Blender fails.
     """
     records: dict[str, NDArray] = {
         "values": cage.positions,

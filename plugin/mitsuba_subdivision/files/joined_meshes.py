@@ -25,6 +25,9 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
 
     Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width.
 
+    Returns CageContents: with a source that names vertices and faces by their mesh and their numbers there. Raises
+    CageError if meshes have different rules or schemes, or an index is out of the range of its own mesh.
+
     Parameters
     ----------
     meshes : sequence of CageContents
@@ -32,16 +35,6 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
         returned as it is.
     name : str
         Name of the file in messages.
-
-    Returns
-    -------
-    CageContents
-        With a source that names vertices and faces by their mesh and their numbers there.
-
-    Raises
-    ------
-    CageError
-        If meshes have different rules or schemes, or an index is out of the range of its own mesh.
 
     Warns
     -----

@@ -39,12 +39,8 @@ def read_obj(path: str | Path) -> CageContents:
 
     All other statements are skipped. A backslash at the end of a line continues the line, except in a comment.
 
-    Raises
-    ------
-    CageError
-        If the file is malformed; the message names the line. The cage itself is not validated.
-    OSError
-        If the file cannot be read.
+    Raises CageError if the file is malformed; the message names the line. The cage itself is not validated. Raises
+    OSError if the file cannot be read.
 
     Warns
     -----

@@ -93,15 +93,13 @@ class ObjTags:
 def take_plain_tags(tags: ObjTags, obj: ObjText, statements: IntArray) -> NDArray[np.bool_]:
     """Add tags of one edge, vertex or face each to ``tags``, by whole-array operations.
 
+    Returns (n,) bool: whether each statement has been added. `parse_tag` is to read the others, among them all that are
+    malformed.
+
     Parameters
     ----------
     statements : (n,) int
         Numbers of the statements that are tags.
-
-    Returns
-    -------
-    (n,) bool
-        Whether each statement has been added. `parse_tag` is to read the others, among them all that are malformed.
     """
     is_taken = np.zeros(len(statements), dtype=bool)
     text = np.frombuffer(obj.text, np.uint8)
@@ -131,6 +129,8 @@ def take_plain_tags(tags: ObjTags, obj: ObjText, statements: IntArray) -> NDArra
 def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
     """Add the tag of one statement to ``tags``. If a rule is given more than once, the last value counts.
 
+    Raises CageError if the statement is malformed.
+
     Parameters
     ----------
     file : str
@@ -139,11 +139,6 @@ def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
         1-based.
     arguments : str
         The statement after its keyword ``t``.
-
-    Raises
-    ------
-    CageError
-        If the statement is malformed.
 
     Warns
     -----

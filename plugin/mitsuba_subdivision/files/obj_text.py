@@ -38,10 +38,7 @@ _NO_TEXT = {
 def require_text(name: str, content: bytes) -> None:
     """Refuse a file that is no text of one byte for each character.
 
-    Raises
-    ------
-    CageError
-        If it is not text; the message names the format it has.
+    Raises CageError if it is not text; the message names the format it has.
     """
     for begin, what in _NO_TEXT.items():
         if content.startswith(begin):

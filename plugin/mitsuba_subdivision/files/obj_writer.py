@@ -24,10 +24,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
 
     Numbers have all digits that distinguish float64 numbers. The file appears whole or not at all.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises OSError if the file cannot be written.
 
     Warns
     -----

@@ -58,12 +58,8 @@ def read_ply(path: str | Path) -> CageContents:
     Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
     or "" for negative numbers.
 
-    Raises
-    ------
-    CageError
-        If the package plyfile is missing, or the file is malformed. The cage itself is not validated.
-    OSError
-        If the file cannot be read.
+    Raises CageError if the package plyfile is missing, or the file is malformed. The cage itself is not validated.
+    Raises OSError if the file cannot be read.
 
     Warns
     -----

@@ -23,10 +23,7 @@ _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): 
 def write_ply(contents: CageContents, path: str | Path) -> None:
     """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises OSError if the file cannot be written.
 
     Warns
     -----
@@ -103,6 +100,8 @@ def write_polygons(
 ) -> None:
     """Write polygons to a binary PLY file, which appears whole or not at all.
 
+    Raises OSError if the file cannot be written.
+
     Parameters
     ----------
     properties : dict of str to (n,) float32 or float64 array
@@ -112,11 +111,6 @@ def write_polygons(
         0-based.
     materials : (n_f,) int, optional
         Number of each face's material; negative for none.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
     """
     types = {name: values.dtype.newbyteorder("<") for name, values in properties.items()}
     vertex_count = len(next(iter(properties.values())))

@@ -17,13 +17,7 @@ def writers() -> dict[str, str]:
 
 
 def require_format(path: str | Path) -> str:
-    """The suffix of a file of triangles.
-
-    Raises
-    ------
-    ValueError
-        If the format is unknown.
-    """
+    """The suffix of a file of triangles. Raises ValueError if the format is unknown."""
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"path {path!r}; expected a str or Path")
     suffix, known = Path(path).suffix.lower(), writers()
@@ -42,6 +36,9 @@ def write_triangles(
 ) -> None:
     """Write triangles and the data at their vertices. The file appears whole or not at all.
 
+    Raises ValueError if the format is unknown. Raises CageError if the package usd-core, which writes USD files, is
+    missing. Raises OSError if the file cannot be written.
+
     Parameters
     ----------
     path : str or Path
@@ -52,15 +49,6 @@ def write_triangles(
         0-based rows of positions, normals, texture coordinates and attributes.
     texcoords : (n, 2), optional
     attributes : dict of str to (n, k) array, optional
-
-    Raises
-    ------
-    ValueError
-        If the format is unknown.
-    CageError
-        If the package usd-core, which writes USD files, is missing.
-    OSError
-        If the file cannot be written.
 
     Warns
     -----

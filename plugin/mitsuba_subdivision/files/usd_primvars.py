@@ -68,6 +68,8 @@ def read_primvars(
     texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
     which follow from the surface, joints and their weights, and primvars with a single value for the whole mesh.
 
+    Raises CageError if the indices of a primvar are out of range, or their number is wrong.
+
     Parameters
     ----------
     order : (n_h,) int64, optional
@@ -81,11 +83,6 @@ def read_primvars(
     -------
     texcoords : Attribute or None
     attributes : dict of str to Attribute
-
-    Raises
-    ------
-    CageError
-        If the indices of a primvar are out of range, or their number is wrong.
 
     Warns
     -----

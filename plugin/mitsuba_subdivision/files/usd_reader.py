@@ -125,17 +125,14 @@ class MeshReader:
     def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
         """The mesh as contents of a cage.
 
+        Returns CageContents: in its own space, a mesh that is not to be smoothed has no scheme.
+
         Parameters
         ----------
         is_local : bool
             Whether points are left in the mesh's own space instead of the world's.
         choice : PrimvarChoice, optional
             Which primvars are read, by default all.
-
-        Returns
-        -------
-        CageContents
-            In its own space, a mesh that is not to be smoothed has no scheme.
         """
         mesh = self.mesh
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)

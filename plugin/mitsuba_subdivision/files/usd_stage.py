@@ -27,10 +27,7 @@ _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 def require_usd(name: str) -> None:
     """Check that the USD library is there.
 
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing; the message begins with the name of a file.
+    Raises CageError if the package usd-core is missing; the message begins with the name of a file.
     """
     try:
         import pxr  # noqa: F401 - only to find out whether it is missing
@@ -43,7 +40,7 @@ def require_usd(name: str) -> None:
 def open_stage(
     path: str | Path, name: str, completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None
 ) -> Usd.Stage:
-    """Open the stage of a file, with everything that it refers to.
+    """Open the stage of a file, with everything that it refers to. Raises CageError if the file is malformed.
 
     Parameters
     ----------
@@ -51,11 +48,6 @@ def open_stage(
         Beginning of messages.
     completed : callable, optional
         Makes of the stage and its name one that has what USD itself cannot open.
-
-    Raises
-    ------
-    CageError
-        If the file is malformed.
 
     Warns
     -----
@@ -94,10 +86,7 @@ def _warn_of_missing(name: str, errors: list[str]) -> None:
 def stage_up_axis(path: str | Path) -> str:
     """Axis that points up in a USD file: "y" or "z".
 
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing, or the file is malformed.
+    Raises CageError if the package usd-core is missing, or the file is malformed.
     """
     name = f'"{path}"'
     try:
@@ -167,6 +156,8 @@ def chosen_meshes(
     Meshes that are not to be smoothed are skipped if there are others. If all meshes are requested, so are meshes that
     renderers do not show.
 
+    Raises CageError if there is no such mesh, or more than one and not all are requested.
+
     Parameters
     ----------
     path : str or None
@@ -177,11 +168,6 @@ def chosen_meshes(
         Time code at which visibility and schemes are read.
     scheme : str or None
         Scheme that replaces the meshes' own.
-
-    Raises
-    ------
-    CageError
-        If there is no such mesh, or more than one and not all are requested.
 
     Warns
     -----

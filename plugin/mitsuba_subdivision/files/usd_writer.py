@@ -27,12 +27,7 @@ def write_usd(contents: CageContents, path: str | Path) -> None:
 
     A cage that names no scheme becomes a Catmull-Clark mesh.
 
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing.
-    OSError
-        If the file cannot be written.
+    Raises CageError if the package usd-core is missing. Raises OSError if the file cannot be written.
 
     Warns
     -----

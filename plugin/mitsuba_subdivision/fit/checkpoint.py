@@ -45,13 +45,7 @@ class Checkpoint:
 
     @classmethod
     def load(cls, path: Path) -> Checkpoint:
-        """Read a file that `save` has written.
-
-        Raises
-        ------
-        ValueError
-            If it is none.
-        """
+        """Read a file that `save` has written. Raises ValueError if it is none."""
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
@@ -69,10 +63,7 @@ class Checkpoint:
     def state(self, name: str, like: State) -> State:
         """A state with the arrays of another one.
 
-        Raises
-        ------
-        ValueError
-            If there is none of that name, or its arrays have other shapes.
+        Raises ValueError if there is none of that name, or its arrays have other shapes.
         """
         found = self.states.get(name, {})
         shapes = [{field: np.shape(values) for field, values in each.items()} for each in (found, like)]

@@ -98,10 +98,7 @@ class Fit(ABC):
     def step(self) -> float:
         """Take a step, and return the loss before it.
 
-        Raises
-        ------
-        CageError, SchemeError
-            If the cage is due to be refined and cannot be: see `ControlCage.refinement`.
+        Raises CageError, SchemeError if the cage is due to be refined and cannot be: see `ControlCage.refinement`.
         """
         number = len(self.losses)
         if self._is_time_to_refine(number):
@@ -146,22 +143,15 @@ class Fit(ABC):
     def save_checkpoint(self, path: str | Path) -> None:
         """Write the state that `resume` needs.
 
-        Raises
-        ------
-        OSError
-            If the file cannot be written; an existing one is then unchanged.
+        Raises OSError if the file cannot be written; an existing one is then unchanged.
         """
         Checkpoint(self.refinements, self._since, np.array(self.losses), self._states()).save(Path(path))
 
     def resume(self, path: str | Path) -> Self:
         """Resume from a checkpoint of a fit with the same arguments.
 
-        Raises
-        ------
-        ValueError
-            If the file is no checkpoint, or one of another fit.
-        OSError
-            If the file cannot be read.
+        Raises ValueError if the file is no checkpoint, or one of another fit. Raises OSError if the file cannot be
+        read.
         """
         found = Checkpoint.load(Path(path))
         if self.refinements > found.refinements:
@@ -196,10 +186,7 @@ class Schedule:
     def of(cls, given: Schedulable, name: str) -> Schedule:
         """A schedule of a number, of pairs ``(step, value)``, or of a function.
 
-        Raises
-        ------
-        ValueError
-            If it is none of these, or if steps do not increase; the message has the name.
+        Raises ValueError if it is none of these, or if steps do not increase; the message has the name.
         """
         if callable(given):
             return cls(np.zeros(1), np.zeros(1), given)

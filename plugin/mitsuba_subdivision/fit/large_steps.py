@@ -25,6 +25,8 @@ class LargeSteps:
 
     It stands in for ``mitsuba.ad.LargeSteps``, which requires a mesh of triangles.
 
+    Raises ValueError if ``lambda_`` is not positive.
+
     Parameters
     ----------
     laplacian : (n, n) sparse array
@@ -32,11 +34,6 @@ class LargeSteps:
         `LimitSurface.stiffness`.
     lambda_ : float
         How far steps reach: more than 0. Where it is large, all of the surface moves together.
-
-    Raises
-    ------
-    ValueError
-        If ``lambda_`` is not positive.
     """
 
     def __init__(self, laplacian: sparse.csr_array, lambda_: float) -> None:

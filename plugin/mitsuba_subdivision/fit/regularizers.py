@@ -59,13 +59,7 @@ class Regularizer:
 
     @classmethod
     def named(cls, name: str, start: LimitSurface) -> Regularizer:
-        """One of `MATRICES`, for a surface that begins here.
-
-        Raises
-        ------
-        ValueError
-            If there is none of that name.
-        """
+        """One of `MATRICES`, for a surface that begins here. Raises ValueError if there is none of that name."""
         _require_name(name, (*MATRICES,))
         points = start.cage.positions
         return cls(MATRICES[name](start).tocsr(), points if name in ABOUT_START else np.zeros_like(points))
@@ -74,10 +68,7 @@ class Regularizer:
 def device_regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
     """A regularizer by its name: a differentiable function of flat x, y, z.
 
-    Raises
-    ------
-    ValueError
-        If there is none of that name.
+    Raises ValueError if there is none of that name.
     """
     _require_name(name, (*MATRICES, FOLDS))
     return folds(start.cage) if name == FOLDS else device_form(Regularizer.named(name, start))

@@ -28,6 +28,8 @@ def to_mesh(
 ) -> ControlCage:
     """Fit a cage to a mesh of triangles: from a scan or a sculpt to a few control points.
 
+    Raises ValueError if the mesh is malformed or has no area, or as `PointFit`.
+
     Parameters
     ----------
     cage : ControlCage
@@ -41,11 +43,6 @@ def to_mesh(
         Points on the mesh, uniform by area; by default eight for each control point in the end.
     **options
         Of `PointFit`, such as ``refine``.
-
-    Raises
-    ------
-    ValueError
-        If the mesh is malformed or has no area, or as `PointFit`.
     """
     refine = options.get("refine", ())
     if count is None:

@@ -42,6 +42,9 @@ class View:
 class Pictures:
     """A scene with a subdivision surface, rendered in its views.
 
+    Raises ValueError if the variant has no derivatives, there are no views, a picture does not fit its film, or an
+    entry of ``scene`` has the shape's name.
+
     Parameters
     ----------
     scene : dict
@@ -54,12 +57,6 @@ class Pictures:
         Samples of each pixel.
     edge_spp : int
         Samples of outlines for each pixel, where the integrator has such.
-
-    Raises
-    ------
-    ValueError
-        If the variant has no derivatives, there are no views, a picture does not fit its film, or an entry of
-        ``scene`` has the shape's name.
     """
 
     def __init__(

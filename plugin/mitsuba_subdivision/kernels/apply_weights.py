@@ -53,6 +53,8 @@ class WeightKernel:
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Evaluate every vertex of the tessellation.
 
+        Raises ValueError if the number of control points is not that of the table.
+
         Parameters
         ----------
         control_points : flat Dr.Jit float array, (3 control_count)
@@ -63,11 +65,6 @@ class WeightKernel:
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
             Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
             Differentiable with respect to the control points, forward and backward.
-
-        Raises
-        ------
-        ValueError
-            If the number of control points is not that of the table.
         """
         if dr.grad_enabled(control_points):
             return self.evaluated(dr.detach(control_points)).attached(control_points)
@@ -81,10 +78,7 @@ class WeightKernel:
     def evaluated(self, control_points: FloatBuffer) -> EvaluatedVertices:
         """Evaluate every vertex and the tangents that derivatives need, from detached control points.
 
-        Raises
-        ------
-        ValueError
-            If the number of control points is not that of the table.
+        Raises ValueError if the number of control points is not that of the table.
         """
         self.require_control_points(control_points)
         return EvaluatedVertices(self, *self.sampled(control_points, 4, _with_tangents))
@@ -92,10 +86,7 @@ class WeightKernel:
     def require_control_points(self, control_points: FloatBuffer) -> None:
         """Check that a flat array has as many coordinates as the table has of control points.
 
-        Raises
-        ------
-        ValueError
-            If not.
+        Raises ValueError if not.
         """
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))

@@ -131,15 +131,12 @@ class ArrayTypes:
 def float_type_of(variant: str) -> type:
     """Flat float array type of a variant of Mitsuba.
 
+    Raises ValueError if the variant is scalar, or its backend is unknown.
+
     Parameters
     ----------
     variant : str
         Such as "llvm_ad_rgb".
-
-    Raises
-    ------
-    ValueError
-        If the variant is scalar, or its backend is unknown.
     """
     backend, *features = variant.split("_")
     if backend not in ("llvm", "cuda"):

@@ -29,15 +29,12 @@ class Monomials:
     def values(self, coefficients: Sequence[Value], s: Float, t: Float, derivatives: int = 1) -> tuple[Value, ...]:
         """Evaluate a polynomial.
 
+        Returns tuple: the value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
+
         Parameters
         ----------
         coefficients : sequence of m arrays
             Numbers or vectors.
-
-        Returns
-        -------
-        tuple
-            The value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
         """
         along_s = [
             _horner([0 if k is None else coefficients[k] for k in column], s, derivatives) for column in self._columns

@@ -74,16 +74,14 @@ class OneRing:
     ) -> NDArray[np.int32]:
         """Find the one-rings of many elements of this signature: the vertices of ``topology`` at each local vertex.
 
+        Returns (e, K) int32.
+
         Parameters
         ----------
         half_edges : (e,) int
             The half-edge that names each element.
         columns : (K, e) int32, optional
             Array for the result, which is a transposed view of it.
-
-        Returns
-        -------
-        (e, K) int32
         """
         # This is often the largest array of all, and is filled column by column. In chunks of elements the half-edges
         # of the walks stay in the cache.
@@ -102,12 +100,7 @@ class OneRing:
         return columns.T
 
     def vertices_around(self, topology: Topology, fans: list[FanHalfEdges]) -> NDArray[np.int32]:
-        """`gather` for one element with known `fan_half_edges`.
-
-        Returns
-        -------
-        (K,) int32
-        """
+        """`gather` for one element with known `fan_half_edges`. Returns (K,) int32."""
         corners, turns, steps = self._slot_walks
         begins = ragged.starts(np.array([len(behind) + len(ahead) for behind, ahead in fans]))
         unturned = begins + [len(behind) for behind, _ in fans]

@@ -52,7 +52,7 @@ class ChannelLayout:
     def of(
         cls, name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable
     ) -> ChannelLayout:
-        """Choose how an attribute is interpolated.
+        """Choose how an attribute is interpolated. Raises SchemeError if the scheme has no rules for such attributes.
 
         Parameters
         ----------
@@ -62,11 +62,6 @@ class ChannelLayout:
             Of the cage, validated.
         patches : PatchTable
             Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
-
-        Raises
-        ------
-        SchemeError
-            If the scheme has no rules for such attributes.
         """
         key = cage.structure, scheme, attribute.interpolation, Content(attribute.indices)
         return _LAYOUTS.get(key, lambda: _layout_of(name, attribute, cage, scheme, patches))
@@ -238,16 +233,14 @@ def contracts_alike(channel: Channel, patches: PatchTable, half_edge: IntArray) 
 
     If they are subdivided alike there, their tangents at the point are the same multiples of derivatives nearby.
 
+    Returns (s,) bool.
+
     Parameters
     ----------
     patches : PatchTable
         Of the surface.
     half_edge : (s,) int64
         Half-edges that begin at the points.
-
-    Returns
-    -------
-    (s,) bool
     """
     if isinstance(channel, LinearChannel):
         return np.zeros(len(half_edge), dtype=bool)

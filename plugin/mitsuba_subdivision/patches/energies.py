@@ -42,7 +42,7 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 def energy_matrix(
     patches: PatchTable, control_of_vertex: IntArray, control_points: FloatArray, density: Density, order: int
 ) -> sparse.csr_array:
-    """Sum an energy over a surface.
+    """Sum an energy over a surface. Returns (n, n) CSR array of float64: symmetric.
 
     Parameters
     ----------
@@ -52,11 +52,6 @@ def energy_matrix(
         Of the surface.
     order : int
         Gauss nodes along each parameter of a piece.
-
-    Returns
-    -------
-    (n, n) CSR array of float64
-        Symmetric.
     """
     from scipy import sparse
 

@@ -52,15 +52,12 @@ def fan_codes(topology: Topology, *, near: bool = False) -> IntArray:
 def row_codes(columns: Sequence[IntArray]) -> IntArray:
     """Number the rows of a table: equal rows get equal numbers, and lesser rows lesser ones.
 
+    Returns (n,) unsigned int: of a type of few bytes, where few are enough.
+
     Parameters
     ----------
     columns : sequence of (n,) int
         The first column counts most in the order.
-
-    Returns
-    -------
-    (n,) unsigned int
-        Of a type of few bytes, where few are enough.
     """
     codes: IntArray = np.zeros(len(columns[0]), dtype=np.uint8)
     count = 1

@@ -11,10 +11,8 @@ from ..schemes.scheme_table import require_scheme
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     """The chosen scheme, or the cage's own or Catmull-Clark, with the cage's rules.
 
-    Raises
-    ------
-    SchemeError
-        If the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no surface of it.
+    Raises SchemeError if the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no
+    surface of it.
 
     Warns
     -----

@@ -68,18 +68,13 @@ class CageRefinement:
 def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinement:
     """Refine a cage once.
 
+    Raises CageError if no cage has the refined surface, or the refined values of an attribute. Raises SchemeError if
+    the scheme does not number refined faces as Catmull-Clark, Loop or Doo-Sabin do, or has no rules for an attribute.
+
     Parameters
     ----------
     chosen : str or Scheme, optional
         As for `adapted_scheme`. If it is given, the refined cage names it.
-
-    Raises
-    ------
-    CageError
-        If no cage has the refined surface, or the refined values of an attribute.
-    SchemeError
-        If the scheme does not number refined faces as Catmull-Clark, Loop or Doo-Sabin do, or has no rules for an
-        attribute.
     """
     scheme = adapted_scheme(cage, chosen)
     contents = CageContents(
@@ -137,10 +132,7 @@ def _with_tags(
 ) -> tuple[CageContents, ControlCage]:
     """Add the tags that make the refined cut mesh of a refined cage, and return the cage, too.
 
-    Raises
-    ------
-    CageError
-        If there are none.
+    Raises CageError if there are none.
     """
     expected, cut = refinement.topology, cage.cut_mesh.topology
     sharpness = _refined_sharpness(cage.tags, refinement, corners)

@@ -44,6 +44,9 @@ def refined_attributes(
     Face-varying values are corners by conditions on the seams that meet at a vertex, which may come out otherwise in
     the refined cage: then the cage gets another rule, if one has the same corners.
 
+    Raises CageError if no rule makes the same corners. Raises SchemeError if the scheme has no rules for seams, and an
+    attribute has some.
+
     Parameters
     ----------
     cage, refined : ControlCage
@@ -59,13 +62,6 @@ def refined_attributes(
         The rule for the refined cage.
     texcoords : Attribute or None
     attributes : dict of str to Attribute
-
-    Raises
-    ------
-    CageError
-        If no rule makes the same corners.
-    SchemeError
-        If the scheme has no rules for seams, and an attribute has some.
     """
     found: dict[str, Attribute] = {}
     subdivided: dict[str, _RefinedValues] = {}
@@ -96,10 +92,7 @@ def dual_attributes(
 ) -> RefinedAttributes:
     """Refine texture coordinates and attributes under Doo-Sabin, where they are subdivided as points are.
 
-    Raises
-    ------
-    SchemeError
-        If one is interpolated linearly, or has seams.
+    Raises SchemeError if one is interpolated linearly, or has seams.
     """
     found: dict[str, Attribute] = {}
     for name, attribute in _named(cage).items():

@@ -34,10 +34,7 @@ class RefinedCorners:
     def of(cls, cage: ControlCage, scheme: Scheme, refined: Topology) -> RefinedCorners:
         """Find the origin of each corner.
 
-        Raises
-        ------
-        SchemeError
-            If the scheme numbers refined faces in a way of its own.
+        Raises SchemeError if the scheme numbers refined faces in a way of its own.
         """
         t, cut = cage.topology, cage.cut_mesh.topology
         h = np.arange(t.half_edge_count)

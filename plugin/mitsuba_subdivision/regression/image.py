@@ -66,10 +66,7 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
     The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
     same order, the same estimates give the same bits.
 
-    Raises
-    ------
-    ImageError
-        If there is no estimate, or their sizes differ.
+    Raises ImageError if there is no estimate, or their sizes differ.
     """
     total: Estimate | None = None
     squares = np.zeros(())
@@ -137,10 +134,7 @@ class Image:
 def require_finite(image: Image) -> None:
     """Refuse an image with values that are not finite, which merging would spread, and no tier can compare.
 
-    Raises
-    ------
-    ImageError
-        If there are any; the message names the first.
+    Raises ImageError if there are any; the message names the first.
     """
     broken = image.not_finite()
     if broken:
@@ -157,10 +151,8 @@ def save_image(path: str | Path, image: Image) -> None:
 def load_image(path: str | Path) -> Image:
     """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
 
-    Raises
-    ------
-    ImageError
-        If the file cannot be read, channels are missing, or the number of samples or the variance is impossible.
+    Raises ImageError if the file cannot be read, channels are missing, or the number of samples or the variance is
+    impossible.
     """
     channels, metadata = read_channels(path)
     source = str(path)
@@ -296,11 +288,8 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
-    Raises
-    ------
-    ImageError
-        If there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep pixels or broken
-        metadata.
+    Raises ImageError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep
+    pixels or broken metadata.
     """
     path = Path(path)
     if not path.is_file():

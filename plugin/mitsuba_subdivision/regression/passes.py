@@ -54,10 +54,7 @@ class Sampling:
     def share(self, number: int, count: int) -> range:
         """Batches of pass ``number`` of ``count``, where passes count from 1.
 
-        Raises
-        ------
-        RegressionError
-            If there is no such pass, or more passes than batches.
+        Raises RegressionError if there is no such pass, or more passes than batches.
         """
         if not 1 <= number <= count:
             raise RegressionError(f"there is no pass {number} of {count}; expected 1 to {count}")
@@ -103,10 +100,7 @@ def render_pass(
 def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
     """Merge passes of one image. The order in which they are given makes no difference.
 
-    Raises
-    ------
-    RegressionError
-        If a file is no pass, passes are of different images, or two have the same samples.
+    Raises RegressionError if a file is no pass, passes are of different images, or two have the same samples.
     """
     if not passes:
         raise RegressionError("no passes to merge; expected at least one")
@@ -267,10 +261,7 @@ _lock = threading.Lock()
 def cluster(address: str) -> Iterator[Client]:
     """The cluster of a scheduler, at an address such as "tcp://farm:8786".
 
-    Raises
-    ------
-    RegressionError
-        If `distributed` is not installed, or the cluster is not there.
+    Raises RegressionError if `distributed` is not installed, or the cluster is not there.
     """
     try:
         from distributed import Client

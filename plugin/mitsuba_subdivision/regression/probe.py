@@ -53,10 +53,7 @@ class Probe:
     def from_channels(cls, channels: dict[str, NDArray], source: str) -> Probe | None:
         """Probe from the channels of a file, None if there is none.
 
-        Raises
-        ------
-        ImageError
-            If only some of a probe's channels are there.
+        Raises ImageError if only some of a probe's channels are there.
         """
         missing = [name for name in PROBE_CHANNELS if name not in channels]
         if len(missing) == len(PROBE_CHANNELS):

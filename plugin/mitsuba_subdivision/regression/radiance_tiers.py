@@ -237,10 +237,7 @@ def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
 def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
     """Compare two converged images as an eye does that flips between them.
 
-    Raises
-    ------
-    ImageError
-        If FLIP is not installed, or pixels are not finite, to which it gives good scores.
+    Raises ImageError if FLIP is not installed, or pixels are not finite, to which it gives good scores.
     """
     try:
         import flip_evaluator

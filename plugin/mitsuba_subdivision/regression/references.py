@@ -51,10 +51,7 @@ def as_reference(
 ) -> Image:
     """Make a reference of an image: its metadata get tolerances, and the command that makes it.
 
-    Raises
-    ------
-    ImageError
-        If the image is not finite.
+    Raises ImageError if the image is not finite.
     """
     require_finite(image)
     found = image.metadata
@@ -91,13 +88,7 @@ class UnusableReference(RegressionError):
 
 
 def load_reference(path: Path) -> Image:
-    """Read a reference.
-
-    Raises
-    ------
-    UnusableReference
-        If it is missing, damaged, or no reference.
-    """
+    """Read a reference. Raises UnusableReference if it is missing, damaged, or no reference."""
     if not path.is_file():
         raise UnusableReference(f'there is no reference "{path}"')
     try:
@@ -109,13 +100,7 @@ def load_reference(path: Path) -> Image:
 
 
 def sampling_of(reference: Image) -> Sampling:
-    """Sampling of a reference.
-
-    Raises
-    ------
-    UnusableReference
-        If the reference does not record it.
-    """
+    """Sampling of a reference. Raises UnusableReference if the reference does not record it."""
     found = reference.metadata.get("sampling")
     if reference.estimate is None or not isinstance(found, dict):
         raise UnusableReference(
@@ -153,10 +138,7 @@ def render_like(
 
     Each ``seed`` from 0 on has other samples, as has the second attempt with each.
 
-    Raises
-    ------
-    UnusableReference
-        If the reference does not say how it was rendered, or has another size.
+    Raises UnusableReference if the reference does not say how it was rendered, or has another size.
     """
     sampling = sampling_of(reference)
     loaded = load_scene(source, reference.metadata.get("parameters"), reference.metadata.get("filter"))

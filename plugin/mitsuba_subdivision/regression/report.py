@@ -50,10 +50,7 @@ def write_report(folder: str | Path, comparison: Comparison, title: str | None =
 
     The title is by default the reference's name. Returns the path of the page.
 
-    Raises
-    ------
-    ImageError
-        If matplotlib is not installed.
+    Raises ImageError if matplotlib is not installed.
     """
     folder = Path(folder)
     title = title or comparison.reference.name

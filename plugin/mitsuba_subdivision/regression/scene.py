@@ -64,6 +64,9 @@ def load_scene(
 ) -> LoadedScene:
     """Load a scene in the current variant.
 
+    Raises RegressionError if there is no such file or sensor, or the filter of a scene that is already loaded is
+    another.
+
     Parameters
     ----------
     parameters : dict, optional
@@ -72,11 +75,6 @@ def load_scene(
         Reconstruction filter to use instead of the film's own. With "box", the same seed gives the same bits.
     sensor_index : int
         Which of the scene's sensors renders, from 0 on.
-
-    Raises
-    ------
-    RegressionError
-        If there is no such file or sensor, or the filter of a scene that is already loaded is another.
     """
     with timed("Loading shapes and their hierarchy"):
         loaded = _loaded_scene(source, parameters, filter_name)
@@ -274,13 +272,7 @@ def environment(variant: str) -> dict[str, str]:
 
 
 def require_variant(variant: str) -> str:
-    """Return the name of a variant that can run here.
-
-    Raises
-    ------
-    RegressionError
-        If it cannot.
-    """
+    """Return the name of a variant that can run here. Raises RegressionError if it cannot."""
     problem = variant_problem(variant)
     if problem:
         raise RegressionError(problem)

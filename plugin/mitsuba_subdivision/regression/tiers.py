@@ -95,10 +95,7 @@ class Tolerances:
     def with_values(self, values: Mapping[str, Any]) -> Tolerances:
         """Tolerances with some values replaced.
 
-        Raises
-        ------
-        ImageError
-            If a name is unknown, or a value is not a finite number of at least 0.
+        Raises ImageError if a name is unknown, or a value is not a finite number of at least 0.
         """
         known = [field.name for field in fields(self)]
         for name, value in values.items():

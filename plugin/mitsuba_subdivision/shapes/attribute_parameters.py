@@ -32,10 +32,7 @@ def is_attribute_parameter(name: str) -> bool:
 def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
     """Read texture coordinates and attributes as options of a `ControlCage`.
 
-    Raises
-    ------
-    ValueError
-        If a parameter has a wrong shape, indices come without values, or an attribute is given twice.
+    Raises ValueError if a parameter has a wrong shape, indices come without values, or an attribute is given twice.
     """
     from ..cage.attributes import Attribute
 

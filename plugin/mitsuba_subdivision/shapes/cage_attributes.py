@@ -111,15 +111,8 @@ class CageAttributes:
     def update(self, keys: Iterable[str], on_backward: OnBackward) -> list[str]:
         """Read the new values of those parameters that are among some keys.
 
-        Returns
-        -------
-        list of str
-            Names of their attributes.
-
-        Raises
-        ------
-        ValueError
-            If the number of values has changed, or one is not finite.
+        Returns list of str: names of their attributes. Raises ValueError if the number of values has changed, or one is
+        not finite.
         """
         names = [name for name in self._channels if f"{PREFIX}{name}" in keys]
         for name in names:

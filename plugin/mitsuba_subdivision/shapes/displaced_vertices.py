@@ -69,9 +69,7 @@ class VertexLocations:
 
         Where a seam ends at an extraordinary point, positions and values contract at different rates.
 
-        Returns
-        -------
-        (n,) bool
+        Returns (n,) bool.
         """
         found = np.ones(len(self.corner), dtype=bool)
         corners = np.flatnonzero((self.uv == 0).all(axis=1))

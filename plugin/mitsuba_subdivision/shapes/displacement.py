@@ -45,6 +45,8 @@ PREFIX = "vertex_"
 class ShapeDisplacement:
     """Displacement of a shape's surface: heights, their channel, and the scale.
 
+    Raises ValueError if the cage lacks the channel that heights depend on, or heights are not scalar.
+
     Parameters
     ----------
     positions : (n, 3) float64
@@ -66,11 +68,6 @@ class ShapeDisplacement:
         Its value.
     kernel : SurfaceKernel or None
         The displaced surface on the device, that of exact shading if there is any. None in scalar variants without.
-
-    Raises
-    ------
-    ValueError
-        If the cage lacks the channel that heights depend on, or heights are not scalar.
     """
 
     def __init__(
@@ -116,10 +113,7 @@ class ShapeDisplacement:
     def checked_scale(self) -> float:
         """The value of ``displacement_scale``; NaN while a frozen function is recorded, which cannot read it.
 
-        Raises
-        ------
-        ValueError
-            If it is not a finite number.
+        Raises ValueError if it is not a finite number.
         """
         if is_recording():
             return np.nan
@@ -189,10 +183,7 @@ class ShapeDisplacement:
 def _attribute_named(given: str, surface: LimitSurface) -> str:
     """Name, in the cage, of the attribute that the parameter gives.
 
-    Raises
-    ------
-    ValueError
-        If there is no such attribute, or its values are not scalar.
+    Raises ValueError if there is no such attribute, or its values are not scalar.
     """
     attributes = surface.cage.attributes
     widths = {f"{PREFIX}{name}": attribute.values.shape[1] for name, attribute in attributes.items()}

@@ -86,10 +86,7 @@ class TextureHeights:
     The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
     Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives.
 
-    Raises
-    ------
-    ValueError
-        If the texture is not a function of texture coordinates, or not scalar.
+    Raises ValueError if the texture is not a function of texture coordinates, or not scalar.
     """
 
     def __init__(self, variant: Variant, texture: mi.Texture) -> None:

@@ -192,10 +192,7 @@ def computed_ones(*values: Any) -> set[int]:
     There is no such computation behind a variable whose own gradient is asked for, and none after a gradient has passed
     through it, which Dr.Jit then forgets by default.
 
-    Returns
-    -------
-    set of int
-        Dr.Jit's numbers of the arrays' derivatives.
+    Returns set of int: Dr.Jit's numbers of the arrays' derivatives.
     """
     derivatives = {index >> _HALF for value in values for index in dr.detail.collect_indices(value)} - {0}
     graph = str(dr.graphviz_ad(as_string=True))

@@ -114,13 +114,7 @@ class Parameter:
         return f"{self.description}. (Default: {default})" if default else self.description
 
     def checked(self, value: Any) -> Any:
-        """The same value.
-
-        Raises
-        ------
-        ValueError
-            If it has another type, or is not allowed.
-        """
+        """The same value. Raises ValueError if it has another type, or is not allowed."""
         kind, expected = _TYPES[self.type]
         # In Python true is an integer as well.
         if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
@@ -450,10 +444,7 @@ STATE_PARAMETERS = (
 def value_of(props: mi.Properties, name: str) -> Any:
     """The checked value of a parameter that a scene gives to the shape; the default where there is none.
 
-    Raises
-    ------
-    ValueError
-        If it has another type, or is not allowed; says what was expected.
+    Raises ValueError if it has another type, or is not allowed; says what was expected.
     """
     parameter = PARAMETER_OF_NAME[name]
     return parameter.checked(props[name]) if name in props else parameter.default

@@ -69,12 +69,8 @@ class Parameters:
 def read_parameters(props: mi.Properties) -> Parameters:
     """Read and check the parameters that a scene gives to the shape.
 
-    Raises
-    ------
-    ValueError
-        If a parameter is unknown, missing, contradictory, or has a wrong type or value.
-    CageError
-        If the cage is invalid.
+    Raises ValueError if a parameter is unknown, missing, contradictory, or has a wrong type or value. Raises CageError
+    if the cage is invalid.
     """
     # Imported here, so that importing the package stays fast.
     from ..schemes import scheme_named

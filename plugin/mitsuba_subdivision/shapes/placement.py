@@ -24,10 +24,7 @@ FAR = 4
 def checked_matrix(transform: Any, name: str = "to_world") -> NDArray[np.float64]:
     """``(4, 4)`` matrix of one of Mitsuba's transformations, of a scalar or a JIT variant: the parameter of a name.
 
-    Raises
-    ------
-    ValueError
-        If it is not an invertible affine map.
+    Raises ValueError if it is not an invertible affine map.
     """
     if not hasattr(transform, "matrix"):
         raise ValueError(f'parameter "{name}" is {transform!r}; expected a transformation')

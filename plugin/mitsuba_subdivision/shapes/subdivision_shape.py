@@ -416,10 +416,7 @@ def make_subdivision(variant: Variant) -> type:
         def vertex_normal(self, index: Index, active: Mask = True) -> Vector3:
             """Normal at a vertex of the mesh.
 
-            Raises
-            ------
-            RuntimeError
-                If the mesh has none, whose buffer Mitsuba would read beyond its end.
+            Raises RuntimeError if the mesh has none, whose buffer Mitsuba would read beyond its end.
             """
             self._require_at_vertices("vertex_normal", "normals", self.has_vertex_normals())
             return super().vertex_normal(index, active)
@@ -427,10 +424,7 @@ def make_subdivision(variant: Variant) -> type:
         def vertex_texcoord(self, index: Index, active: Mask = True) -> Vector2:
             """Texture coordinates at a vertex of the mesh.
 
-            Raises
-            ------
-            RuntimeError
-                If the mesh has none, whose buffer Mitsuba would read beyond its end.
+            Raises RuntimeError if the mesh has none, whose buffer Mitsuba would read beyond its end.
             """
             self._require_at_vertices("vertex_texcoord", "texture coordinates", self.has_vertex_texcoords())
             return super().vertex_texcoord(index, active)
@@ -440,10 +434,7 @@ def make_subdivision(variant: Variant) -> type:
         ) -> mi.SurfaceInteraction3f:
             """Interaction where the surface has some texture coordinates; invalid where it has not.
 
-            Raises
-            ------
-            RuntimeError
-                If the cage has no texture coordinates.
+            Raises RuntimeError if the cage has no texture coordinates.
             """
             if self.has_vertex_texcoords():
                 return super().eval_parameterization(uv, ray_flags, active)
@@ -458,10 +449,7 @@ def make_subdivision(variant: Variant) -> type:
         def recompute_vertex_normals(self) -> None:
             """Replace the normals of the limit surface by means of those of the triangles.
 
-            Raises
-            ------
-            RuntimeError
-                If the mesh has no normals.
+            Raises RuntimeError if the mesh has no normals.
             """
             self._require_at_vertices("recompute_vertex_normals", "normals", self.has_vertex_normals())
             super().recompute_vertex_normals()

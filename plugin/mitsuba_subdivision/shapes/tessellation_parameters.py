@@ -111,10 +111,7 @@ class AdaptiveTessellation:
     def with_error(self, error: NDArray[np.floating]) -> AdaptiveTessellation:
         """The same tessellation with another value of the limit, given as an array of one number.
 
-        Raises
-        ------
-        ValueError
-            If the array has another size, or the number is not above 0.
+        Raises ValueError if the array has another size, or the number is not above 0.
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
@@ -132,10 +129,7 @@ Tessellation = UniformTessellation | AdaptiveTessellation
 def read_tessellation(props: mi.Properties) -> Tessellation:
     """Read and check the tessellation parameters.
 
-    Raises
-    ------
-    ValueError
-        If one has a wrong type or value, or contradicts another.
+    Raises ValueError if one has a wrong type or value, or contradicts another.
     """
     if value_of(props, "tessellation") == "uniform":
         wrong = [name for name in ADAPTIVE if name in props]

@@ -114,13 +114,7 @@ def _sampled(
 
 
 def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
-    """Flat control points as ``(count, 3)``.
-
-    Raises
-    ------
-    ValueError
-        If their number is not `count`.
-    """
+    """Flat control points as ``(count, 3)``. Raises ValueError if their number is not `count`."""
     found = np.array(points, dtype=np.float64)
     if found.size != 3 * count:
         from ..kernels.apply_weights import coordinates_expected

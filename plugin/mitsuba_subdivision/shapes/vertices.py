@@ -121,10 +121,7 @@ class _Selection:
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
     """Check flat coordinates of so many control points, on any device, and move them to Dr.Jit's memory.
 
-    Raises
-    ------
-    ValueError
-        If there are more or fewer, or one is not a finite number.
+    Raises ValueError if there are more or fewer, or one is not a finite number.
     """
     if len(control_points) != 3 * count:
         from ..kernels.apply_weights import coordinates_expected

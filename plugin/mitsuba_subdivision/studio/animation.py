@@ -155,15 +155,12 @@ class Turntable:
 class FrameRange:
     """Times of a USD file, or the files of frames. The studio's camera stands still, and sees all frames.
 
+    Raises CageError, OSError if a frame cannot be read, or nothing is visible in any of them.
+
     Parameters
     ----------
     numbers : range
         Times or numbers of files.
-
-    Raises
-    ------
-    CageError, OSError
-        If a frame cannot be read, or nothing is visible in any of them.
     """
 
     def __init__(self, source: SceneSource[C], numbers: range) -> None:
@@ -208,19 +205,14 @@ def set_parameters(part: mi.Object, values: Mapping[str, Any]) -> None:
 class FrameFiles:
     """File and time code of a frame.
 
+    Raises CageError if the name has no number in it. Raises FileNotFoundError if there is no file for a frame.
+
     Parameters
     ----------
     path : Path
         A USD file, or a name with a number in it, such as "frame_%04d.obj".
     numbers : range
         Times or numbers of files.
-
-    Raises
-    ------
-    CageError
-        If the name has no number in it.
-    FileNotFoundError
-        If there is no file for a frame.
     """
 
     def __init__(self, path: Path, numbers: range) -> None:

@@ -52,6 +52,8 @@ class CageScenes:
     Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
     stay. Each file is read once: its control points are kept in a temporary file.
 
+    Raises CageError, OSError if there is no file of a frame.
+
     Parameters
     ----------
     cage : ControlCage, str or Path
@@ -60,11 +62,6 @@ class CageScenes:
         As for `ControlCage.from_file`.
     numbers : range, optional
         Times or numbers of files, if there are frames.
-
-    Raises
-    ------
-    CageError, OSError
-        If there is no file of a frame.
     """
 
     def __init__(
@@ -130,10 +127,7 @@ class CageScenes:
     ) -> SceneNode:
         """Entries of a scene: "surface", "cage" if it is drawn, and those of the studio.
 
-        Raises
-        ------
-        CageError
-            If ``checker`` is set, and there are no texture coordinates.
+        Raises CageError if ``checker`` is set, and there are no texture coordinates.
         """
         look, model = self._look, contents.model
         if look.checker and model.cage.texcoords is None:

@@ -107,15 +107,12 @@ def camera_axes(azimuth: float, elevation: float) -> NDArray[np.float64]:
 def angles_of(view: View) -> tuple[float, float]:
     """Azimuth and elevation of a view, in degrees.
 
+    Raises ValueError if there is no such view, or the elevation is not between -90 and 90.
+
     Parameters
     ----------
     view : str or (azimuth, elevation)
         A name in `VIEWS`, or two angles.
-
-    Raises
-    ------
-    ValueError
-        If there is no such view, or the elevation is not between -90 and 90.
     """
     if isinstance(view, str):
         if view not in VIEWS:
@@ -134,10 +131,7 @@ def studio_axes(up: str) -> NDArray[np.float64]:
 
     A model's front is that of modelling programs: -y where z is up, +z where y is up.
 
-    Raises
-    ------
-    ValueError
-        If the axis is neither y nor z.
+    Raises ValueError if the axis is neither y nor z.
     """
     if up not in UP_AXES:
         raise ValueError(f'up axis "{up}"; expected {" or ".join(UP_AXES)}')

@@ -18,10 +18,7 @@ _AUXILIARY = "albedo:albedo,normal:sh_normal"
 def require_denoiser() -> None:
     """Check that the package of the denoiser is installed, before a picture is rendered.
 
-    Raises
-    ------
-    ValueError
-        If it is missing.
+    Raises ValueError if it is missing.
     """
     try:
         import mitsuba_oidn  # noqa: F401 - only to find out whether it is there
@@ -73,10 +70,7 @@ def render_denoised(
 def denoised(loaded: LoadedScene, pixels: NDArray[np.float32], seed: int = 0) -> NDArray[np.float32]:
     """Remove the noise of a picture ``(height, width, channels)`` that was rendered with the box filter.
 
-    Raises
-    ------
-    ValueError
-        If the picture has no R, G and B.
+    Raises ValueError if the picture has no R, G and B.
     """
     import mitsuba_oidn
 

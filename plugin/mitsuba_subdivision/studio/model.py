@@ -162,13 +162,7 @@ class Model:
 
 
 def up_axis_of(path: Path) -> str:
-    """Axis of a model's file that points up: "y" or "z".
-
-    Raises
-    ------
-    CageError
-        If a USD file cannot be opened.
-    """
+    """Axis of a model's file that points up: "y" or "z". Raises CageError if a USD file cannot be opened."""
     found = FORMATS.get(path.suffix.lower())
     if found is not None and found.up is not None:
         return found.up

@@ -36,17 +36,14 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
     If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
     would make an error of every scene in a scalar variant where warnings are errors.
 
+    Raises ValueError if there is no such shading.
+
     Parameters
     ----------
     variant : str
         Variant in which the scene is rendered.
     parameters : dict
         Of the shape ``subdivision``; by default its shading is ``auto``.
-
-    Raises
-    ------
-    ValueError
-        If there is no such shading.
     """
     shading = parameters.get("shading", "auto")
     if shading not in SHADINGS:
@@ -65,7 +62,7 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
 def segments_for(
     cage: ControlCage, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float, shading: str
 ) -> NDArray[np.int64]:
-    """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`.
+    """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`. Returns (n,) int64.
 
     Parameters
     ----------
@@ -76,10 +73,6 @@ def segments_for(
     near_clip : float
         Of the sensor.
     shading : "vertex" or "exact"
-
-    Returns
-    -------
-    (n,) int64
     """
     linear = to_world[:, :3, :3]
     box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T

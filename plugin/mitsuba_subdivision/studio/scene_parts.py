@@ -46,12 +46,7 @@ class SceneParts:
     def in_files(self, name: str, node: SceneNode) -> SceneNode:
         """A scene entry that refers to files instead of data in memory.
 
-        Raises
-        ------
-        ValueError
-            If something cannot be written.
-        OSError
-            If a file cannot be written.
+        Raises ValueError if something cannot be written. Raises OSError if a file cannot be written.
         """
         found = dict(node)
         if "positions" in node:

@@ -57,6 +57,10 @@ def studio(
     A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
     camera is below the model's middle there is no floor, and lights come from below.
 
+    Returns dict: "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and "ground". "ground"
+    is missing in views from below. Raises ValueError if no variant is set; if bounds are not finite, or the least not
+    below the greatest; if view, axis, size or samples are invalid.
+
     Parameters
     ----------
     bounds : (2, 3) array
@@ -74,18 +78,6 @@ def studio(
         Points of the model in the world, within the bounds. The camera frames these; by default, the box.
     name : str, optional
         Of the model, or of its file, with which messages begin.
-
-    Returns
-    -------
-    dict
-        "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and "ground". "ground" is
-        missing in views from below.
-
-    Raises
-    ------
-    ValueError
-        If no variant is set; if bounds are not finite, or the least not below the greatest; if view, axis, size or
-        samples are invalid.
 
     Warns
     -----
@@ -151,13 +143,7 @@ def sampler(spp: int) -> SceneNode:
 
 
 def variant_in_use() -> str:
-    """The current variant of Mitsuba.
-
-    Raises
-    ------
-    ValueError
-        If none is.
-    """
+    """The current variant of Mitsuba. Raises ValueError if none is."""
     variant = mi.variant()
     if variant is None:
         raise ValueError('no variant of Mitsuba is set; expected one, such as by mi.set_variant("llvm_ad_rgb")')

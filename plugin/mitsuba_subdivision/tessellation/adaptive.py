@@ -32,6 +32,9 @@ def adaptive_table(
 ) -> VertexTable:
     """Prepare the adaptive tessellation of a cage's patches.
 
+    Raises ValueError if ``max_rate`` is anything else. Raises MemoryError if the tessellation would not fit into
+    memory.
+
     Parameters
     ----------
     control_of_vertex : (n_v,) int64
@@ -42,13 +45,6 @@ def adaptive_table(
         Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`.
     cage_name : str
         For a warning.
-
-    Raises
-    ------
-    ValueError
-        If ``max_rate`` is anything else.
-    MemoryError
-        If the tessellation would not fit into memory.
 
     Warns
     -----

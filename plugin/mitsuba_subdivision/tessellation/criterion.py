@@ -92,7 +92,7 @@ class DisplacementBound:
 
 @dataclass(frozen=True, eq=False)
 class Criterion:
-    """An error limit for all triangles of a tessellation.
+    """An error limit for all triangles of a tessellation. Raises ValueError if the error is negative or no number.
 
     Attributes
     ----------
@@ -104,11 +104,6 @@ class Criterion:
         Triangles that this sensor cannot see edge-on, and so cannot be at a silhouette, may be coarse.
     displacement : DisplacementBound or None
         Displacement of the surface. The limit is checked at samples of it.
-
-    Raises
-    ------
-    ValueError
-        If the error is negative or no number.
     """
 
     measure: Measure
@@ -256,14 +251,12 @@ def _slip(tangents: tuple[TangentCone, TangentCone], longest: FloatArray) -> Flo
 def least_product(forms: FloatArray) -> IntArray:
     """Integers whose product is least, of those with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` no more than one.
 
+    Returns (t, 2) int64.
+
     Parameters
     ----------
     forms : (f, 3, t) float64
         A, B and C, not negative; ``f`` of them, each of which is to be no more than one.
-
-    Returns
-    -------
-    (t, 2) int64
     """
     forms = np.minimum(forms, MOST)
     a, b, c = np.maximum(forms.max(axis=0), TINY)

@@ -40,13 +40,7 @@ def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
 
 
 def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
-    """Check that a tessellation fits into memory.
-
-    Raises
-    ------
-    MemoryError
-        If not; says which rate would.
-    """
+    """Check that a tessellation fits into memory. Raises MemoryError if not; says which rate would."""
     needed = bytes_of_tessellation(patches, grid)
     available = exceeded_limit(needed)
     if available is None:
@@ -63,13 +57,7 @@ def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
 
 
 def require_memory_for_triangles(count: int) -> None:
-    """Check that an adaptive tessellation fits into memory.
-
-    Raises
-    ------
-    MemoryError
-        If not.
-    """
+    """Check that an adaptive tessellation fits into memory. Raises MemoryError if not."""
     needed = ADAPTIVE_TRIANGLE_BYTES * count
     available = exceeded_limit(needed)
     if available is not None:
@@ -90,15 +78,12 @@ def exceeded_limit(needed: float, most: int | None = None) -> int | None:
 def available_memory(root: str | Path = "/") -> int | None:
     """Bytes that the process can still allocate: the minimum over the machine, its control groups and its own limit.
 
+    Returns int or None: None if the system does not report it.
+
     Parameters
     ----------
     root : str or Path
         Parent of the folders ``proc`` and ``sys``.
-
-    Returns
-    -------
-    int or None
-        None if the system does not report it.
     """
     from pathlib import Path
 

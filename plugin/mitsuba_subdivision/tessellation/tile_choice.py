@@ -58,6 +58,9 @@ def choose_tiles(
 ) -> Tiles:
     """Divide the patches of a cage into tiles, and choose their rates.
 
+    Returns Tiles: in the order of the elements, and in each along a curve of Morton's. Raises MemoryError if their
+    triangles would not fit into memory.
+
     Parameters
     ----------
     frames : PatchFrames
@@ -69,16 +72,6 @@ def choose_tiles(
         Most segments along an edge of the cage; around extraordinary points, along each ring.
     cage_name : str
         For a warning.
-
-    Returns
-    -------
-    Tiles
-        In the order of the elements, and in each along a curve of Morton's.
-
-    Raises
-    ------
-    MemoryError
-        If their triangles would not fit into memory.
 
     Warns
     -----
@@ -157,13 +150,7 @@ def _whole(frames: PatchFrames, corners: list[IntArray], features: NDArray[np.bo
 
 
 def _chosen(rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]) -> Iterator[Tiles]:
-    """Tiles of all patches, with their rates.
-
-    Raises
-    ------
-    MemoryError
-        If there would be too many triangles.
-    """
+    """Tiles of all patches, with their rates. Raises MemoryError if there would be too many triangles."""
     triangle_count = 0
     for tiles, coefficients in _in_runs(_cut(rates, blocks)):
         chosen = [tiles] if coefficients is None else rates.rated(tiles, coefficients, triangle_count)

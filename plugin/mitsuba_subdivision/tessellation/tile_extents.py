@@ -67,6 +67,8 @@ def alike(parts: list[TileParts]) -> list[TileParts]:
 def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDArray[np.bool_]:
     """Whether the extents of the surface over tiles are within their limits.
 
+    Returns (n,) bool: never true where it does not fit.
+
     Parameters
     ----------
     limit : (n,) float64
@@ -74,11 +76,6 @@ def fit_within(scheme: Scheme, limit: FloatArray, tiles: list[TileParts]) -> NDA
         it may not.
     tiles : list of TileParts
         Each tile as one part.
-
-    Returns
-    -------
-    (n,) bool
-        Never true where it does not fit.
     """
     if not tiles:
         return np.zeros(len(limit), dtype=bool)

@@ -80,17 +80,14 @@ class TileRates:
 
         Rates are those that the limit needs, and may exceed the highest; see `clipped`.
 
+        Raises MemoryError if there would be too many triangles.
+
         Parameters
         ----------
         coefficients : (b, 3, t) float64
             Bernstein coefficients over the tiles.
         triangle_count : int
             Of all tiles before.
-
-        Raises
-        ------
-        MemoryError
-            If there would be too many triangles.
         """
         axis = axis_across(coefficients[self.basis.corners])
         extent = np.ptp(dot(coefficients, axis), axis=0)

@@ -32,6 +32,9 @@ def uniform_table(
 ) -> VertexTable:
     """Prepare the uniform tessellation of a cage's patches; the same for equal arguments, while somebody holds it.
 
+    Raises ValueError if the rate is no integer, below 1, or so high that there are more vertices than buffers hold.
+    Raises MemoryError if the tessellation would not fit into memory.
+
     Parameters
     ----------
     rate : int
@@ -40,13 +43,6 @@ def uniform_table(
         0-based control point at each mesh vertex, where the mesh has several copies of some.
     control_count : int, optional
         Number of control points. By default there is one for each mesh vertex.
-
-    Raises
-    ------
-    ValueError
-        If the rate is no integer, below 1, or so high that there are more vertices than buffers hold.
-    MemoryError
-        If the tessellation would not fit into memory.
     """
 
     def make() -> VertexTable:
@@ -85,13 +81,7 @@ def _grid(patches: PatchTable, rate: int) -> UniformGrid:
 
 
 def checked_rate(rate: int, name: str = "tessellation rate") -> int:
-    """A rate that is an integer of 1 or more.
-
-    Raises
-    ------
-    ValueError
-        If it is none. The message begins with the name.
-    """
+    """A rate that is an integer of 1 or more. Raises ValueError if it is none. The message begins with the name."""
     try:
         checked = operator.index(rate)
     except TypeError:

@@ -151,17 +151,14 @@ class Answers(Protocol):
 class InteractionHook:
     """Overrides functions of a variant's shapes in Python; see the module.
 
+    Raises RuntimeError if there is a `hook_problem`, or the class lacks one of the functions.
+
     Parameters
     ----------
     variant : module
         Such as ``mitsuba.llvm_ad_rgb``.
     example : mi.Mesh
         Of the class whose shapes are to be hooked.
-
-    Raises
-    ------
-    RuntimeError
-        If there is a `hook_problem`, or the class lacks one of the functions.
     """
 
     def __init__(self, variant: Variant, example: mi.Mesh) -> None:
@@ -365,10 +362,8 @@ _hooks: dict[Variant, InteractionHook] = {}
 def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
     """The hook of a variant's shapes, built for the first of them.
 
-    Raises
-    ------
-    RuntimeError
-        If there is none yet, and another variant is set, in which Mitsuba would make the group that is built upon.
+    Raises RuntimeError if there is none yet, and another variant is set, in which Mitsuba would make the group that is
+    built upon.
     """
     with _lock:
         if variant not in _hooks:

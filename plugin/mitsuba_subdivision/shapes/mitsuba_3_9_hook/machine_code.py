@@ -86,6 +86,9 @@ def bindings_library() -> ctypes.PyDLL:
 class Trampoline:
     """A virtual function that calls the original one, and then Python.
 
+    Raises OSError if the system allows no executable memory. Raises AttributeError if the libraries lack a function
+    that is needed.
+
     Parameters
     ----------
     original : int
@@ -100,13 +103,6 @@ class Trampoline:
         error, which C++ throws. The object has been destructed.
     equal : (2,) tuple of int, optional
         Offsets of two words of the object. If they are equal, Python is not called.
-
-    Raises
-    ------
-    OSError
-        If the system allows no executable memory.
-    AttributeError
-        If the libraries lack a function that is needed.
     """
 
     def __init__(
@@ -145,17 +141,14 @@ def tag_of(address: int) -> int:
 def replace_function(entry: int, address: int) -> None:
     """Replace an entry of a write-protected virtual function table.
 
+    Raises OSError if the system does not allow it to be written.
+
     Parameters
     ----------
     entry : int
         Address of the entry in the table.
     address : int
         Of the function.
-
-    Raises
-    ------
-    OSError
-        If the system does not allow it to be written.
     """
     page = entry - entry % mmap.PAGESIZE
     _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
@@ -166,12 +159,8 @@ def replace_function(entry: int, address: int) -> None:
 def require_trampolines() -> None:
     """Check that trampolines work on this system.
 
-    Raises
-    ------
-    OSError
-        If the system does not allow memory to be executed that a program has written.
-    AttributeError
-        If the libraries lack a function that is needed.
+    Raises OSError if the system does not allow memory to be executed that a program has written. Raises AttributeError
+    if the libraries lack a function that is needed.
     """
     _code_after(0, object, print, sys.exit, None)
     _protect(_writable_page(), mmap.PROT_READ | mmap.PROT_EXEC)
