@@ -16,13 +16,7 @@ release = mitsuba_subdivision.__version__
 html_title = f"{project} {release}"
 html_theme = "furo"
 
-extensions = [
-    "myst_nb",
-    "numpydoc",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.mathjax",
-    "sphinxcontrib.mermaid",
-]
+extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinxcontrib.mermaid"]
 exclude_patterns = ["mitsuba_subdivision", "mitsuba_usd", "reference/build", "**/__pycache__", "**/.ipynb_checkpoints"]
 
 myst_enable_extensions = ["dollarmath", "html_image"]

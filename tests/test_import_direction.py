@@ -89,17 +89,7 @@ BY_NAME = {"deferred.py", "schemes/scheme_table.py", "files/formats.py"}
 BY_NAME |= {"figures/figure_table.py"}
 # Packages that may import a library that the numpy packages do without.
 MAY_IMPORT = {
-    "mitsuba": {
-        "variants",
-        "mitsuba_mesh",
-        "shapes",
-        "fit",
-        "regression",
-        "figures",
-        "studio",
-        "doctor",
-        "commands",
-    },
+    "mitsuba": {"variants", "mitsuba_mesh", "shapes", "fit", "regression", "figures", "studio", "doctor", "commands"},
     "drjit": {
         "llvm",
         "variants",

@@ -190,11 +190,7 @@ def _rendered_height(**parameters: Any) -> float:
             "to_world": camera @ mi.ScalarTransform4f().scale([_PIXEL, _PIXEL, 1]),
             "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}},
         },
-        "surface": {
-            "type": "subdivision",
-            **cube().as_properties(mi),
-            **parameters,
-        },
+        "surface": {"type": "subdivision", **cube().as_properties(mi), **parameters},
     }
     pixel = mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array
     return float(pixel[2])

@@ -11,14 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .materialx_nodes import constant, is_constant, node
 from .stage_warnings import StageWarnings
-from .surface_models import (
-    COSINE_82,
-    NEUTRAL,
-    conductor,
-    conductor_reflectance,
-    schlick_reflectance,
-    with_shape,
-)
+from .surface_models import COSINE_82, NEUTRAL, conductor, conductor_reflectance, schlick_reflectance, with_shape
 from .textures import Textures
 
 # USD's colour of meshes without one.

@@ -130,13 +130,7 @@ def _cone(number: Number) -> Polygons:
 
 def _capsule(number: Number) -> Polygons:
     radius, half = number("radius", 0.5), number("height", 1.0) / 2
-    return _revolved(
-        [
-            _arc(radius, -90, 0, -half),
-            _line((radius, -half), (radius, half)),
-            _arc(radius, 0, 90, half),
-        ]
-    )
+    return _revolved([_arc(radius, -90, 0, -half), _line((radius, -half), (radius, half)), _arc(radius, 0, 90, half)])
 
 
 GPRIMS: dict[str, Callable[[Number], Polygons]] = {

@@ -140,8 +140,7 @@ class ShapeReader:
         names = contents.texcoords()
         if len(names) > 1:
             self._notes.add(
-                "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set",
-                contents.name,
+                "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set", contents.name
             )
         return PrimvarChoice(tuple(names[:1]), tuple(sorted(contents.primvars())))
 

@@ -198,14 +198,7 @@ class _StageWalk:
             instances.append(replace(each, group=group_of[each.group]))
         chosen, resolution = self.camera(camera)
         return SceneContents(
-            up,
-            found.shapes,
-            groups,
-            instances,
-            self._materials.materials,
-            found.lights,
-            chosen,
-            resolution,
+            up, found.shapes, groups, instances, self._materials.materials, found.lights, chosen, resolution
         )
 
     def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:

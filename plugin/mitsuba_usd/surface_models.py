@@ -147,11 +147,7 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
     rough = number_mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat)
     # Widths are r^2 sqrt(2 / (1 + (1 - a)^2)) and (1 - a) of that.
     narrow = plus(1.0, number("multiply", -1.0, i("specular_roughness_anisotropy")))
-    product = number(
-        "divide",
-        number("multiply", 2.0, narrow),
-        plus(1.0, number("multiply", narrow, narrow)),
-    )
+    product = number("divide", number("multiply", 2.0, narrow), plus(1.0, number("multiply", narrow, narrow)))
     return {
         "base_color": times(base, below),
         "metalness": metalness,

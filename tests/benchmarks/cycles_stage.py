@@ -31,10 +31,7 @@ def main(stage, camera):
         clock.append((time.monotonic(), time.process_time()))
 
     bpy.ops.wm.usd_import(
-        filepath=stage,
-        import_subdivision=True,
-        import_cameras=False,
-        apply_unit_conversion_scale=False,
+        filepath=stage, import_subdivision=True, import_cameras=False, apply_unit_conversion_scale=False
     )
     lap()
     scene = bpy.context.scene

@@ -301,9 +301,7 @@ def test_a_scheme_states_its_rules():
 
 @pytest.mark.parametrize(
     ("cage", "scheme", "message"),
-    [
-        (extraordinary(5), "loop", r"extraordinary\(5\): face 0 has 4 corners; the scheme loop expects triangles only"),
-    ],
+    [(extraordinary(5), "loop", r"extraordinary\(5\): face 0 has 4 corners; the scheme loop expects triangles only")],
 )
 def test_faces_without_rules_are_named(cage, scheme, message):
     with pytest.raises(SchemeError, match=message):

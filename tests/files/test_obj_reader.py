@@ -118,19 +118,7 @@ def obj_files(draw):
     space = st.sampled_from([b" ", b"  ", b"\t", b" \\\n ", b"\\\r\n"])
     number = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: repr(x).encode())
     noise = st.sampled_from(
-        [
-            b"",
-            b"  ",
-            b"# v 1 2",
-            b"vn 0 0 1",
-            b"g a b",
-            b"usemtl \xff",
-            b"s 1",
-            b"vp 1",
-            b"fo 1",
-            b"#\\",
-            b"\x0c",
-        ]
+        [b"", b"  ", b"# v 1 2", b"vn 0 0 1", b"g a b", b"usemtl \xff", b"s 1", b"vp 1", b"fo 1", b"#\\", b"\x0c"]
     )
     lines, vertex_count, texcoord_count = [], draw(st.integers(1, 5)), draw(st.integers(0, 3))
     tails = [b"", b"//1"] if draw(st.booleans()) or not texcoord_count else []

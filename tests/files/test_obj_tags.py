@@ -132,10 +132,7 @@ def test_a_warning_names_unknown_values(read, tag, expected):
 @pytest.mark.parametrize(
     ("tag", "message"),
     [
-        (
-            "crease 2/1/0 1 4",
-            r'line 9: malformed tag "crease 2/1/0 1 4" \(2 values\); expected a name, counts',
-        ),
+        ("crease 2/1/0 1 4", r'line 9: malformed tag "crease 2/1/0 1 4" \(2 values\); expected a name, counts'),
         (
             "crease 1/1/0 1 10",
             "line 9: tag crease has 1 integers and 1 floats; expected two integers per edge and a float",

@@ -455,11 +455,7 @@ def test_a_warning_names_what_has_no_place(tmp_path):
         triangle_rule="smooth",
         scheme="loop",
         texcoords=Attribute(np.zeros((12, 2)), "face_varying"),
-        attributes={
-            "a b": vertex,
-            "kept": vertex,
-            "v": Attribute(vertex.values, "varying"),
-        },
+        attributes={"a b": vertex, "kept": vertex, "v": Attribute(vertex.values, "varying")},
     )
     message = (
         r'tags.ply": .ply files have no place for creases, corners, holes, boundary, triangle_rule, scheme, texcoords, '

@@ -452,10 +452,7 @@ CREASES = "int[] creaseIndices = [0, 1, 2]\nint[] creaseLengths = [{}]\nfloat[] 
             {"mesh": CREASES.format("2", "1")},
             "creaseLengths add up to 2, but creaseIndices has 3 entries; expected as many",
         ),
-        (
-            {"mesh": CREASES.format("2, 1", "1, 1")},
-            "creaseLengths has the value 1 at 1; expected 2 or more vertices",
-        ),
+        ({"mesh": CREASES.format("2, 1", "1, 1")}, "creaseLengths has the value 1 at 1; expected 2 or more vertices"),
         (
             {"mesh": CREASES.format("3", "1, 1, 1")},
             "creaseSharpnesses has 3 entries; expected 1, one per crease, or 2, one per edge",

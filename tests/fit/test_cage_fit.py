@@ -256,10 +256,7 @@ def picture():
         ({"others": {"surface.colour": 0.1}}, 'others has "surface.colour"; expected one of .*surface.control_points'),
         ({"regularizers": {"stretch": 1}}, 'regularizer "stretch"; expected one of laplacian'),
         ({"crease_of": [0]}, "crease_of without sharp_edges; expected both"),
-        (
-            {"sharp_edges": [(0, 1)], "crease_of": [0, 1]},
-            r"crease_of of the shape \(2,\) and type int64; expec",
-        ),
+        ({"sharp_edges": [(0, 1)], "crease_of": [0, 1]}, r"crease_of of the shape \(2,\) and type int64; expec"),
         ({"sharp_edges": [(0, 1)], "crease_of": [1]}, "crease_of has no crease 0; expected all from 0 on"),
         ({"sharp_edges": [(0, 1)], "crease_of": [-1]}, "crease_of has a crease -1; expected all from 0 on"),
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),

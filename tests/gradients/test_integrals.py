@@ -56,11 +56,7 @@ def expected_of(linear, shift, volume, first, second):
     change = linear @ matrix + np.outer(shift, first)
     change = change + change.T + growth * matrix
     return np.concatenate(
-        [
-            growth * volume,
-            linear @ first + shift * volume + growth * first,
-            [change[i, j] for i, j in solids.PAIRS],
-        ]
+        [growth * volume, linear @ first + shift * volume + growth * first, [change[i, j] for i, j in solids.PAIRS]]
     )
 
 

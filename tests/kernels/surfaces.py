@@ -35,10 +35,7 @@ SURFACES = {
     "valence 3": ("catmull_clark", lambda: extraordinary(3)),
     "valence 50": ("catmull_clark", lambda: extraordinary(50, closed=False)),
     "face of 20": ("catmull_clark", lambda: extraordinary_face(20)),
-    "smooth triangles": (
-        "catmull_clark",
-        lambda: tagged(cage_of("catmull_clark", "prism"), triangle_rule="smooth"),
-    ),
+    "smooth triangles": ("catmull_clark", lambda: tagged(cage_of("catmull_clark", "prism"), triangle_rule="smooth")),
     "sheet": ("catmull_clark", lambda: sheet(4, 3)),
     "sheet without corners": ("catmull_clark", lambda: sheet(3, 2, boundary="edge_only")),
     "boundary none": ("catmull_clark", lambda: sheet(4, 4, boundary="none")),
@@ -51,10 +48,7 @@ SURFACES = {
     "into a dart": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (INFINITE, 1.5))),
     "semi-sharp ring": ("catmull_clark", lambda: tagged(cube(), creases=[(a, b, 4) for a, b in RING])),
     # Divided along the edge, and no vertex is extraordinary.
-    "semi-sharp torus": (
-        "catmull_clark",
-        lambda: tagged(cage_of("catmull_clark", "torus"), creases=[(0, 1, 1.5)]),
-    ),
+    "semi-sharp torus": ("catmull_clark", lambda: tagged(cage_of("catmull_clark", "torus"), creases=[(0, 1, 1.5)])),
     "chaikin": (
         "catmull_clark",
         lambda: tagged(

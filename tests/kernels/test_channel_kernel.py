@@ -142,14 +142,9 @@ def test_values_differ_across_seams_only(np_rng):
     edge = np.flatnonzero(whole & whole[t.twin])
     along = np_rng.random(len(edge))
     here, there = (
-        evaluated(
-            surface,
-            "texcoords",
-            DOUBLE,
-            t.face[h],
-            np.stack([u, 0 * u], axis=1),
-            h - t.face_offsets[t.face[h]],
-        )[0]
+        evaluated(surface, "texcoords", DOUBLE, t.face[h], np.stack([u, 0 * u], axis=1), h - t.face_offsets[t.face[h]])[
+            0
+        ]
         for h, u in ((edge, along), (t.twin[edge], 1 - along))
     )
     differs = np.abs(here - there).max(axis=1)

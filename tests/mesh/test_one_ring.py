@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.mesh.one_ring import FEW_ELEMENTS, one_ring
-from mitsuba_subdivision.mesh.signature import (
-    Signature,
-    fan_half_edges,
-    half_edges_around,
-    signature_at,
-)
+from mitsuba_subdivision.mesh.signature import Signature, fan_half_edges, half_edges_around, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
 from reference.exact_samples import mesh_of
 from reference.refined_cages import sheet, tagged

@@ -8,12 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 from mitsuba_subdivision import ControlCage
-from mitsuba_subdivision.cage.named_cages import (
-    extraordinary,
-    extraordinary_face,
-    extraordinary_triangles,
-    torus,
-)
+from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_face, extraordinary_triangles, torus
 from mitsuba_subdivision.mesh.connectivity import Topology
 
 from reference.brute_force import BruteForce, Sample

@@ -71,14 +71,7 @@ class SharpMesh:
         for (vertex, far), value in left.items():
             new_edges[frozenset((vertex, number[frozenset((vertex, far))]))] = value
         vertices = {v: self._less(s) for v, s in self.vertices.items()}
-        return SharpMesh(
-            self.scheme,
-            np.array(points),
-            new_faces + middles,
-            new_edges,
-            vertices,
-            self.method,
-        )
+        return SharpMesh(self.scheme, np.array(points), new_faces + middles, new_edges, vertices, self.method)
 
     @staticmethod
     def _less(sharpness: float) -> float:

@@ -198,10 +198,7 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
             'face 0: corner 0 has index 4 into attribute "texcoords"; expected 0 to 3',
         ),
         ({"texcoords": np.zeros((8, 2)), "varying_texcoords": np.zeros((8, 2))}, '"texcoords" a second time'),
-        (
-            {"vertex_c": np.zeros((8, 3)), "varying_c": np.zeros((8, 3))},
-            '"c" a second time; expected one',
-        ),
+        ({"vertex_c": np.zeros((8, 3)), "varying_c": np.zeros((8, 3))}, '"c" a second time; expected one'),
         ({"vertex_normals": np.zeros((8, 3))}, 'parameter "vertex_normals" names an attribute "normals"'),
         ({"vertex_c": np.zeros(8)}, 'parameter "vertex_c" has shape (8,); expected (n, k)'),
         ({"vertex_c": "red"}, "parameter \"vertex_c\" is 'red'; expected a tensor"),

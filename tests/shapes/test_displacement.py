@@ -551,11 +551,7 @@ def other_values(cage):
     }
     texcoords = new.pop("texcoords")
     return ControlCage(
-        cage.positions,
-        faces_of(cage),
-        texcoords=texcoords,
-        attributes=new,
-        creases=cage.tags.creases(cage.topology),
+        cage.positions, faces_of(cage), texcoords=texcoords, attributes=new, creases=cage.tags.creases(cage.topology)
     )
 
 
@@ -739,10 +735,7 @@ ERRORS = {
 def test_errors_say_what_was_expected(name):
     parameters, message = ERRORS[name]
     plain = named_cages.cube()
-    attributes = {
-        "height": Attribute(np.ones((8, 1)), "vertex"),
-        "colour": Attribute(np.ones((8, 3)), "vertex"),
-    }
+    attributes = {"height": Attribute(np.ones((8, 1)), "vertex"), "colour": Attribute(np.ones((8, 3)), "vertex")}
     cage = ControlCage(plain.positions, faces_of(plain), attributes=attributes)
     with pytest.raises((ValueError, RuntimeError), match=message):
         mi.load_dict({"type": "subdivision", **cage.as_properties(mi), **parameters})

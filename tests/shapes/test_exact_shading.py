@@ -299,11 +299,7 @@ def matte():
 
 @pytest.mark.parametrize(
     ("name", "integrator", "light"),
-    [
-        ("cube", "direct", "point"),
-        ("icosahedron", "path", "sky"),
-        ("Doo-Sabin tetrahedron", "direct", "directional"),
-    ],
+    [("cube", "direct", "point"), ("icosahedron", "path", "sky"), ("Doo-Sabin tetrahedron", "direct", "directional")],
 )
 @llvm
 def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
@@ -387,11 +383,7 @@ MATERIALS = {
     "blend": lambda: {"type": "blendbsdf", "weight": waves(1), "one": {"type": "diffuse"}, "two": metal()},
     "twosided": lambda: {"type": "twosided", "bsdf": metal()},
     "principled": lambda: {"type": "principled", "roughness": 0.3, "metallic": 0.7, "anisotropic": 0.6},
-    "attributes": lambda: {
-        "type": "principled",
-        "roughness": attribute("heat"),
-        "base_color": attribute("colour"),
-    },
+    "attributes": lambda: {"type": "principled", "roughness": attribute("heat"), "base_color": attribute("colour")},
 }
 
 

@@ -10,10 +10,7 @@ from mitsuba_subdivision.device_arrays import upload
 MATERIALS = {"": [0], "red": [1, 4], "dark blue": [2, 3, 5]}
 # Sums of some hundred areas in single precision.
 ROUNDING = 1e-6
-TESSELLATIONS = {
-    "uniform": {"tessellation_rate": 3},
-    "adaptive": {"tessellation": "adaptive", "max_edge": 0.4},
-}
+TESSELLATIONS = {"uniform": {"tessellation_rate": 3}, "adaptive": {"tessellation": "adaptive", "max_edge": 0.4}}
 
 
 @pytest.fixture
@@ -75,8 +72,4 @@ def test_unknown_materials_and_faces_are_errors(file):
     with pytest.raises(
         RuntimeError, match='expected none for the scheme "doo_sabin", whose surface belongs to vertices'
     ):
-        shape(
-            **tetrahedron().as_properties(mi),
-            scheme="doo_sabin",
-            shown_faces=upload(mi.TensorXu, [1]),
-        )
+        shape(**tetrahedron().as_properties(mi), scheme="doo_sabin", shown_faces=upload(mi.TensorXu, [1]))

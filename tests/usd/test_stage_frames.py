@@ -129,9 +129,7 @@ def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, 
     for module, name in ((stage_scenes, "SceneEntries"), (stage_scenes, "read_open_stage")):
         call = getattr(module, name)
         monkeypatch.setattr(
-            module,
-            name,
-            lambda *given, name=name, call=call, **more: made.update([name]) or call(*given, **more),
+            module, name, lambda *given, name=name, call=call, **more: made.update([name]) or call(*given, **more)
         )
     focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
     lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"

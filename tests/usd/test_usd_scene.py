@@ -1054,8 +1054,7 @@ def test_lights_light_a_plane_as_the_closed_form_says(stage, text, irradiance):
 
 
 @pytest.mark.parametrize(
-    ("kind", "size"),
-    [("RectLight", [1, 1]), ("DiskLight", [0.5]), ("SphereLight", [0.5]), ("CylinderLight", [1, 0.5])],
+    ("kind", "size"), [("RectLight", [1, 1]), ("DiskLight", [0.5]), ("SphereLight", [0.5]), ("CylinderLight", [1, 0.5])]
 )
 def test_lights_of_which_nothing_is_said_are_as_large_as_usd_says_and_shine_everywhere(stage, kind, size):
     schemas = '"lamp" ( prepend apiSchemas = ["ShapingAPI", "ShadowAPI"] )'

@@ -47,12 +47,7 @@ class Attribute:
         vars(self).update(values=_array(values), interpolation=interpolation, indices=indices)
 
     def validated(
-        self,
-        name: str,
-        topology: Topology,
-        source: CageSource,
-        width: int | None = None,
-        order: IntArray | None = None,
+        self, name: str, topology: Topology, source: CageSource, width: int | None = None, order: IntArray | None = None
     ) -> Attribute:
         """Same attribute with read-only arrays, ``values`` of float64 and ``indices`` of int64, checked against a mesh.
 

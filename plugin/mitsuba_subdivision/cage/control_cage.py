@@ -197,11 +197,7 @@ class ControlCage:
 
     @classmethod
     def from_arrays(
-        cls,
-        positions: ArrayLike,
-        face_sizes: ArrayLike,
-        face_vertices: ArrayLike,
-        **options: Any,
+        cls, positions: ArrayLike, face_sizes: ArrayLike, face_vertices: ArrayLike, **options: Any
     ) -> ControlCage:
         """Build a cage from flat arrays.
 

@@ -33,12 +33,7 @@ def add_parser(commands: Commands) -> None:
     )
     figure.add_argument("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
     figure.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        default=DRAWN,
-        metavar="DIR",
-        help="folder to write to (default: %(default)s)",
+        "-o", "--output", type=Path, default=DRAWN, metavar="DIR", help="folder to write to (default: %(default)s)"
     )
     figure.add_argument("--resolution", type=positive, metavar="N", help="width of a panel in pixels (default: 512)")
     figure.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")

@@ -87,9 +87,7 @@ def add_parser(commands: Commands) -> None:
     )
     render.add_argument("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
     render.add_argument(
-        "--denoise",
-        action="store_true",
-        help="render with the box filter, and remove noise by Open Image Denoise",
+        "--denoise", action="store_true", help="render with the box filter, and remove noise by Open Image Denoise"
     )
     add_variant(render, "-m", "--mode")
     render.add_argument("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")

@@ -192,10 +192,7 @@ class DividedElement:
         return np.concatenate(rows + below)
 
     def coefficients(
-        self,
-        form: FloatArray,
-        dtype: DTypeLike = np.float64,
-        known: dict[DividedElement, FloatArray] | None = None,
+        self, form: FloatArray, dtype: DTypeLike = np.float64, known: dict[DividedElement, FloatArray] | None = None
     ) -> NDArray[np.floating]:
         """Coefficients of regular pieces over the element's one-ring. Returns (r, m, K).
 

@@ -67,13 +67,7 @@ def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects:
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
     children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
     return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": stage.integrator(),
-            "sensor": stage.sensors()[0],
-            **children,
-            **objects,
-        }
+        {"type": "scene", "integrator": stage.integrator(), "sensor": stage.sensors()[0], **children, **objects}
     )
 
 

@@ -112,10 +112,7 @@ def ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel
         name = "start" if step == 0 else "result" if step == STEPS else "on the way"
         shown.append((_title(name, step, cages[step]), with_cage(cages[step])))
     mesh = courses["mesh"].cages[STEPS]
-    return [
-        *shown,
-        (_title("dense mesh", STEPS, mesh), {"mesh": make_mesh(mesh.positions, mesh.triangles, CLAY)}),
-    ]
+    return [*shown, (_title("dense mesh", STEPS, mesh), {"mesh": make_mesh(mesh.positions, mesh.triangles, CLAY)})]
 
 
 def _title(name: str, step: int, cage: ControlCage) -> str:
@@ -256,11 +253,7 @@ def _plain(axis: Axes) -> None:
 
 
 def _label(
-    axis: Axes,
-    sensor: mi.Sensor,
-    cage: ControlCage,
-    edges: NDArray[np.integer],
-    sharpness: NDArray[np.floating],
+    axis: Axes, sensor: mi.Sensor, cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]
 ) -> None:
     """Write their sharpness on the edges that the camera sees."""
     camera = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]

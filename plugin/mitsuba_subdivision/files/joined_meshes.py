@@ -101,10 +101,7 @@ def _require_own_indices(mesh: CageContents) -> None:
     """
     source, vertex_count, face_count = mesh.source.name, len(mesh.positions), len(mesh.face_sizes)
     corner_count = len(mesh.face_vertices)
-    for what, indices, count in (
-        ("face corners", mesh.face_vertices, vertex_count),
-        ("holes", mesh.holes, face_count),
-    ):
+    for what, indices, count in (("face corners", mesh.face_vertices, vertex_count), ("holes", mesh.holes, face_count)):
         require_range(indices, count, f"{source}: {what} have")
     data = {**mesh.attributes, **({} if mesh.texcoords is None else {"texcoords": mesh.texcoords})}
     for name, attribute in data.items():

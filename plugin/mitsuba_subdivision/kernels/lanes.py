@@ -72,10 +72,7 @@ class Lanes:
         self._index = types.index
         self._controls = controls
         self._rounding = LEAST_EXTENT[dr.type_v(types.float)] if are_rounded else 0
-        self._patch, self._first_vertex = (
-            types.indices(vertices.patch),
-            types.indices(vertices.first_vertex),
-        )
+        self._patch, self._first_vertex = (types.indices(vertices.patch), types.indices(vertices.first_vertex))
         self._kind = types.indices(vertices.kind)
         of_classes = [(each.first_control, *each.controls.shape) for each in vertices.classes]
         of_kinds = np.array(of_classes)[vertices.class_of_kind].T

@@ -357,10 +357,7 @@ def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vecto
     uu, uv, vv = values.second
     # Where the surface collapses, nothing turns: infinite derivatives times zero would not be numbers.
     inverse = over(1, dr.norm(cross(values.du, values.dv)), 0)
-    changes = (
-        cross(uu, values.dv) + cross(values.du, uv),
-        cross(uv, values.dv) + cross(values.du, vv),
-    )
+    changes = (cross(uu, values.dv) + cross(values.du, uv), cross(uv, values.dv) + cross(values.du, vv))
     dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
     return dn_du, dn_dv
 

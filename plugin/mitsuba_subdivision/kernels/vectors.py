@@ -31,11 +31,7 @@ def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
 def cross(a: Vector3, b: Vector3) -> Vector3:
     """Cross product."""
     (a_x, a_y, a_z), (b_x, b_y, b_z) = a, b
-    components = [
-        dr.fma(a_y, b_z, -(a_z * b_y)),
-        dr.fma(a_z, b_x, -(a_x * b_z)),
-        dr.fma(a_x, b_y, -(a_y * b_x)),
-    ]
+    components = [dr.fma(a_y, b_z, -(a_z * b_y)), dr.fma(a_z, b_x, -(a_x * b_z)), dr.fma(a_x, b_y, -(a_y * b_x))]
     return like(components, a)
 
 

@@ -72,11 +72,7 @@ class PieceTable:
 
     @classmethod
     def build(
-        cls,
-        patches: PatchTable,
-        control_of_vertex: IntArray,
-        control_count: int,
-        piece_levels: int = PIECE_LEVELS,
+        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
     ) -> PieceTable:
         """Prepare the evaluation of some patches; equal arguments share the object while it is referenced.
 

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
 from ..evaluation.divided_element import DividedElement, divided_elements
-from ..evaluation.irregular_patch import (
-    IrregularPatch,
-    level_at_size,
-    level_domains,
-    level_rows,
-    rest_rows,
-    transition,
-)
+from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows, transition
 from ..mesh.connectivity import IntArray, Topology
 from ..progress import counted
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray

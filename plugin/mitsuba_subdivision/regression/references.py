@@ -43,11 +43,7 @@ def render_reference(
 
 
 def as_reference(
-    image: Image,
-    scene: str | Path | None,
-    path: str | Path,
-    sampling: Sampling,
-    tolerances: Tolerances | None = None,
+    image: Image, scene: str | Path | None, path: str | Path, sampling: Sampling, tolerances: Tolerances | None = None
 ) -> Image:
     """Make a reference of an image: its metadata get tolerances, and the command that makes it.
 

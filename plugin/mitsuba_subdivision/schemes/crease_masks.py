@@ -128,10 +128,7 @@ def _vertex_masks(
 
 
 def _blended(
-    shares: list[tuple[tuple[IntArray, FloatArray], FloatArray]],
-    centre: IntArray,
-    far: IntArray,
-    midpoint: FloatArray,
+    shares: list[tuple[tuple[IntArray, FloatArray], FloatArray]], centre: IntArray, far: IntArray, midpoint: FloatArray
 ) -> CreaseMasks:
     """Masks before and after a refinement, with the share of each at every vertex; the shares sum to one."""
     smooth, own = np.zeros((2, len(shares[0][1])))

@@ -43,11 +43,7 @@ GRAZING = 1e-2
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
 _PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
-_KINDS = (
-    "are on the ray",
-    "are along the normal nearby",
-    "are shaded where the triangle lies in the surface",
-)
+_KINDS = ("are on the ray", "are along the normal nearby", "are shaded where the triangle lies in the surface")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 # Shapes whose kernels traverse the same elements share the parameters of their triangles.
@@ -218,12 +214,7 @@ class ExactShading:
             o, along = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
             lines = Lines(o, along, hits.kind == ON_LINE)
         found = kernel.at(
-            hits.location,
-            active,
-            2 if flags & _NORMAL_DERIVATIVES else 1,
-            lines=lines,
-            moves=moves,
-            values=hits.values,
+            hits.location, active, 2 if flags & _NORMAL_DERIVATIVES else 1, lines=lines, moves=moves, values=hits.values
         )
         is_before = active & (dot(dr.detach(found.p) - hit, d) < 0)
         found = found.placed(to_world)

@@ -227,10 +227,7 @@ PARAMETERS = (
         default_text="the only mesh",
     ),
     Parameter(
-        "time",
-        "float",
-        "Time code of a USD file",
-        default_text="values that do not depend on time, or the first ones",
+        "time", "float", "Time code of a USD file", default_text="values that do not depend on time, or the first ones"
     ),
     Parameter(
         "material",
@@ -386,10 +383,7 @@ PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 # Further parameters, which only `traverse` exposes.
 STATE_PARAMETERS = (
     Parameter(
-        "control_points",
-        "float[]",
-        "Vertices of the control cage, flat x, y, z, in object space",
-        flags=DISCONTINUOUS,
+        "control_points", "float[]", "Vertices of the control cage, flat x, y, z, in object space", flags=DISCONTINUOUS
     ),
     Parameter(
         "cage_texcoords",

@@ -146,8 +146,7 @@ class Turntable:
         for number in numbers:
             around = np.linalg.inv(self.matrix(number))
             set_parameters(
-                loaded.scene,
-                {name: mi.ScalarTransform4f((around @ matrix).tolist()) for name, matrix in first.items()},
+                loaded.scene, {name: mi.ScalarTransform4f((around @ matrix).tolist()) for name, matrix in first.items()}
             )
             yield loaded
 

@@ -455,10 +455,7 @@ class LimitSurface:
         if evaluator not in self._pieces:
             levels = {"piece_levels": 0} if evaluator == "stam" else {}
             self._pieces[evaluator] = patches.PieceTable.build(
-                self.patches,
-                self.cage.cut_mesh.vertex,
-                self.cage.vertex_count,
-                **levels,
+                self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count, **levels
             )
         return self._pieces[evaluator]
 

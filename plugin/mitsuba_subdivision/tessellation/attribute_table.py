@@ -56,11 +56,7 @@ class AttributeTable:
 
     @classmethod
     def build(
-        cls,
-        table: VertexTable,
-        patches: PatchTable,
-        control_of_vertex: IntArray,
-        channels: Mapping[str, Channel],
+        cls, table: VertexTable, patches: PatchTable, control_of_vertex: IntArray, channels: Mapping[str, Channel]
     ) -> AttributeTable:
         """Evaluate attributes in float64.
 

@@ -46,9 +46,7 @@ def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
     if available is None:
         return
     fits = bisect_right(
-        range(1, grid.rate),
-        available,
-        key=lambda rate: bytes_of_tessellation(patches, grid.at_rate(rate)),
+        range(1, grid.rate), available, key=lambda rate: bytes_of_tessellation(patches, grid.at_rate(rate))
     )
     raise MemoryError(
         f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "

@@ -117,11 +117,7 @@ def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, co
 
 
 def _strips(
-    rates: IntArray,
-    sides: SideSamples,
-    tiles: IntArray,
-    first_inner: IntArray,
-    keeps_corner: NDArray[np.bool_] | None,
+    rates: IntArray, sides: SideSamples, tiles: IntArray, first_inner: IntArray, keeps_corner: NDArray[np.bool_] | None
 ) -> list[tuple[IntArray, IntArray]]:
     """Triangles between the sides of tiles and the first row of their inner samples."""
     m, found = sides.corner_count, []
