@@ -63,7 +63,7 @@ def few_steps(monkeypatch):
 
 
 def test_the_command_line_knows_every_figure():
-    from mitsuba_subdivision.commands.command_line import parser
+    from mitsuba_subdivision.__main__ import parser
     from mitsuba_subdivision.figures import FIGURES
 
     assert tuple(FIGURES) == FIGURE_NAMES
@@ -73,7 +73,7 @@ def test_the_command_line_knows_every_figure():
 
 def test_figures_of_users_leave_a_checkout_as_it_is():
     """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
-    from mitsuba_subdivision.commands.command_line import parser
+    from mitsuba_subdivision.__main__ import parser
 
     output = parser().parse_args(["figure", "artifact"]).output
     root = Path(__file__).resolve().parents[2]

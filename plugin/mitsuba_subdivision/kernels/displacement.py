@@ -118,6 +118,11 @@ class DisplacedPiece:
         """See `Piece`."""
         return self.surface.magnification
 
+    @property
+    def is_deep(self) -> Mask | None:
+        """See `Piece`."""
+        return self.surface.is_deep
+
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """See `Piece.is_inside`."""
         return self.surface.is_inside(du, dv, tolerance)

@@ -130,6 +130,11 @@ class Piece:
     tip: Tip | None
     size: int = 3  # Of a value
 
+    @property
+    def is_deep(self) -> Mask | None:
+        """Whether parameters lie at the deeper levels of a tip; None if there are no tips."""
+        return None if self.tip is None else self.tip.control_count > 0
+
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """Whether parameters so far on are in the piece, or no further outside than a tolerance."""
         s, t = self._parameters(du, dv)

@@ -244,7 +244,7 @@ class SurfaceKernel:
             2 adds those of the normals.
         lines : Lines, optional
             With these, derivatives follow the points at which the lines intersect the surface; else the location stays.
-            Those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
+            Beside extraordinary points, those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
         nearest : NearestPoints, optional
             With these, derivatives follow the points that are nearest to them.
         moves : bool
@@ -295,9 +295,11 @@ class SurfaceKernel:
         x, y = (dr.replace_grad(self.types.float(0), each) for each in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
         location, moved = Location(location.half_edge, u + x, v + y), values.shifted(x, y)
         n = n + (dr.detach(dn_du) * x + dr.detach(dn_dv) * y)
-        # Derivatives of tangents have no bound near extraordinary points, and would add much noise.
-        tangents = values if follows is lines and lines is not None else moved
-        found = SurfacePoints(location, moved.value, n, tangents.du, tangents.dv)
+        du, dv = moved.du, moved.dv
+        if follows is lines and piece.is_deep is not None:
+            # Derivatives of tangents have no bound near extraordinary points, and would add much noise.
+            du, dv = dr.select(piece.is_deep, values.du, du), dr.select(piece.is_deep, values.dv, dv)
+        found = SurfacePoints(location, moved.value, n, du, dv)
         if derivatives == 1:
             return found
         by_u, by_v = _second_normal_derivatives(piece)

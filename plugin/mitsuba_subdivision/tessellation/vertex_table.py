@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..evaluation.normals import LEAST_EXTENT, unit_normals
-from ..files.triangle_writer import write_triangles
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from .vertex_stencils import ClassStencils, VertexStencils
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from scipy import sparse
 
     from ..patches import StencilRows
@@ -361,4 +361,6 @@ class Tessellation:
         OSError
             If the file cannot be written; an existing one is then left as it was.
         """
+        from ..files.triangle_writer import write_triangles
+
         write_triangles(path, self.positions, self.normals, self.triangles, self.texcoords, self.attributes)
