@@ -1,4 +1,4 @@
-"""Contents of a file that has a control cage."""
+"""Contents of a file that has a control cage, and whether those of two are equal."""
 
 from __future__ import annotations
 

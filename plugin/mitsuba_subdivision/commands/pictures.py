@@ -1,4 +1,4 @@
-"""Pictures that the options of ``render`` ask for, here or on the workers of a cluster."""
+"""Pictures and scene files that the options of ``render`` ask for, here or on the workers of a cluster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A cage whose surface is that of a dense mesh."""
+"""A cage whose surface is that of a dense mesh, by random points of the mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control values on the device: products with sparse weights, and arrays that kernels gather from."""
+"""Control values on the device: products with sparse matrices, and arrays that kernels gather from."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Operations on vectors of three components: 3-vectors of Dr.Jit, or lists of arrays, such as whole arrays on the host.
 
-Those of Dr.Jit's own that are here as well take several times as long to trace.
+Those of Dr.Jit's own that are here as well take several times as long to trace. Beside them are the tolerances of
+Newton's steps.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ The faces of a polygon mesh are one, and the vertices at their corners its entri
 ``ranges(first, lengths)``                   ``first, first + 1, ...`` in every row
 ============================  =============  ======================================
 
-A value for each row becomes one for each entry by ``np.repeat(values, lengths)``.
+A value for each row becomes one for each entry by ``np.repeat(values, lengths)``. Long arrays are processed in chunks
+(`chunks_of`) and looked up by `gathered`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Texture coordinates and attributes of a refined cage."""
+"""Texture coordinates and attributes of a refined cage, and how its limit surface may differ."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surface interactions of the limit surface at the triangles that rays hit."""
+"""Surface interactions of the limit surface at the triangles that rays hit, and the variants that have them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera that frames all points as closely as possible."""
+"""Views of a model, and a camera that frames all points as closely as possible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Polygon meshes in memory as entries of a scene, which can be loaded, and saved as PLY files."""
+"""Polygon meshes in memory as entries of a scene, which can be loaded, and saved as PLY files; and their points."""
 
 from __future__ import annotations
 
