@@ -100,7 +100,7 @@ class NetworkReader:
         return plain.ravel().tolist() if plain.ndim else float(plain)
 
     def _usual(self, declared: MaterialX.Input) -> Input | None:
-        """What an input is that nothing is said of."""
+        """Default of an input without a value or connection."""
         geometry = declared.getDefaultGeomPropString()
         if geometry:
             is_uv = geometry == "UV0"

@@ -257,8 +257,11 @@ def picture():
         ({"regularizers": {"stretch": 1}}, 'regularizer "stretch"; expected one of laplacian'),
         ({"crease_of": [0]}, "crease_of without sharp_edges; expected both"),
         ({"sharp_edges": [(0, 1)], "crease_of": [0, 1]}, r"crease_of of the shape \(2,\) and type int64; expec"),
-        ({"sharp_edges": [(0, 1)], "crease_of": [1]}, "crease_of has no crease 0; expected all from 0 on"),
-        ({"sharp_edges": [(0, 1)], "crease_of": [-1]}, "crease_of has a crease -1; expected all from 0 on"),
+        ({"sharp_edges": [(0, 1)], "crease_of": [1]}, "crease_of skips crease 0; expected consecutive indices from 0"),
+        (
+            {"sharp_edges": [(0, 1)], "crease_of": [-1]},
+            "crease_of has a crease -1; expected consecutive indices from 0",
+        ),
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
     ],
 )

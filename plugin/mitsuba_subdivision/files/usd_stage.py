@@ -14,7 +14,7 @@ from .usd_values import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES, value_at
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
 
-# In where of the path of a prim: all meshes of the file.
+# Value of `prim` that selects every mesh in the file.
 ALL = "*"
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000

@@ -282,5 +282,6 @@ def _checked_creases(crease_of: ArrayLike | None, edge_count: int) -> IntArray:
     missing = np.setdiff1d(np.arange(found.max(initial=-1) + 1), found)
     if (found < 0).any() or len(missing):
         wrong = int(found.min()) if (found < 0).any() else int(missing[0])
-        raise ValueError(f"crease_of has {'a' if wrong < 0 else 'no'} crease {wrong}; expected all from 0 on")
+        what = f"has a crease {wrong}" if wrong < 0 else f"skips crease {wrong}"
+        raise ValueError(f"crease_of {what}; expected consecutive indices from 0")
     return found.astype(np.int64)

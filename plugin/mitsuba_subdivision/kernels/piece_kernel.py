@@ -110,7 +110,7 @@ class TipFrame:
     """Tangents in place of the derivatives."""
 
     row: Index  # First row of the block whose derivatives they are
-    # Where they are; and where they are those of `uneven_frame`
+    # Lanes that need a tangent frame, and lanes that need that of `uneven_frame`
     is_needed: Mask
     is_uneven: Mask
 

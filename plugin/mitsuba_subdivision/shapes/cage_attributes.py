@@ -109,7 +109,7 @@ class CageAttributes:
         self._weights: dict[tuple, Any] = {}
 
     def update(self, keys: Iterable[str], on_backward: OnBackward) -> list[str]:
-        """Read the new values of those parameters that are among some keys.
+        """Read the attributes that are named in ``keys`` again.
 
         Returns list of str: names of their attributes. Raises ValueError if the number of values has changed, or one is
         not finite.

@@ -177,8 +177,7 @@ PARAMETERS = (
     Parameter(
         "cage_name",
         "string",
-        "Name of a cage in memory, for messages. Warnings about the cage are taken as given, as `usd_scene` gives them "
-        "by the same name, and are not repeated",
+        "Name of a cage in memory, for messages. Suppresses warnings about the cage, which its creator has issued",
         default_text="``control cage``, with warnings",
     ),
     Parameter(

@@ -21,7 +21,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray
 
-# What rounding may leave of parameters.
+# Tolerance when comparing parameters.
 PARAMETER_ROUNDING = 1e-9
 
 

@@ -58,7 +58,7 @@ class TileRates:
     def are_within(
         self, tiles: Tiles, lower: FloatArray, upper: FloatArray, axis: FloatArray, extent: FloatArray
     ) -> NDArray[np.bool_]:
-        """``(t,)`` whether one pair of triangles does for tiles whose hulls extend so far.
+        """``(t,)`` whether two triangles approximate tiles with these hulls within the tolerance.
 
         Parameters
         ----------

@@ -27,7 +27,7 @@ _ERROR, _NO_ERROR, _ERROR_TYPE = (
     "_ZN8nanobind12python_errorD1Ev",
     "_ZTIN8nanobind12python_errorE",
 )
-# From an object of C++ to one of Python; what is to be done with the former when the latter goes; and that.
+# Functions of nanobind: wrap a C++ object, set its ownership, destroy it.
 _OBJECT_AT, _SET_STATE, _DESTRUCT = (
     "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object",
     "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
