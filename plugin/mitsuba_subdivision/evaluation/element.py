@@ -367,11 +367,17 @@ class LimitStencil(NamedTuple):
     For a vertex, over the centre, the edge ring and the face ring, counter-clockwise; the face ring's vertex i lies
     between the edge ring's i and i + 1, and it is empty where faces are triangles. For a face of a vertex-based scheme,
     over its vertices, counter-clockwise.
+
+    Attributes
+    ----------
+    position : (m,) float64
+        Sums to one.
+    tangents : (2, m) float64
+        Sum to zero. Weights on the edge ring, or the face's vertices, are ``cos(2 pi i / n)`` and ``sin(2 pi i / n)``;
+        the cross product of the two tangents points outward.
     """
 
-    position: FloatArray  # (m,) float64: sums to one
-    # (2, m) float64: sum to zero. Weights on the edge ring, or the face's vertices, are ``cos(2 pi i / n)`` and
-    # ``sin(2 pi i / n)``; the cross product of the two tangents points outward.
+    position: FloatArray
     tangents: FloatArray
 
 

@@ -35,6 +35,7 @@ class Fit(ABC):
     ----------
     cage : ControlCage
         Where to begin. Its topology, tags and rules stay, but for refinement.
+    scheme : str or None
     refine : sequence of int, or int
         Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
     callbacks : sequence of callable
@@ -98,7 +99,10 @@ class Fit(ABC):
     def step(self) -> float:
         """Take a step, and return the loss before it.
 
-        Raises CageError, SchemeError if the cage is due to be refined and cannot be: see `ControlCage.refinement`.
+        Raises
+        ------
+        CageError, SchemeError
+            If the cage is due to be refined and cannot be: see `ControlCage.refinement`.
         """
         number = len(self.losses)
         if self._is_time_to_refine(number):
@@ -114,8 +118,10 @@ class Fit(ABC):
 
         Parameters
         ----------
+        steps : int
         checkpoint : path, optional
             Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end.
+        every : int
         """
         for number in counted(range(1, steps + 1), "Steps"):
             self.step()
@@ -132,7 +138,13 @@ class Fit(ABC):
         return bool(now > (1 - LEAST_FALL) * before)
 
     def refine(self) -> None:
-        """Refine the cage once: the same surface, with four times as many control points, about."""
+        """Refine the cage once: the same surface, with four times as many control points, about.
+
+        Raises
+        ------
+        CageError, SchemeError
+            As `ControlCage.refinement`.
+        """
         refinement = self.cage.refinement(self._scheme)
         self._follow(refinement)
         self._start = refinement.cage.with_positions(refinement.matrix @ self._start.positions)
@@ -143,15 +155,22 @@ class Fit(ABC):
     def save_checkpoint(self, path: str | Path) -> None:
         """Write the state that `resume` needs.
 
-        Raises OSError if the file cannot be written; an existing one is then unchanged.
+        Raises
+        ------
+        OSError
+            If the file cannot be written; an existing one is then unchanged.
         """
         Checkpoint(self.refinements, self._since, np.array(self.losses), self._states()).save(Path(path))
 
     def resume(self, path: str | Path) -> Self:
         """Resume from a checkpoint of a fit with the same arguments.
 
-        Raises ValueError if the file is no checkpoint, or one of another fit. Raises OSError if the file cannot be
-        read.
+        Raises
+        ------
+        ValueError
+            If the file is no checkpoint, or one of another fit.
+        OSError
+            If the file cannot be read.
         """
         found = Checkpoint.load(Path(path))
         if self.refinements > found.refinements:
@@ -186,7 +205,10 @@ class Schedule:
     def of(cls, given: Schedulable, name: str) -> Schedule:
         """A schedule of a number, of pairs ``(step, value)``, or of a function.
 
-        Raises ValueError if it is none of these, or if steps do not increase; the message has the name.
+        Raises
+        ------
+        ValueError
+            If it is none of these, or if steps do not increase; the message has the name.
         """
         if callable(given):
             return cls(np.zeros(1), np.zeros(1), given)

@@ -25,8 +25,6 @@ class LargeSteps:
 
     It stands in for ``mitsuba.ad.LargeSteps``, which requires a mesh of triangles.
 
-    Raises ValueError if ``lambda_`` is not positive.
-
     Parameters
     ----------
     laplacian : (n, n) sparse array
@@ -34,6 +32,11 @@ class LargeSteps:
         `LimitSurface.stiffness`.
     lambda_ : float
         How far steps reach: more than 0. Where it is large, all of the surface moves together.
+
+    Raises
+    ------
+    ValueError
+        If ``lambda_`` is not positive.
     """
 
     def __init__(self, laplacian: sparse.csr_array, lambda_: float) -> None:
@@ -53,6 +56,10 @@ class LargeSteps:
         Parameters
         ----------
         points : (n, 3) array, or flat Dr.Jit array
+
+        Returns
+        -------
+        mi.Float
         """
         given = np.array(points, dtype=np.float64).reshape(-1, 3)
         return upload(mi.Float, self.matrix @ given)

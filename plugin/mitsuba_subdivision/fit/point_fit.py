@@ -33,11 +33,20 @@ DAMPING = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Points of the surface, and their targets."""
+    """Points of the surface, and their targets.
 
-    weights: sparse.csr_array  # (s, n) CSR array of float64: points of the surface over control points
-    goals: FloatArray  # (s, 3) float64
-    across: FloatArray  # (s, 3) float64: unit normals, along which distances count in full; zero where there is none
+    Attributes
+    ----------
+    weights : (s, n) CSR array of float64
+        Points of the surface over control points.
+    goals : (s, 3) float64
+    across : (s, 3) float64
+        Unit normals, along which distances count in full; zero where there is none.
+    """
+
+    weights: sparse.csr_array
+    goals: FloatArray
+    across: FloatArray
 
     @classmethod
     def joined(cls, parts: Sequence[_Pairs]) -> _Pairs:

@@ -1,4 +1,4 @@
-"""A cage whose surface is that of a dense mesh, by random points of the mesh."""
+"""A cage whose surface is that of a dense mesh."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ def to_mesh(
 ) -> ControlCage:
     """Fit a cage to a mesh of triangles: from a scan or a sculpt to a few control points.
 
-    Raises ValueError if the mesh is malformed or has no area, or as `PointFit`.
-
     Parameters
     ----------
     cage : ControlCage
@@ -41,8 +39,16 @@ def to_mesh(
         Of `PointFit`.
     count : int, optional
         Points on the mesh, uniform by area; by default eight for each control point in the end.
+    seed : int
     **options
         Of `PointFit`, such as ``refine``.
+
+    Raises
+    ------
+    ValueError
+        If the mesh is malformed or has no area, or as `PointFit`.
+    CageError, SchemeError
+        As `PointFit`.
     """
     refine = options.get("refine", ())
     if count is None:
@@ -83,6 +89,8 @@ def triangle_samples(positions: FloatArray, triangles: IntArray, count: int, see
     positions : (n, 3) array
     triangles : (m, 3) int array
         0-based; some of them have an area.
+    count : int
+    seed : int
 
     Returns
     -------

@@ -28,25 +28,29 @@ Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture, and the sensor that took it."""
+    """A picture, and the sensor that took it.
 
-    # Its film has the size of the picture, the box filter, and ``sample_border``, if outlines may leave the picture
+    Attributes
+    ----------
+    sensor : dict or mi.Sensor
+        Its film has the size of the picture, the box filter, and ``sample_border``, if outlines may leave the picture.
+    picture : (height, width, channels) array, mi.Bitmap, or path of a file
+        In linear light, with the channels of the film; bitmaps are converted.
+    mask : (height, width) array, optional
+        Weight of each pixel; 0 where the picture is not to be compared.
+    """
+
     sensor: Any
-    # (height, width, channels) array, mi.Bitmap, or path of a file: in linear light, with the channels of the film;
-    # bitmaps are converted
     picture: Any
-    # (height, width) array: weight of each pixel; 0 where the picture is not to be compared
     mask: ArrayLike | None = None
 
 
 class Pictures:
     """A scene with a subdivision surface, rendered in its views.
 
-    Raises ValueError if the variant has no derivatives, there are no views, a picture does not fit its film, or an
-    entry of ``scene`` has the shape's name.
-
     Parameters
     ----------
+    views : sequence of View
     scene : dict
         What there is besides the surface: emitters, and the integrator if it is to be another one.
     shape : dict
@@ -57,6 +61,12 @@ class Pictures:
         Samples of each pixel.
     edge_spp : int
         Samples of outlines for each pixel, where the integrator has such.
+
+    Raises
+    ------
+    ValueError
+        If the variant has no derivatives, there are no views, a picture does not fit its film, or an entry of
+        ``scene`` has the shape's name.
     """
 
     def __init__(
@@ -92,6 +102,7 @@ class Pictures:
 
         Parameters
         ----------
+        cage : ControlCage
         halvings : int
             How often it was refined: its edges have half as many segments each time.
         """
@@ -107,6 +118,7 @@ class Pictures:
         ----------
         values : dict
             Parameters of the scene, by their names.
+        seed : int
         """
         for name, value in values.items():
             self.params[name] = value

@@ -109,9 +109,6 @@ def compare(
     where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
     Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
 
-    Raises ImageError if an image is denoised, the sizes differ, a tier is unknown, or the images lack what a chosen
-    tier compares.
-
     Parameters
     ----------
     tiers : sequence of str, optional
@@ -120,6 +117,11 @@ def compare(
         By default those stored with the reference.
     suite_size : int
         Number of scenes that share the probability of a false alarm.
+
+    Raises
+    ------
+    ImageError
+        If an image is denoised, the sizes differ, a tier is unknown, or the images lack what a chosen tier compares.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
@@ -176,7 +178,10 @@ def _decide(
 ) -> None:
     """Let other tiers decide where one cannot, and where one proves that another's finding is chance.
 
-    Raises ImageError if a tier that was chosen cannot run, and no other stands in for it.
+    Raises
+    ------
+    ImageError
+        If a tier that was chosen cannot run, and no other stands in for it.
     """
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):

@@ -39,12 +39,20 @@ class Estimate:
     A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
     samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
     and a renderer needs to output images only.
+
+    Attributes
+    ----------
+    mean : (height, width, 3) float64
+    variance : (height, width, 3) float64
+        Of one sample. Zero if there is one batch only, from which it cannot be estimated.
+    count : (height, width) int64
+        Samples of each pixel.
+    batches : int
     """
 
-    mean: NDArray[np.float64]  # (height, width, 3) float64
-    # (height, width, 3) float64: of one sample. Zero if there is one batch only, from which it cannot be estimated.
+    mean: NDArray[np.float64]
     variance: NDArray[np.float64]
-    count: NDArray[np.int64]  # (height, width) int64: samples of each pixel
+    count: NDArray[np.int64]
     batches: int
 
     @classmethod
@@ -66,7 +74,10 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
     The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
     same order, the same estimates give the same bits.
 
-    Raises ImageError if there is no estimate, or their sizes differ.
+    Raises
+    ------
+    ImageError
+        If there is no estimate, or their sizes differ.
     """
     total: Estimate | None = None
     squares = np.zeros(())
@@ -93,16 +104,29 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A linear RGB image, and the further data of its file."""
+    """A linear RGB image, and the further data of its file.
 
-    name: str  # For messages: the path of the file, in most cases
-    pixels: NDArray[np.float64]  # (height, width, 3) float64
-    estimate: Estimate | None = None  # Variance and number of samples; the mean of the estimate is ``pixels``
-    # (height, width, 3) float64 or None: the first batch alone. A later render of the same scene repeats its samples
-    # one by one.
+    Attributes
+    ----------
+    name : str
+        For messages: the path of the file, in most cases.
+    pixels : (height, width, 3) float64
+    estimate : Estimate or None
+        Variance and number of samples; the mean of the estimate is ``pixels``.
+    paired : (height, width, 3) float64 or None
+        The first batch alone. A later render of the same scene repeats its samples one by one.
+    probe : Probe or None
+        What the ray through the centre of each pixel hits.
+    metadata : dict
+        How the image was made.
+    """
+
+    name: str
+    pixels: NDArray[np.float64]
+    estimate: Estimate | None = None
     paired: NDArray[np.float64] | None = None
-    probe: Probe | None = None  # What the ray through the centre of each pixel hits
-    metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
+    probe: Probe | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -134,7 +158,10 @@ class Image:
 def require_finite(image: Image) -> None:
     """Refuse an image with values that are not finite, which merging would spread, and no tier can compare.
 
-    Raises ImageError if there are any; the message names the first.
+    Raises
+    ------
+    ImageError
+        If there are any; the message names the first.
     """
     broken = image.not_finite()
     if broken:
@@ -151,8 +178,10 @@ def save_image(path: str | Path, image: Image) -> None:
 def load_image(path: str | Path) -> Image:
     """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
 
-    Raises ImageError if the file cannot be read, channels are missing, or the number of samples or the variance is
-    impossible.
+    Raises
+    ------
+    ImageError
+        If the file cannot be read, channels are missing, or the number of samples or the variance is impossible.
     """
     channels, metadata = read_channels(path)
     source = str(path)
@@ -288,8 +317,11 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
-    Raises ImageError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep
-    pixels or broken metadata.
+    Raises
+    ------
+    ImageError
+        If there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep pixels or broken
+        metadata.
     """
     path = Path(path)
     if not path.is_file():

@@ -74,28 +74,46 @@ class Tolerances:
     Those of the probe are at least four times as large as the differences between variants of Mitsuba (scalar against
     LLVM: 6e-5 degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and small enough to notice one weight
     of a refinement rule that is wrong by a thousandth (0.009 degrees, 1.2e-5 diagonals).
+
+    Attributes
+    ----------
+    mask_fraction : float
+        Part of the pixels whose ray may hit another shape or element, or hit where the other image has nothing.
+    angle_p999, angle_max : float
+        Degrees between shading normals: 99.9th percentile and maximum, away from silhouettes.
+    position : float
+        Distance of hit points, in diagonals of the bounding box of all hit points.
+    uv_p999 : float
+        Difference of the surface parameters where the same triangle is hit, 99.9th percentile.
+    paired_relative : float
+        Relative difference of pixels with the same samples; 0 demands equal bits.
+    alpha : float
+        Probability that any scene of a suite without changes fails the tile tier.
+    floor_relative, floor_absolute : float
+        What sums in single precision may add to the standard error of a tile: relative to its mean, and in radiance.
+    flip_mean, flip_p95 : float
+        Mean and 95th percentile of FLIP.
     """
 
-    # Part of the pixels whose ray may hit another shape or element, or hit where the other image has nothing
     mask_fraction: float = 1e-3
-    # Degrees between shading normals: 99.9th percentile and maximum, away from silhouettes
     angle_p999: float = 0.002
     angle_max: float = 0.01
-    position: float = 5e-6  # Distance of hit points, in diagonals of the bounding box of all hit points
-    uv_p999: float = 1e-3  # Difference of the surface parameters where the same triangle is hit, 99.9th percentile
-    paired_relative: float = 1e-5  # Relative difference of pixels with the same samples; 0 demands equal bits
-    alpha: float = 0.01  # Probability that any scene of a suite without changes fails the tile tier
-    # What sums in single precision may add to the standard error of a tile: relative to its mean, and in radiance
+    position: float = 5e-6
+    uv_p999: float = 1e-3
+    paired_relative: float = 1e-5
+    alpha: float = 0.01
     floor_relative: float = 2e-4
     floor_absolute: float = 1e-6
-    # Mean and 95th percentile of FLIP
     flip_mean: float = 0.005
     flip_p95: float = 0.02
 
     def with_values(self, values: Mapping[str, Any]) -> Tolerances:
         """Tolerances with some values replaced.
 
-        Raises ImageError if a name is unknown, or a value is not a finite number of at least 0.
+        Raises
+        ------
+        ImageError
+            If a name is unknown, or a value is not a finite number of at least 0.
         """
         known = [field.name for field in fields(self)]
         for name, value in values.items():

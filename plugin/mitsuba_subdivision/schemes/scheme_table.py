@@ -14,7 +14,13 @@ _SCHEMES: dict[str, Scheme] = {}
 
 
 def scheme_named(name: str) -> Scheme:
-    """Look a scheme up by name. Raises SchemeError if there is none of that name; the message lists those there are."""
+    """Look a scheme up by name.
+
+    Raises
+    ------
+    SchemeError
+        If there is none of that name; the message lists those there are.
+    """
     if name not in _SCHEMES:
         if name not in SCHEME_CLASSES:
             raise SchemeError(
@@ -28,7 +34,10 @@ def scheme_named(name: str) -> Scheme:
 def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
     """The scheme with the rules of a cage: a copy, or the scheme itself if these are its rules.
 
-    Raises SchemeError if the scheme has no such rules: only Catmull-Clark knows another one for triangles.
+    Raises
+    ------
+    SchemeError
+        If the scheme has no such rules: only Catmull-Clark knows another one for triangles.
     """
     changed = {
         name: rule
