@@ -362,6 +362,25 @@ def test_derivatives_by_parameters_are_the_tangents_and_those_of_the_normal(name
             np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
 
 
+@pytest.mark.parametrize("name", ["polygons", "triangles"])
+def test_derivatives_of_tangents_by_parameters_are_second_derivatives(name, np_rng):
+    """At the deeper levels of tips, too, where those by hits leave them out."""
+    surface = small_surface(name)
+    kernel = surface.on_device(DOUBLE)
+    location = random_locations(surface, np_rng, 200, deepest=6)
+    element, uv, corner = on_device(kernel.types, *location)
+    expected = surface.evaluate(*location, derivatives=2)
+    second = ((expected.d2p_duu, expected.d2p_duv), (expected.d2p_duv, expected.d2p_dvv))
+    for axis, by_axis in enumerate(second):
+        own = kernel.types.vector2(uv)
+        dr.enable_grad(own)
+        found = kernel.evaluate(element, own, corner)
+        changes = forward([found.dp_du, found.dp_dv], [own], [kernel.types.vector2(1 - axis, axis)])
+        for change, derivative in zip(changes, by_axis, strict=True):
+            scale = np.linalg.norm(derivative, axis=1).max()
+            np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
+
+
 # Rays
 
 

@@ -296,7 +296,7 @@ class SurfaceKernel:
         location, moved = Location(location.half_edge, u + x, v + y), values.shifted(x, y)
         n = n + (dr.detach(dn_du) * x + dr.detach(dn_dv) * y)
         du, dv = moved.du, moved.dv
-        if follows is lines and piece.is_deep is not None:
+        if lines is not None and follows is lines and piece.is_deep is not None:
             # Derivatives of tangents have no bound near extraordinary points, and would add much noise.
             du, dv = dr.select(piece.is_deep, values.du, du), dr.select(piece.is_deep, values.dv, dv)
         found = SurfacePoints(location, moved.value, n, du, dv)
