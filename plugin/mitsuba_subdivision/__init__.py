@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from .evaluation.element import limit_stencil
     from .evaluation.scheme_laws import check_scheme
     from .examples import example_file
-    from .fit.views import loss_of_views
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
     from .schemes import SchemeError
+    from .shapes.moving_vertices import loss_of_views
     from .shapes.tessellation_parameters import pixel_error_for
     from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
@@ -86,7 +86,7 @@ _MODULES = {
     "check_scheme": "evaluation.scheme_laws",
     "example_file": "examples",
     "limit_stencil": "evaluation.element",
-    "loss_of_views": "fit.views",
+    "loss_of_views": "shapes.moving_vertices",
     "pixel_error_for": "shapes.tessellation_parameters",
     "register_scheme": "schemes",
     "render_denoised": "studio",

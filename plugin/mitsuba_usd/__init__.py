@@ -4,7 +4,7 @@ Meshes, cameras, lights, and materials of MaterialX and of UsdPreviewSurface bec
 The package needs nothing of `mitsuba_subdivision` but its public names.
 
 stage_walk.py, stage_*.py, polygons.py   read a stage to plain data
-materialx_layers.py, materialx_library.py   the USD layers and the node library of MaterialX
+materialx_layers.py          the USD layers and the node library of MaterialX
 contents.py                  the plain data
 surface_models.py            models of surfaces, by the inputs that all share
 materialx_nodes.py, materialx_noise.py, baking.py   nodes of MaterialX, evaluated to numbers or pictures

@@ -4,9 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes import exact_shading
-from mitsuba_subdivision.shapes.exact_shading import exact_shading_problem
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook import interaction_hook
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import exact_shading_problem, hook_problem
 
 
 def _made(**parameters):
@@ -43,7 +42,7 @@ def test_scalar_variants_have_a_reason_of_their_own():
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_without_the_hook_it_is_normals_of_vertices(monkeypatch):
-    monkeypatch.setattr(exact_shading, "hook_problem", lambda: "needs another computer")
+    monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
     assert exact_shading_problem(_variant()) == "exact shading needs another computer"
     automatic = _made(shading="auto")
     assert _shading(automatic) == "vertex"
@@ -56,11 +55,11 @@ def test_a_trial_that_fails_is_a_reason(monkeypatch):
     def fail(*_):
         raise RuntimeError("needs the virtual functions of Mitsuba 3.9")
 
-    monkeypatch.setattr(exact_shading, "hook_problem", lambda: None)
-    monkeypatch.setattr(exact_shading, "interaction_hook", fail)
-    exact_shading._trial_problem.cache_clear()
+    monkeypatch.setattr(interaction_hook, "hook_problem", lambda: None)
+    monkeypatch.setattr(interaction_hook, "interaction_hook", fail)
+    interaction_hook._trial_problem.cache_clear()
     assert exact_shading_problem(_variant()) == "exact shading needs the virtual functions of Mitsuba 3.9"
-    exact_shading._trial_problem.cache_clear()
+    interaction_hook._trial_problem.cache_clear()
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes import exact_shading
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook import interaction_hook
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import StillPicture, Turntable
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
@@ -74,7 +74,7 @@ def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
 def test_the_command_says_once_what_it_does_elsewhere(tmp_path, monkeypatch, capfd, words):
     CUBE.save(tmp_path / "cube.obj")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(exact_shading, "hook_problem", lambda: "needs another computer")
+    monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
     assert main(["render", "cube.obj", "-o", "a.png", *SMALL, *words, "-m", "llvm_ad_rgb"]) == 0
     assert capfd.readouterr().err.count("exact shading needs another computer\n") == 1
     assert main(["render", "cube.obj", "-o", "b.png", *SMALL, *words, "--shading", "vertex", "-m", "llvm_ad_rgb"]) == 0

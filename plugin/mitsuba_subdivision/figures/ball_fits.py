@@ -16,7 +16,7 @@ from ..cage.named_cages import cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.to_mesh import triangle_samples
-from ..fit.views import loss_of_views
+from ..shapes.moving_vertices import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode
 from .figure_scenes import make_mesh

@@ -99,12 +99,14 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
         warnings.simplefilter("error", DeprecationWarning)
         # Plyfile maps lists of one known length, and reads all others row by row, in a hundred times as long. It maps
         # a file of our own, as the process would end if another program cut a mapped file.
-        for corners in (3, 4) if binary else ():
-            with suppress(Exception), tempfile.TemporaryFile() as file:
+        if binary:
+            with tempfile.TemporaryFile() as file:
                 file.write(content)
-                file.seek(0)
-                lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
-                return {element.name: element for element in PlyData.read(file, known_list_len=lengths)}
+                for corners in (3, 4):
+                    lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
+                    with suppress(Exception):
+                        file.seek(0)
+                        return {element.name: element for element in PlyData.read(file, known_list_len=lengths)}
         try:
             return {element.name: element for element in PlyData.read(io.BytesIO(content), mmap=False)}
         except UnicodeDecodeError:

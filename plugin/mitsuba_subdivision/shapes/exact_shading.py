@@ -1,11 +1,11 @@
-"""Surface interactions of the limit surface at the triangles that rays hit, and the variants that have them."""
+"""Surface interactions of the limit surface at the triangles that rays hit."""
 
 from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
 from enum import Enum, auto
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -30,7 +30,6 @@ from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
 from ..variants import Variant
 from .attribute_parameters import WIDTHS, mesh_name
-from .mitsuba_3_9_hook.interaction_hook import hook_problem, interaction_hook
 from .placement import Placement
 from .spectral_colors import SpectralUpsampling, holds_spectra
 
@@ -407,30 +406,3 @@ def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray)
     """Some of the locations that a function returns."""
     start, uv = locate()
     return start[chosen], uv[chosen]
-
-
-def exact_shading_problem(variant: Variant) -> str | None:
-    """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading.
-
-    Parameters
-    ----------
-    variant : module
-        Such as ``mitsuba.llvm_ad_rgb``.
-    """
-    if not dr.is_jit_v(variant.Float):
-        return "exact shading needs a variant of llvm or cuda"
-    problem = hook_problem() or _trial_problem(variant)
-    return problem and f"exact shading {problem}"
-
-
-@cache
-def _trial_problem(variant: Variant) -> str | None:
-    # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
-    class Example(variant.Mesh):
-        """Mesh derived in Python."""
-
-    try:
-        interaction_hook(variant, Example("example", vertex_count=3, face_count=1))
-    except RuntimeError as error:
-        return str(error)
-    return None

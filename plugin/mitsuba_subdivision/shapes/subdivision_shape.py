@@ -506,7 +506,7 @@ def _has_textured_emitter(props: mi.Properties, variant: Variant) -> bool:
 
 def _is_exact(parameters: Parameters, variant: Variant) -> bool:
     if parameters.shading == "auto" and not parameters.face_normals:
-        from .exact_shading import exact_shading_problem
+        from .mitsuba_3_9_hook.interaction_hook import exact_shading_problem
 
         return exact_shading_problem(variant) is None
     if parameters.shading == "exact" and not dr.is_jit_v(variant.Float):

@@ -25,7 +25,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Container, Iterator
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import FrameType, TracebackType
 from typing import Any, NoReturn, Protocol
 from weakref import WeakKeyDictionary, WeakValueDictionary
@@ -375,6 +375,33 @@ def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
                 )
             _hooks[variant] = InteractionHook(variant, example)
         return _hooks[variant]
+
+
+def exact_shading_problem(variant: Variant) -> str | None:
+    """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading.
+
+    Parameters
+    ----------
+    variant : module
+        Such as ``mitsuba.llvm_ad_rgb``.
+    """
+    if not dr.is_jit_v(variant.Float):
+        return "exact shading needs a variant of llvm or cuda"
+    problem = hook_problem() or _trial_problem(variant)
+    return problem and f"exact shading {problem}"
+
+
+@cache
+def _trial_problem(variant: Variant) -> str | None:
+    # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
+    class Example(variant.Mesh):
+        """Mesh derived in Python."""
+
+    try:
+        interaction_hook(variant, Example("example", vertex_count=3, face_count=1))
+    except RuntimeError as error:
+        return str(error)
+    return None
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
