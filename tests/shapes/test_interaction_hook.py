@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import mmap
 import re
 import subprocess
 import sys
@@ -175,7 +176,7 @@ def test_errors_leave_no_variables_behind():
     code = (
         "import contextlib\n"
         "scene = mi.load_dict({'type': 'scene', 'shape': shape('exact')})\n"
-        "def fail(self, si, ray, preliminary, flags, active):\n"
+        "def fail(self, si, hit):\n"
         "    si.uv = mi.Point2f(3 * si.p.x, si.p.y)\n"
         "    raise ValueError\n"
         "def ask():\n"
@@ -283,7 +284,7 @@ def test_an_interruption_inside_an_answer_is_raised(monkeypatch):
 
 
 @pytest.mark.parametrize("parameters", [{}, {"vertex_heat": 1}, {"scheme": "doo_sabin"}])
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.usefixtures("no_other_scene", "variant_llvm_ad_rgb")
 def test_frozen_functions_render_as_others(parameters):
     if "vertex_heat" in parameters:
         heat = upload(mi.TensorXf, np.arange(8.0, dtype=np.float32)[:, None])
@@ -308,8 +309,8 @@ def test_frozen_functions_render_as_others(parameters):
 
 
 @pytest.fixture
-def asked(monkeypatch):
-    """Shapes that are asked for interactions, one after the other."""
+def asked(monkeypatch, no_other_scene):  # noqa: ARG001
+    """Shapes that are asked for interactions, one after the other. Shapes of earlier scenes would be asked as well."""
     found = []
     complete = exact_shading.ExactShading.complete
 
@@ -593,10 +594,10 @@ def test_the_trial_notices_what_differs(kind, message):
         def __init__(self, trial):
             self.trial = trial
 
-        def complete(self, si, ray, preliminary, flags, active):
+        def complete(self, si, hit):
             uv = mi.Point2f(si.uv)
             with contextlib.suppress(hook_trial.TrialError):
-                self.trial.complete(si, ray, preliminary, flags + (kind == "hard of hearing"), active)
+                self.trial.complete(si, hit._replace(flags=hit.flags + (kind == "hard of hearing")))
             if kind == "mute":
                 si.uv = uv
 
@@ -614,6 +615,13 @@ def test_the_trial_notices_what_differs(kind, message):
             hook.attach(shape, kept[0])
 
     assert hook_trial.trial_problem(mi.llvm_ad_rgb, attach) == message
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_code_longer_than_its_page_is_refused():
+    make()
+    with pytest.raises(OSError, match=r"^machine code of \d+ bytes; expected at most a page of \d+$"):
+        machine_code._installed(bytes(mmap.PAGESIZE))
 
 
 @pytest.mark.parametrize("current", ["scalar_rgb", None])

@@ -35,6 +35,7 @@ from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
     from ..tessellation import VertexTable
+    from .mitsuba_3_9_hook.hook_trial import TriangleHit
 
 # Cosine between a ray and a normal at a silhouette.
 GRAZING = 1e-2
@@ -180,15 +181,9 @@ class ExactShading:
         for name, values in self.values.items():
             callback.put(f"shading_cage_{name}", values.flat, differentiable)
 
-    def complete(
-        self,
-        si: mi.SurfaceInteraction3f,
-        ray: mi.Ray3f,
-        preliminary: mi.PreliminaryIntersection3f,
-        flags: int,
-        active: Mask,
-    ) -> None:
+    def complete(self, si: mi.SurfaceInteraction3f, triangle_hit: TriangleHit) -> None:
         """Complete a surface interaction as Mitsuba asks for it."""
+        ray, preliminary, flags, active = triangle_hit
         kernel, vector3 = self.kernel, self.kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:

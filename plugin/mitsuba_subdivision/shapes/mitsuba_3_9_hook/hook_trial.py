@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -20,6 +20,15 @@ _ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)
 # Results that the answers return.
 _ANSWERED_UV, _VALUE = (8, 9), (10, 11, 12)
 _ATTRIBUTES = {"face_one": 1, "face_three": 3}
+
+
+class TriangleHit(NamedTuple):
+    """Arguments of `mi.Shape.compute_surface_interaction`."""
+
+    ray: mi.Ray3f
+    preliminary: mi.PreliminaryIntersection3f
+    flags: int  # `mi.RayFlags`
+    active: Mask
 
 
 class TrialError(Exception):
@@ -34,18 +43,11 @@ class Trial:
         self.asked: list[Any] = []
         self.fails = False
 
-    def complete(
-        self,
-        si: mi.SurfaceInteraction3f,
-        ray: mi.Ray3f,
-        preliminary: mi.PreliminaryIntersection3f,
-        flags: int,
-        active: Mask,
-    ) -> None:
+    def complete(self, si: mi.SurfaceInteraction3f, hit: TriangleHit) -> None:
         """Note the arguments, and answer."""
         if self.fails:
             raise TrialError
-        self.asked = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
+        self.asked = _asked(hit)
         si.uv = self._variant.Point2f(*_ANSWERED_UV)
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value:
@@ -69,13 +71,13 @@ def trial_problem(variant: Variant, attach: Callable[[mi.Mesh, Trial], None]) ->
     ray = variant.Ray3f(variant.Point3f(*_ORIGIN), variant.Vector3f(*_DIRECTION))
     preliminary = dr.zeros(variant.PreliminaryIntersection3f)
     preliminary.t, preliminary.prim_uv = variant.Float(_DISTANCE), variant.Point2f(*_UV)
-    flags, active, answered = int(mi.RayFlags.UV), variant.Mask(True), variant.Point2f(*_ANSWERED_UV)
+    active, answered = variant.Mask(True), variant.Point2f(*_ANSWERED_UV)
+    hit = TriangleHit(ray, preliminary, int(mi.RayFlags.UV), active)
 
     def interaction() -> mi.SurfaceInteraction3f:
-        return shape.compute_surface_interaction(ray, preliminary, flags, active)
+        return shape.compute_surface_interaction(*hit)
 
-    expected = [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
-    if _identity(interaction().uv) != _identity(answered) or trial.asked != expected:
+    if _identity(interaction().uv) != _identity(answered) or trial.asked != _asked(hit):
         return "compute_surface_interaction does not pass on its arguments, or its result"
     questions: list[Callable[[], Any]] = [interaction]
     si = dr.zeros(variant.SurfaceInteraction3f)
@@ -124,6 +126,11 @@ def _triangle(variant: Variant) -> mi.Mesh:
         mesh.add_attribute(name, size, [0.0] * size)
     mesh.traverse(Corners())
     return mesh
+
+
+def _asked(hit: TriangleHit) -> list[Any]:
+    ray, preliminary, flags, active = hit
+    return [*_identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active), flags]
 
 
 def _identity(*values: Any) -> list[Any]:

@@ -36,7 +36,7 @@ import mitsuba as mi
 from ...kernels.types import Mask, Value
 from ...variants import Variant, variant_name
 from ..device_state import paused_collection
-from .hook_trial import trial_problem
+from .hook_trial import TriangleHit, trial_problem
 from .machine_code import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
 # Functions of the library of Mitsuba's Python bindings: from a Python object to its C++ instance, and back; and the
@@ -129,14 +129,7 @@ class Answers(Protocol):
     An error is raised where Python called Mitsuba. Arguments lie in memory of C++ and must not be kept.
     """
 
-    def complete(
-        self,
-        si: mi.SurfaceInteraction3f,
-        ray: mi.Ray3f,
-        preliminary: mi.PreliminaryIntersection3f,
-        flags: int,
-        active: Mask,
-    ) -> None:
+    def complete(self, si: mi.SurfaceInteraction3f, hit: TriangleHit) -> None:
         """Complete a surface interaction.
 
         Called after Mitsuba has filled in that of the triangle, while a kernel is traced.
@@ -218,13 +211,13 @@ class InteractionHook:
                 return
             # A scene that is collected while a function is being frozen ends the process.
             with paused_collection():
-                answers.complete(
-                    self._object_at(result_type, result),
+                hit = TriangleHit(
                     self._object_at(ray_type, ray),
                     self._object_at(preliminary_type, preliminary),
                     flags & _FLAGS,
                     self._mask_at(active),
                 )
+                answers.complete(self._object_at(result_type, result), hit)
 
         # Shapes outside every group are called inside all instances, and return zeros, which are one variable. Other
         # shapes set a point, and leave the time zero.

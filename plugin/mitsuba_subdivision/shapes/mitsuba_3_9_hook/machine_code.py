@@ -170,11 +170,15 @@ def _installed(code: bytes, *used: Any) -> int:
     """Copy machine code to executable memory, and return its address.
 
     The memory is never freed: virtual function tables refer to the code, and the code to Python objects.
+
+    Raises OSError if the code and its unwind information are longer than a page.
     """
-    for each in used:
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
     address = _writable_page()
     written = code + _frame_description(address, len(code))
+    if len(written) > mmap.PAGESIZE:
+        raise OSError(f"machine code of {len(written)} bytes; expected at most a page of {mmap.PAGESIZE}")
+    for each in used:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
     ctypes.memmove(address, written, len(written))
     _protect(address, mmap.PROT_READ | mmap.PROT_EXEC)
     bindings_library()["__register_frame"](ctypes.c_void_p(address + len(code)))
