@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.fit import CageFit, View
+from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.fit import CageFit, View, regularizer
 
 SIZE = 24
 SKY = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}}
 LIGHT = {"sun": {"type": "directional", "direction": [-1, -0.6, -1.4]}}
 # Sums on several threads are in no fixed order.
 ORDER = 1e-3
-# Of values that were float32 on the device.
-ROUNDING = 1e-6
+# Of values that were float32 on the device, and of sums of a few dozen of them.
+ROUNDING, SUMS = 1e-6, 1e-4
 
 
 @pytest.fixture(autouse=True)
@@ -65,6 +66,41 @@ def test_a_box_is_found_from_a_cube(views):
 def extents(cage):
     boxes = LimitSurface(cage).bounds()
     return boxes.upper.max(axis=0) - boxes.lower.min(axis=0)
+
+
+def test_a_step_that_collapses_the_surface_is_told(views):
+    """The first step of Adam moves each coordinate by the learning rate: here, to the centre."""
+    diagonal = np.sqrt(12)
+    fit = made(cube(), views, smoothing=0, learning_rate=1 / diagonal, regularizers={"laplacian": 1e6})
+    with pytest.raises(RuntimeError, match=r"^step 0, with the learning rate 0\.288675, moved all control points"):
+        fit.step()
+
+
+def test_a_loss_that_is_not_finite_is_told_before_points_move(views):
+    fit = made(cube(), views, loss=lambda picture, _: dr.mean(picture, axis=None) * dr.nan)
+    with pytest.raises(RuntimeError, match=r"^the loss of step 0 is nan; expected a finite one"):
+        fit.run(2)
+    np.testing.assert_allclose(fit.control_points, cube().positions, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("name", ["laplacian", "bending", "anchor"])
+def test_regularizers_are_losses_of_control_points(name, np_rng):
+    """By the matrices they are made of, and by their derivatives along a random direction."""
+    surface = LimitSurface(cube())
+    moved, way = (np_rng.normal(size=(8, 3)) for _ in range(2))
+    matrix = {
+        "laplacian": surface.cage.laplacian().T @ surface.cage.laplacian() / 8,
+        "bending": surface.bending(),
+        "anchor": np.eye(8) / 8,
+    }[name]
+    x = moved - surface.cage.positions if name == "anchor" else moved
+    points = upload(mi.Float, moved.astype(np.float32))
+    dr.enable_grad(points)
+    loss = regularizer(name, surface)(points)
+    dr.backward(loss)
+    assert float(loss[0]) == pytest.approx(np.sum(x * (matrix @ x)) / 2, rel=SUMS)
+    slope = np.sum(np.array(dr.grad(points)).reshape(-1, 3) * way)
+    assert slope == pytest.approx(np.sum(way * (matrix @ x)), rel=SUMS)
 
 
 @pytest.mark.parametrize("integrator", ["prb", "prb_projective"])

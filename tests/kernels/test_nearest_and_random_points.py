@@ -79,6 +79,22 @@ def test_nearest_points_are_minima_from_places_beside_them(name, np_rng):
         np.testing.assert_allclose(distance, away, rtol=0, atol=bar * size, err_msg=variant)
 
 
+def test_locations_of_results_start_the_next_call(np_rng):
+    surface, kernel = surface_named("torus"), kernel_named("torus", DOUBLE)
+    _, points = points_near(surface, 40, np_rng)
+    near = surface.closest_point(points)
+    points, place = device_points(kernel.types, points), on_device(kernel.types, near.element, near.uv, near.corner)
+    found = kernel.closest(points, *place)
+    again = kernel.closest(points, found.location)
+    there = kernel.evaluate(found.location)
+    dr.eval(found, again, there)
+    np.testing.assert_allclose(vectors(again.p), vectors(found.p), rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(vectors(there.p), vectors(found.p))
+    for arguments in ((found.location, place[1]), (place[0],)):
+        with pytest.raises(TypeError, match="expected a location alone, or an element and uv"):
+            kernel.evaluate(*arguments)
+
+
 @pytest.mark.parametrize("name", ["sheet", "half disc of 6", "loop sheet", "holes", "crease"])
 def test_minima_on_borders_are_found(name, np_rng):
     """From inside an element, for points that lie beyond a border."""

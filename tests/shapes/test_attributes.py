@@ -369,7 +369,7 @@ def test_meshes_of_polygons_have_spectra_as_well(name):
 
 
 @exact
-@pytest.mark.usefixtures("variant_llvm_ad_spectral")
+@pytest.mark.usefixtures("variant_llvm_ad_spectral", "no_other_scene")
 def test_frozen_functions_look_up_spectra(tmp_path):
     path = str(square(tmp_path / "square.ply"))
     scene = mi.load_dict({"type": "scene", "shape": {"type": "subdivision", "filename": path, "shading": "exact"}})

@@ -4,7 +4,8 @@ from .cage_fit import CageFit
 from .fitting import Schedule
 from .large_steps import LargeSteps
 from .point_fit import PointFit
+from .regularizers import regularizer
 from .to_mesh import to_mesh
 from .views import View
 
-__all__ = ["CageFit", "LargeSteps", "PointFit", "Schedule", "View", "to_mesh"]
+__all__ = ["CageFit", "LargeSteps", "PointFit", "Schedule", "View", "regularizer", "to_mesh"]

@@ -20,7 +20,7 @@ from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
 from .fitting import Fit, Schedulable, Schedule
 from .large_steps import LargeSteps
-from .regularizers import device_regularizer
+from .regularizers import regularizer
 from .unknown_creases import UnknownCreases
 from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 
@@ -30,6 +30,8 @@ U = "u"
 SHARPNESS = "sharpness"
 # Parameters of the scene that are attributes of the cage begin with this.
 CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
+# A surface of this size, in that of the initial one, has collapsed: its triangles have no area in single precision.
+COLLAPSED = 1e-4
 
 
 class CageFit(Fit):
@@ -91,6 +93,8 @@ class CageFit(Fit):
         If an option, a view or a parameter's name is invalid, or the variant has no derivatives.
     CageError, SchemeError
         As `LimitSurface`; from `step`, if a cage cannot be refined.
+    RuntimeError
+        From `step`, if the loss is not finite, or the step has moved all control points to one place.
     """
 
     def __init__(
@@ -149,10 +153,11 @@ class CageFit(Fit):
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
             self._steps = LargeSteps(laplacian, self._smoothing)
-        self._regularizers = {name: device_regularizer(name, start) for name in self._weights}
+        self._regularizers = {name: regularizer(name, start) for name in self._weights}
         self._optimizer = mi.ad.Adam(lr=1.0, uniform=True)
         flat = upload(mi.Float, positions)
         self._optimizer[U] = flat if self._steps is None else self._steps.to_differential(flat)
+        self._initial_extent = self._extent()
         self._load_others()
 
     def _follow(self, refinement: CageRefinement) -> None:
@@ -239,9 +244,12 @@ class CageFit(Fit):
             values[CONTROL_POINTS] = self._creases.points(self._others[SHARPNESS], points)
         loss = self._pictures.loss(values, self._seed + number)
         total: Any = loss
-        for name, regularizer in self._regularizers.items():
-            total += dr.opaque(mi.Float, self._weights[name](number)) * regularizer(points)
+        for name, term in self._regularizers.items():
+            total += dr.opaque(mi.Float, self._weights[name](number)) * term(points)
         dr.backward(total)
+        value = float(np.array(loss).ravel()[0])
+        if not np.isfinite(value):
+            raise RuntimeError(f"the loss of step {number} is {value}; expected a finite one: see pictures and loss")
         self._optimizer.set_learning_rate(self._learning_rate(number) * self._size)
         self._optimizer.step()
         if self._other_rates:
@@ -249,7 +257,16 @@ class CageFit(Fit):
             self._others.step()
         if self._creases is not None:
             self._others[SHARPNESS] = dr.clip(self._others[SHARPNESS], 0, self._creases.highest)
-        return float(np.array(loss).ravel()[0])
+        if not self._extent() >= COLLAPSED * self._initial_extent:
+            raise RuntimeError(
+                f"step {number}, with the learning rate {self._learning_rate(number):g}, moved all control points to "
+                "one place; expected a smaller learning_rate, or smaller weights of regularizers"
+            )
+        return value
+
+    def _extent(self) -> float:
+        """Diagonal of the box around the optimiser's variables: 0 where that around the control points is."""
+        return float(np.linalg.norm(np.ptp(np.array(self._optimizer[U]).reshape(-1, 3), axis=0)))
 
     def _states(self) -> dict[str, State]:
         others = {f"other {name}": adam_state(self._others, name) for name in self._other_rates}

@@ -65,10 +65,28 @@ class Regularizer:
         return cls(MATRICES[name](start).tocsr(), points if name in ABOUT_START else np.zeros_like(points))
 
 
-def device_regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
-    """A regularizer by its name: a differentiable function of flat x, y, z.
+def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
+    """Term that keeps a cage even, as a loss of control points on the device, for optimisations of one's own.
 
-    Raises ValueError if there is none of that name.
+    Parameters
+    ----------
+    name : "laplacian" | "bending" | "anchor" | "folds"
+        As in `CageFit`.
+    start : LimitSurface
+        Where the optimisation begins: "anchor" measures distances from its control points, "bending" derivatives in its
+        metric, see `LimitSurface.bending`.
+
+    Returns
+    -------
+    callable
+        Maps control points, a flat ``mi.Float`` of x, y, z of each such as the shape's parameter ``control_points``, to
+        a ``mi.Float`` of one number, differentiable by them. "laplacian", "bending" and "anchor" are half a sum of
+        squares, for a mean over control points or an integral over the surface.
+
+    Raises
+    ------
+    ValueError
+        If there is none of that name.
     """
     _require_name(name, (*MATRICES, FOLDS))
     return folds(start.cage) if name == FOLDS else device_form(Regularizer.named(name, start))

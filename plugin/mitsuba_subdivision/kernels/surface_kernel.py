@@ -116,24 +116,38 @@ class SurfaceKernel:
         # Assign in place, because others may hold a reference to the array.
         self.coefficients[:] = coefficients
 
-    def evaluate(self, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfacePoints:
+    def evaluate(
+        self, element: Index | Location, uv: Vector2 | None = None, corner: Index = 0, derivatives: int = 1
+    ) -> SurfacePoints:
         """Evaluate points, normals and tangents.
 
         Differentiable with respect to the control points and the parameters, forward and backward.
 
         Parameters
         ----------
-        element : index array
-            0-based, as for `LimitSurface.evaluate`.
+        element : index array, or Location
+            0-based, as for `LimitSurface.evaluate`; or the location of a result, without ``uv`` and ``corner``.
         uv : 2-vector
             Parameters, in the domain, seen from the corner.
         corner : index array
         derivatives : 1 or 2
             2 adds those of the normals.
-        """
-        return self.at(self.walk.at(element, uv[0], uv[1], corner), derivatives=derivatives)
 
-    def intersect(self, ray: Ray, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1) -> SurfaceHits:
+        Raises
+        ------
+        TypeError
+            If ``uv`` is missing beside an element, or given beside a location.
+        """
+        return self.at(self._location(element, uv, corner), derivatives=derivatives)
+
+    def _location(self, element: Index | Location, uv: Vector2 | None, corner: Index) -> Location:
+        if isinstance(element, Location) is (uv is not None):
+            raise TypeError("expected a location alone, or an element and uv")
+        return element if uv is None else self.walk.at(element, uv[0], uv[1], corner)
+
+    def intersect(
+        self, ray: Ray, element: Index | Location, uv: Vector2 | None = None, corner: Index = 0, derivatives: int = 1
+    ) -> SurfaceHits:
         """Find where rays intersect the surface, near given parameters.
 
         Differentiable with respect to the control points and the ray: points stay on the ray.
@@ -147,7 +161,7 @@ class SurfaceKernel:
         """
         vector3 = self.types.vector3
         o, d = vector3(ray.o), vector3(ray.d)
-        start = self.walk.at(element, uv[0], uv[1], corner)
+        start = self._location(element, uv, corner)
         # From the foot of the starting point, as single precision loses digits over long distances.
         along, away = dr.detach(d), dr.detach(o)
         foot = self.at(start, moves=False).p - away
@@ -166,7 +180,12 @@ class SurfaceKernel:
         return SurfaceHits(**vars(found), t=t)
 
     def closest(
-        self, points: Vector3, element: Index, uv: Vector2, corner: Index = 0, derivatives: int = 1
+        self,
+        points: Vector3,
+        element: Index | Location,
+        uv: Vector2 | None = None,
+        corner: Index = 0,
+        derivatives: int = 1,
     ) -> NearestSurfacePoints:
         """Find the nearest points of the surface, from given parameters down.
 
@@ -185,7 +204,8 @@ class SurfaceKernel:
         """
         points = self.types.given(self.types.vector3, points)
         search = NearestLocation(self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients)))
-        start = self.walk.at(element, dr.detach(uv[0]), dr.detach(uv[1]), corner)
+        start = self._location(element, uv, corner)
+        start = Location(start.half_edge, dr.detach(start.u), dr.detach(start.v))
         location, nearest = search.found(dr.detach(points), start)
         found = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
         return NearestSurfacePoints(**vars(found), distance=dr.norm(points - found.p))
