@@ -13,6 +13,10 @@ from mitsuba_subdivision.shapes.heights import AttributeHeights, TextureHeights
 IMAGE = np.random.default_rng(5).random((4, 7, 1)).astype(np.float32)
 # Central differences in single precision.
 STEP, DIFFERENCE = 1e-3, 2e-3
+# Second differences over a texel, of values that single precision rounds.
+SECOND = 1e-3
+# Of texture coordinates, several texels.
+SLIDE = 0.02
 TO_UV = {
     "plain": lambda: mi.ScalarTransform3f().scale(1),
     "turned": lambda: mi.ScalarTransform3f().rotate(30),
@@ -87,6 +91,32 @@ def test_slopes_of_bitmaps_are_differences(turn, channels):
     assert np.quantile(off, 0.9) < DIFFERENCE * 5
 
 
+@pytest.mark.parametrize("turn", [0, 90])
+def test_slopes_of_a_bitmap_turn_with_texture_coordinates(turn):
+    """Of a bitmap of texels of a quadratic function, whose differences over a texel are its second derivatives."""
+    if not dr.is_diff_v(mi.Float):
+        pytest.skip("only variants of arrays have derivatives")
+    height, width = 9, 16
+    y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
+    image = (0.5 * x**2 - 0.75 * x * y + 0.2 * y**2)[:, :, None].astype(np.float32)
+    to_uv = mi.ScalarTransform3f().rotate(turn).scale([0.5, 1.0])
+    heights = heights_of(bitmap(image, to_uv=to_uv, wrap_mode="clamp"))
+    a = np.array(to_uv.matrix).reshape(3, 3)
+    # Texels that are far enough from the sides.
+    inside = np.linalg.inv(a) @ np.concatenate([np.random.default_rng(3).uniform(0.2, 0.8, (2, 40)), np.ones((1, 40))])
+    expected = a[:2, :2].T @ [[1, -0.75], [-0.75, 0.4]] @ a[:2, :2]
+    for axis in range(2):
+        s, t = arrays(*inside[:2])
+        dr.enable_grad((s, t)[axis])
+        zeros, ones = arrays(np.zeros(40), np.ones(40))
+        _, by_s, by_t = heights([s, t], [ones, zeros], [zeros, ones])
+        found = []
+        for slope in (by_s, by_t):
+            dr.set_grad((s, t)[axis], 1)
+            found.append(np.array(dr.forward_to(slope, flags=dr.ADFlag.ClearInterior)))
+        np.testing.assert_allclose(found, np.repeat(expected[:, axis, None], 40, axis=1), rtol=0, atol=SECOND)
+
+
 def test_slopes_of_a_bitmap_that_is_not_interpolated_are_zero():
     s, t = places()
     assert not np.any(slopes(heights_of(bitmap(filter_type="nearest")), s, t))
@@ -139,3 +169,34 @@ def test_the_range_of_an_attribute_is_the_hull_of_its_values():
 def test_textures_that_are_no_heights_are_refused():
     with pytest.raises(ValueError, match=r'kind "MeshAttribute" was given; expected the name of the attribute itself'):
         heights_of({"type": "mesh_attribute", "name": "vertex_height"})
+
+
+def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap():
+    """They did not, but for the products of both coordinates: slopes of bitmaps are constant along a texel."""
+    if not dr.is_diff_v(mi.Float):
+        pytest.skip("only variants of arrays have derivatives")
+    cube = named_cages.cube()
+    x, y, z = cube.positions.T
+    texcoords = Attribute(np.stack([0.3 * x + 0.11 * z + 0.5, 0.3 * y + 0.23 * z + 0.5], axis=1), "vertex")
+    cage = ControlCage(cube.positions, cube.face_vertices.reshape(-1, 4), texcoords=texcoords)
+    t, s = np.meshgrid(*[(np.arange(256) + 0.5) / 256] * 2, indexing="ij")
+    image = np.sin(4 * np.pi * s) * np.cos(2 * np.pi * t)
+    shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, "displacement_scale": 0.02}
+    parameters = mi.traverse(mi.load_dict({**shape, "displacement": bitmap(image[:, :, None].astype(np.float32))}))
+    given = mi.Float(parameters["cage_texcoords"])
+    way = upload(mi.Float, np.random.default_rng(1).normal(size=dr.width(given)))
+
+    def normals(step):
+        parameters["cage_texcoords"] = given + step * way
+        parameters.update()
+        # Dr.Jit clears the derivatives of what others are computed from.
+        return 1 * parameters["vertex_normals"]
+
+    step = mi.Float(0)
+    dr.enable_grad(step)
+    found = normals(step)
+    dr.set_grad(step, 1)
+    derivative = np.array(dr.forward_to(found))
+    # Over some texels, as slopes jump from one to the next.
+    expected = (np.array(normals(SLIDE)) - np.array(normals(-SLIDE))) / (2 * SLIDE)
+    assert np.abs(derivative - expected).mean() < 0.2 * np.abs(expected).mean()

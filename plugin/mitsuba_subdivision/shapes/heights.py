@@ -84,7 +84,8 @@ class TextureHeights:
     """Heights of a texture, with derivatives by the chain rule.
 
     The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
-    Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives.
+    Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives. The
+    derivatives of a bitmap's gradient by texture coordinates are differences over a texel.
 
     Raises ValueError if the texture is not a function of texture coordinates, or not scalar.
     """
@@ -113,10 +114,42 @@ class TextureHeights:
     def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
         """See `Heights`."""
         s, t = value
-        by_s, by_t = self._each(self._gradient, s, t, active)
-        if self._gradient == self._own_gradient:
-            by_s, by_t = self._corrected(by_s, by_t)
+        is_bitmap = self._gradient == self._own_gradient
+        moves = is_bitmap and self._is_jit and dr.grad_enabled(s, t)
+        by_s, by_t = (self._moving_slopes if moves else self._slopes)(s, t, active)
         return self._each(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
+
+    def _slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
+        """Derivatives of the height by s and by t."""
+        by_s, by_t = self._each(self._gradient, s, t, active)
+        return self._corrected(by_s, by_t) if self._gradient == self._own_gradient else (by_s, by_t)
+
+    def _moving_slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
+        """Slopes of a bitmap whose own derivatives by s and t are differences over a texel.
+
+        Between texels a bitmap's slope along s does not depend on s, and jumps at the next: its derivative would be
+        zero everywhere, although the normals of the displaced surface turn.
+        """
+        at = dr.detach(s), dr.detach(t)
+        slopes = list(self._slopes(*at, active))
+        for axis, (parameter, texel) in enumerate(zip((s, t), self._texel(), strict=True)):
+            with dr.suspend_grad():
+                behind, ahead = (
+                    self._slopes(*(x + sign * texel / 2 if i == axis else x for i, x in enumerate(at)), active)
+                    for sign in (-1, 1)
+                )
+            move = dr.replace_grad(type(s)(0), parameter)
+            slopes = [slope + (b - a) / texel * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
+        return slopes
+
+    def _texel(self) -> list[float]:
+        """Steps of s and of t that lead one texel on."""
+        parameters = mi.traverse(self._texture)
+        to_uv = np.eye(2)
+        if "to_uv" in parameters:
+            to_uv = np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
+        texels = abs(to_uv) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
+        return (1 / np.maximum(texels.max(axis=0), 1)).tolist()
 
     def height(self, value: Value) -> Float:
         """The heights alone."""
