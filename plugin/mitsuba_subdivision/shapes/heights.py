@@ -130,16 +130,15 @@ class TextureHeights:
         Between texels a bitmap's slope along s does not depend on s, and jumps at the next: its derivative would be
         zero everywhere, although the normals of the displaced surface turn.
         """
-        at = dr.detach(s), dr.detach(t)
-        slopes = list(self._slopes(*at, active))
-        for axis, (parameter, texel) in enumerate(zip((s, t), self._texel(), strict=True)):
+        s_0, t_0 = dr.detach(s), dr.detach(t)
+        slopes = self._slopes(s_0, t_0, active)
+        step_s, step_t = self._texel()
+        for parameter, ds, dt in ((s, step_s / 2, 0.0), (t, 0.0, step_t / 2)):
             with dr.suspend_grad():
-                behind, ahead = (
-                    self._slopes(*(x + sign * texel / 2 if i == axis else x for i, x in enumerate(at)), active)
-                    for sign in (-1, 1)
-                )
-            move = dr.replace_grad(type(s)(0), parameter)
-            slopes = [slope + (b - a) / texel * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
+                behind = self._slopes(s_0 - ds, t_0 - dt, active)
+                ahead = self._slopes(s_0 + ds, t_0 + dt, active)
+            move = dr.replace_grad(type(s)(0), parameter) / (2 * (ds + dt))  # type: ignore[func-returns-value]  # The stub is wrong.
+            slopes = [slope + (b - a) * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
         return slopes
 
     def _texel(self) -> list[float]:
