@@ -137,8 +137,9 @@ class TextureHeights:
             with dr.suspend_grad():
                 behind = self._slopes(s_0 - ds, t_0 - dt, active)
                 ahead = self._slopes(s_0 + ds, t_0 + dt, active)
-            move = dr.replace_grad(type(s)(0), parameter) / (2 * (ds + dt))  # type: ignore[func-returns-value]  # The stub is wrong.
-            slopes = [slope + (b - a) * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
+            move = dr.replace_grad(type(s)(0), parameter)  # type: ignore[func-returns-value]  # The stub is wrong.
+            per = 1 / (2 * (ds + dt))
+            slopes = [slope + (b - a) * per * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
         return slopes
 
     def _texel(self) -> list[float]:
