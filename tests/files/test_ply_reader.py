@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+import tempfile
 import threading
 
 import numpy as np
@@ -136,6 +137,18 @@ end_header
     np.testing.assert_array_equal(found.face_vertices, np.concatenate(faces))
     np.testing.assert_array_equal(found.positions[:, 1], points[:, 1])
     np.testing.assert_array_equal(found.attributes["weight"].values[:, 0], weights)
+
+
+def test_binary_files_are_read_where_no_temporary_file_can_be_made(tmp_path, monkeypatch):
+    path = tmp_path / "cube.ply"
+    cube().save(path)
+    assert b"format binary" in path.read_bytes()
+
+    def fail():
+        raise OSError("no space left")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
+    np.testing.assert_array_equal(read_ply(path).positions, cube().positions)
 
 
 def test_elements_without_rows_are_read(tmp_path):

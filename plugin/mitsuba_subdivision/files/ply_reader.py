@@ -100,7 +100,7 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
         # Plyfile maps lists of one known length, and reads all others row by row, in a hundred times as long. It maps
         # a file of our own, as the process would end if another program cut a mapped file.
         if binary:
-            with tempfile.TemporaryFile() as file:
+            with suppress(OSError), tempfile.TemporaryFile() as file:
                 file.write(content)
                 for corners in (3, 4):
                     lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
