@@ -16,6 +16,7 @@ import numpy as np
 from ..device_arrays import mapped
 from ..kernels.displacement import Heights
 from ..kernels.types import Float, Mask, Value, Vector2
+from ..schemes.domain import FloatArray
 from ..variants import Variant
 
 if TYPE_CHECKING:
@@ -144,11 +145,7 @@ class TextureHeights:
 
     def _texel(self) -> list[float]:
         """Steps of s and of t that lead one texel on."""
-        parameters = mi.traverse(self._texture)
-        to_uv = np.eye(2)
-        if "to_uv" in parameters:
-            to_uv = np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
-        texels = abs(to_uv) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
+        texels = abs(self._to_uv()) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
         return (1 / np.maximum(texels.max(axis=0), 1)).tolist()
 
     def height(self, value: Value) -> Float:
@@ -198,15 +195,21 @@ class TextureHeights:
 
         Mitsuba 3.9.1 multiplies them by the numbers of texels along either side after ``to_uv`` instead of before.
         """
-        parameters = mi.traverse(self._texture)
         sides = np.array(self._texture.resolution(), dtype=np.float64)
-        if "to_uv" not in parameters or sides[0] == sides[1]:
+        if sides[0] == sides[1]:
             return by_s, by_t
-        to_uv = np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
+        to_uv = self._to_uv()
         if (to_uv[0, 1] == 0 and to_uv[1, 0] == 0) or np.linalg.det(to_uv) == 0:
             return by_s, by_t
         (a, b), (c, d) = (to_uv.T @ np.diag(sides) @ np.linalg.inv(to_uv.T) @ np.diag(1 / sides)).tolist()
         return a * by_s + b * by_t, c * by_s + d * by_t
+
+    def _to_uv(self) -> FloatArray:
+        """``(2, 2)`` linear part of a bitmap's ``to_uv``."""
+        parameters = mi.traverse(self._texture)
+        if "to_uv" not in parameters:
+            return np.eye(2)
+        return np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
 
     def _derivative(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
         found = []
