@@ -21,10 +21,13 @@ from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .bernstein import regular_bernstein, times
 from .divided_element import DividedElement, PartKind
-from .irregular_patch import IrregularPatch, level_rows, transition
+from .irregular_patch import IrregularPatch, level_rows, rest_rows, transition
 
+# Divisions after which a tile is bounded by its pieces and by what is left: of surfaces, by whether rules are convex,
+# as others bound what is left some ten times worse; and of the curves along sides, which have few coefficients.
+DIVISIONS, DIVISIONS_OF_SIDES = {True: 8, False: 32}, 32
 # Normals are bounded on the pieces after this many divisions.
-NORMAL_DEPTH = 3
+DIVISIONS_OF_NORMALS = 4
 
 
 class DividedTile:
@@ -104,24 +107,65 @@ class DividedTile:
     def pieces(self) -> FloatArray | None:
         """``(p, b, K)`` Bernstein coefficients of pieces on which all normals are, or nearly those.
 
-        Nearer to extraordinary points than these, normals turn less than on them. None where parts are left after a few
+        Nearer to extraordinary points than these, normals turn less than on them. None where parts are left after some
         divisions that hold neither pieces nor one extraordinary point.
         """
-        return self._pieces(NORMAL_DEPTH)
+        pieces, rest = self._divided(DIVISIONS_OF_NORMALS)
+        return np.stack(pieces) if all(tile.is_self_similar for tile, _ in rest) else None
 
-    def _pieces(self, depth: int) -> FloatArray | None:
-        found = []
-        for tile, rows in self.children:
+    @cached_property
+    def hull(self) -> FloatArray | None:
+        """``(h, K)`` points around the surface: it lies in their convex hull, which is hardly larger.
+
+        None where rules are not convex and parts are left that hold neither pieces nor one extraordinary point.
+        """
+        return self._hull(DIVISIONS[self._scheme.has_convex_rules])
+
+    @cached_property
+    def side_hulls(self) -> list[FloatArray | None]:
+        """Likewise around the curve along each side of the tile."""
+        return [self._hull(DIVISIONS_OF_SIDES, side) for side in range(self._scheme.domain.corner_count)]
+
+    def _hull(self, divisions: int, side: int | None = None) -> FloatArray | None:
+        pieces, rest = self._divided(divisions, side)
+        if not self._scheme.has_convex_rules and not all(tile.is_self_similar for tile, _ in rest):
+            return None
+        return np.concatenate([*pieces, *(tile._reach @ rows for tile, rows in rest)])
+
+    @cached_property
+    def _reach(self) -> FloatArray:
+        """``(n, K)`` points around the tile: its one-ring or, if rules are not convex, far enough from its tip."""
+        if self._scheme.has_convex_rules or not isinstance(self._source, IrregularPatch):
+            return self.control_points
+        # The sum of n vectors is the mean of n times each of them.
+        away = np.diag((self.control_count - 1) * rest_rows(self._source).max(axis=0))[1:]
+        return np.eye(1, self.control_count) + np.concatenate([away, -away])
+
+    def _divided(
+        self, divisions: int, side: int | None = None
+    ) -> tuple[list[FloatArray], list[tuple[DividedTile, FloatArray]]]:
+        """The tile after some divisions, or what of it lies along one side.
+
+        Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the tiles that are left, with
+        their control points.
+        """
+        if not divisions:
+            return [], [(self, np.eye(self.control_count))]
+        basis, m = regular_bernstein(self._scheme).basis, self._scheme.domain.corner_count
+        # Copies of a domain at its corners come first, and share the sides that meet there.
+        copies = range(4) if side is None else (side, (side + 1) % m)
+        # Around an extraordinary point, one part is left, but along a semi-sharp crease many.
+        fewer = divisions - 1 if self.is_self_similar else divisions // 2
+        pieces: list[FloatArray] = []
+        rest: list[tuple[DividedTile, FloatArray]] = []
+        for tile, rows in (self.children[number] for number in copies):
             if tile is None:
-                found.append(rows[None])
-            elif depth > 1:
-                below = tile._pieces(depth - 1)
-                if below is None:
-                    return None
-                found.append(below @ rows)
-            elif not tile.is_self_similar:
-                return None
-        return np.concatenate(found)
+                pieces.append(rows if side is None else rows[basis.sides[side]])
+                continue
+            inner, left = tile._divided(fewer, side)
+            pieces += [own @ rows for own in inner]
+            rest += [(each, own @ rows) for each, own in left]
+        return pieces, rest
 
 
 def part_of_tile(element: DividedElement, stencils: FloatArray) -> tuple[DividedTile | None, FloatArray]:

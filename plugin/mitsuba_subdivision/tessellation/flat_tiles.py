@@ -8,100 +8,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import times
+from ..evaluation.divided_tile import DividedTile
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from .cones import NormalCone, cross, dot
 from .criterion import Measure
-from .tile_extents import TileParts, fit_within
 from .tile_rates import TileRates, axis_across
 from .tiles import Tiles
 
 # Relative area of triangles that rounding may flip.
 FOLDED = 1e-6
+# Tiles whose hulls are made together, which bounds temporary memory to some megabytes.
+TILES_TOGETHER = 1 << 10
 
 
-class PatchGroup(NamedTuple):
-    """One-rings of one class."""
+class TileParts(NamedTuple):
+    """Tiles that are divided alike."""
 
-    signature: Signature
-    at: IntArray  # (n,) int64: the tile that each is of
-    points: FloatArray  # (K, 3, n) float64: control points
-    slots: IntArray | None = None  # (K,) int64 or None: the vertices of a one-ring that these are; None if they are all
+    tile: DividedTile
+    values: FloatArray  # (K, 3, p) float64: control points
+    owner: IntArray  # (p,) int64: the tile that each is
 
-    def chosen(self, which: NDArray[np.bool_]) -> PatchGroup:
+    def chosen(self, which: NDArray[np.bool_]) -> TileParts:
         """Some of them."""
         if which.all():
             return self
         chosen = np.flatnonzero(which)
-        return self._replace(at=self.at[chosen], points=self.points.take(chosen, axis=2))
-
-
-def have_flat_rings(rates: TileRates, tiles: Tiles, groups: list[PatchGroup]) -> NDArray[np.bool_]:
-    """``(t,)`` whether the one-rings of patches are so flat that one pair of triangles suffices for each.
-
-    Most patches of a dense cage are, and need no further test.
-    """
-    count = len(tiles)
-    corners, extent = np.empty((4, 3, count)), np.empty(count)
-    for each in groups:
-        # The diagonals of a face: the element, or a face beside a vertex element.
-        topology = one_ring(each.signature.smoothed).topology
-        size = int(topology.face_sizes[0])
-        corners[..., each.at] = each.points[topology.face_vertices[[0, size // 4, size // 2, 3 * size // 4]]]
-    lower, upper = _boxes(groups, count)
-    limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
-    fits = np.linalg.norm(upper - lower, axis=0) <= limit
-    if rates.criterion.measure is Measure.EDGE:
-        return fits
-    axis = axis_across(corners)
-    for each in groups:
-        extent[each.at] = np.ptp(dot(each.points, axis[:, each.at]), axis=0)
-    may_be_flat = axis.any(axis=0) & ~fits & ~tiles.sides.any(axis=1) & (extent <= limit)
-    return fits | (may_be_flat & ~_are_folded(groups, axis, may_be_flat))
+        return self._replace(values=self.values.take(chosen, axis=2), owner=self.owner[chosen])
 
 
 def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray[np.bool_]:
     """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along feature edges."""
-    count, corners = len(tiles), np.empty((rates.domain.corner_count, 3, len(tiles)))
-    rings = []
-    for own, points, at, _ in groups:
-        rings.append(PatchGroup(own.signature, at, own.one_ring_points(points), own.slots))
+    corners = np.empty((rates.domain.corner_count, 3, len(tiles)))
+    lower, upper = np.empty((2, 3, len(tiles)))
+    for own, points, at in groups:
         corners[..., at] = times(own.corners, points)
-    lower, upper = _boxes(rings, count)
-    axis = axis_across(corners)
-    limit = rates.limit(tiles, lower, upper, NormalCone.of_any(count))
+        ring = own.one_ring_points(points)
+        lower[:, at], upper[:, at] = ring.min(axis=0), ring.max(axis=0)
+    limit = rates.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
     if rates.criterion.measure is Measure.EDGE:
-        return fit_within(rates.scheme, limit, groups)
-    parts = [TileParts(each.tile, dot(each.values, axis[:, each.owner])[:, None], each.owner) for each in groups]
-    # A tile without a normal, or that may be folded, is tested by its size only.
+        return _extents(groups, np.eye(3)[..., None] * np.ones(len(tiles))) <= limit
+    axis = axis_across(corners)
+    extent = _extents(groups, axis[None])
+    # A tile that is folded, or has no normal, is tested by its size only.
     fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & rates.scheme.has_convex_rules
-    has_normal = axis.any(axis=0)
-    found = fit_within(rates.scheme, np.where(has_normal, limit, np.where(fits, np.inf, -1.0)), parts)
-    folded = _are_folded(rings, axis, found & ~fits)
+    found = fits | (axis.any(axis=0) & (extent <= limit))
+    folded = _are_folded(groups, axis, found & ~fits)
     if folded.any():
         found &= ~folded | (_normal_sines(rates, groups, axis, folded) < 1)
     if rates.criterion.outline is not None:
         # A border may be a silhouette for any normals.
         cone = NormalCone(axis, _normal_sines(rates, groups, axis, ~(found | tiles.sides.any(axis=1))))
-        higher = np.where(cone.sine < 1, rates.limit(tiles, lower, upper, cone), -1.0)
-        found |= fit_within(rates.scheme, higher, parts)
-    may_curve = found & ~fits & tiles.sides.any(axis=1)
-    if may_curve.any():
-        found &= ~_have_curved_sides(rates, tiles, groups, may_curve, corners, limit)
+        found |= (cone.sine < 1) & (extent <= rates.limit(tiles, lower, upper, cone))
+    return found & ~_have_curved_sides(tiles, groups, found & ~fits, corners, limit)
+
+
+def _extents(groups: list[TileParts], axes: FloatArray) -> FloatArray:
+    """``(t,)`` size of the surface over tiles along axes ``(d, 3, t)``, no less than it is; infinite if unknown."""
+    found = np.full(axes.shape[2], np.inf)
+    for tile, points, at in groups:
+        if tile.hull is None:
+            continue
+        for begin in range(0, len(at), TILES_TOGETHER):
+            run = slice(begin, begin + TILES_TOGETHER)
+            along = [np.ptp(times(tile.hull, dot(points[..., run], axis[:, at[run]])), axis=0) for axis in axes]
+            found[at[run]] = np.linalg.norm(along, axis=0)
     return found
 
 
-def _boxes(groups: list[PatchGroup], count: int) -> tuple[FloatArray, FloatArray]:
-    """Least and largest coordinates ``(3, t)`` of the control points of each one-ring."""
-    lower, upper = np.empty((3, count)), np.empty((3, count))
-    for each in groups:
-        lower[:, each.at], upper[:, each.at] = each.points.min(axis=0), each.points.max(axis=0)
-    return lower, upper
-
-
-def _are_folded(groups: list[PatchGroup], axis: FloatArray, are_asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _are_folded(groups: list[TileParts], axis: FloatArray, are_asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``(t,)`` whether control faces of some one-rings face opposite ways, seen along axes ``(3, t)``.
 
     Such a surface has silhouettes along its folds, and not only along edges of the cage. At a dart, where one vertex of
@@ -112,21 +88,21 @@ def _are_folded(groups: list[PatchGroup], axis: FloatArray, are_asked: NDArray[n
     across = np.empty((2, 3, len(are_asked)))
     across[..., asked] = _normals_to(axis[:, asked])
     for each in groups:
-        own = each.chosen(are_asked[each.at])
-        if not len(own.at):
+        tile, values, at = each.chosen(are_asked[each.owner])
+        if not len(at):
             continue
-        t = one_ring(own.signature.smoothed).topology
+        t, points = one_ring(tile.signature.smoothed).topology, tile.one_ring_points(values)
         # The diagonals of each face; of triangles, two sides.
         quarters = t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4
         vertices = t.face_vertices[quarters]
-        if own.slots is not None:
+        if tile.slots is not None:
             number = np.full(t.vertex_count, -1)
-            number[own.slots] = np.arange(len(own.slots))
+            number[tile.slots] = np.arange(len(tile.slots))
             vertices = number[vertices]
         a, b, c, d = vertices[:, (vertices >= 0).all(axis=0)]
-        x, y = (dot(own.points, along) for along in across[..., own.at])
+        x, y = (dot(points, along) for along in across[..., at])
         areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
-        found[own.at] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
+        found[at] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
     return found
 
 
@@ -156,7 +132,6 @@ def _normal_sines(
 
 
 def _have_curved_sides(
-    rates: TileRates,
     tiles: Tiles,
     groups: list[TileParts],
     are_asked: NDArray[np.bool_],
@@ -164,23 +139,20 @@ def _have_curved_sides(
     limit: FloatArray,
 ) -> NDArray[np.bool_]:
     """``(t,)`` whether tiles with these corners have a feature edge that is no straight line within the limit."""
-    m, asked = rates.domain.corner_count, []
-    for side in range(m):
-        for each in groups:
-            on = are_asked[each.owner] & (tiles.sides[each.owner, side] > 0)
-            if on.any():
-                asked.append((side, each.chosen(on)))
-    at = np.concatenate([each.owner for _, each in asked])
-    sides = np.repeat([number for number, _ in asked], [len(each.owner) for _, each in asked])
-    across = np.stack(_normals_to(corners[(sides + 1) % m, :, at].T - corners[sides, :, at].T))
-    parts, begin = [], 0
-    for number, each in asked:
-        own = slice(begin, begin + len(each.owner))
-        values = np.einsum("kit,dit->kdt", each.values, across[..., own])
-        parts.append(TileParts(each.tile, values, np.arange(own.start, own.stop), number))
-        begin = own.stop
     found = np.zeros(len(tiles), dtype=bool)
-    found[at[~fit_within(rates.scheme, limit[at], parts)]] = True
+    for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+        on_side = are_asked & (tiles.sides[:, side] > 0)
+        for each in groups:
+            own = each.chosen(on_side[each.owner])
+            if not len(own.owner):
+                continue
+            hull, at = own.tile.side_hulls[side], own.owner
+            if hull is None:
+                found[at] = True
+                continue
+            curve = times(hull, own.values)
+            extents = [np.ptp(dot(curve, across), axis=0) for across in _normals_to(end[:, at] - begin[:, at])]
+            found[at] |= np.hypot(*extents) > limit[at]
     return found
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..cage.errors import warn
 from ..evaluation.bernstein import times
 from ..evaluation.divided_element import divided_elements
-from ..evaluation.divided_tile import part_of_tile
+from ..evaluation.divided_tile import DividedTile, part_of_tile
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
@@ -20,10 +20,9 @@ from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .cones import dot
 from .criterion import Criterion, Measure
-from .flat_tiles import PatchGroup, are_flat, have_flat_rings
+from .flat_tiles import TileParts, are_flat
 from .patch_frames import PatchFrames
 from .spans import joined, sort
-from .tile_extents import TileParts, alike
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
@@ -81,7 +80,7 @@ def choose_tiles(
     points = control_points[control_of_vertex]
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
     features = feature_edges(patches, frames, points, criterion)
-    needed = Tiles.joined(list(_chosen(rates, _blocks(patches, frames, points, features))))
+    needed = Tiles.joined(list(_chosen(rates, _whole_patches(patches, frames, points, features))))
     tiles = rates.clipped(needed)
     if criterion.outline is None:
         _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
@@ -107,10 +106,12 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
     )
 
 
-def _blocks(
+def _whole_patches(
     patches: PatchTable, frames: PatchFrames, points: FloatArray, features: NDArray[np.bool_]
-) -> Iterator[tuple[Tiles, list[PatchGroup]]]:
-    """All patches, each as one tile, class by class, in blocks that bound temporary memory.
+) -> Iterator[tuple[Tiles, DividedTile | None, FloatArray]]:
+    """All patches, each as one tile, in blocks of one class that bound temporary memory.
+
+    Yields the tiles; how they are divided, or None for pieces; and their control points, or Bernstein coefficients.
 
     Parameters
     ----------
@@ -122,73 +123,51 @@ def _blocks(
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
     coordinates = np.ascontiguousarray(points.T)
-    groups: list[PatchGroup] = []
-    corners: list[IntArray] = []
-    count = 0
-    for patch_class in counted(table.classes, "Tiles of patch classes"):
+    elements = divided_elements(table.scheme, [each.signature for each in table.classes])
+    pairs = list(zip(table.classes, elements, strict=True))
+    for patch_class, element in counted(pairs, "Tiles of patch classes"):
+        every = np.eye(element.control_count)
+        tile, rows = part_of_tile(element, every)
         of_class = patch_class.corners if refined is None else refined.corners(patch_class)
-        begin = 0
-        while begin < len(of_class):
-            own = slice(begin, begin + PATCHES_AT_ONCE - count)
-            begin = own.stop
-            corners.append(of_class[own])
-            controls = np.empty((patch_class.controls.shape[1], 3, len(corners[-1])))
-            for axis, values in enumerate(coordinates):
-                controls[:, axis] = values.take(patch_class.controls[own].T, mode="clip")
-            groups.append(PatchGroup(patch_class.signature, np.arange(count, count + len(corners[-1])), controls))
-            count += len(corners[-1])
-            if count == PATCHES_AT_ONCE:
-                yield _whole(frames, corners, features), groups
-                groups, corners, count = [], [], 0
-    if groups:
-        yield _whole(frames, corners, features), groups
+        for begin in range(0, len(of_class), PATCHES_AT_ONCE):
+            block = slice(begin, begin + PATCHES_AT_ONCE)
+            controls = patch_class.controls[block].T
+            values = np.stack([axis.take(controls, mode="clip") for axis in coordinates], axis=1)
+            values = values if rows is every else times(rows, values)
+            yield Tiles.whole(of_class[block], sides_on(features, frames, of_class[block])), tile, values
 
 
-def _whole(frames: PatchFrames, corners: list[IntArray], features: NDArray[np.bool_]) -> Tiles:
-    every = np.concatenate(corners)
-    return Tiles.whole(every, sides_on(features, frames, every))
-
-
-def _chosen(rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]) -> Iterator[Tiles]:
+def _chosen(rates: TileRates, patches: Iterable[tuple[Tiles, DividedTile | None, FloatArray]]) -> Iterator[Tiles]:
     """Tiles of all patches, with their rates. Raises MemoryError if there would be too many triangles."""
     triangle_count = 0
-    for tiles, coefficients in _in_runs(_cut(rates, blocks)):
+    for tiles, coefficients in _in_runs(_cut(rates, patches)):
         chosen = [tiles] if coefficients is None else rates.rated(tiles, coefficients, triangle_count)
         triangle_count += sum(map(rates.cost, chosen))
         yield from chosen
 
 
 def _cut(
-    rates: TileRates, blocks: Iterable[tuple[Tiles, list[PatchGroup]]]
+    rates: TileRates, patches: Iterable[tuple[Tiles, DividedTile | None, FloatArray]]
 ) -> Iterator[tuple[Tiles, FloatArray | None]]:
     """Tiles of all patches: those with rates; and those that lie in pieces, with Bernstein coefficients over them."""
-    whole: list[_Undecided] = []
     # Few tiles of each block are divided again: those of many blocks together.
-    parts: list[_Undecided] = []
-    for tiles, patches in blocks:
-        rest = patches
-        if rates.scheme.has_convex_rules:
-            is_flat = have_flat_rings(rates, tiles, patches)
-            yield tiles[is_flat], None
-            rest = [each.chosen(~is_flat[each.at]) for each in patches if not is_flat[each.at].all()]
-        pieces, undecided = _parts_of_patches(rates, tiles, rest)
-        yield pieces
-        whole.append(undecided)
-        # Their control points live on in the list only, which gives them up when it is divided.
-        del undecided, rest
-        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, whole, parts)
-        yield from _divided_to(PATCHES_AT_ONCE - 1, rates, parts, parts)
-    yield from _divided_to(0, rates, whole, parts)
-    yield from _divided_to(0, rates, parts, parts)
+    waiting: list[_Undecided] = []
+    for tiles, tile, values in patches:
+        if tile is None:
+            yield tiles, values
+            continue
+        waiting.append((tiles, [TileParts(tile, values, np.arange(len(tiles)))]))
+        yield from _divided_until_fewer(PATCHES_AT_ONCE, rates, waiting)
+    yield from _divided_until_fewer(1, rates, waiting)
 
 
-def _divided_to(
-    most: int, rates: TileRates, waiting: list[_Undecided], parts: list[_Undecided]
+def _divided_until_fewer(
+    count: int, rates: TileRates, waiting: list[_Undecided]
 ) -> Iterator[tuple[Tiles, FloatArray | None]]:
-    """Divide the tiles that wait until no more than so many do; decided ones as `_cut`, others are added to a list."""
-    while sum(len(tiles) for tiles, _ in waiting) > most:
+    """Divide the tiles of a list until fewer than so many are left there; decided ones as `_cut`."""
+    while sum(len(tiles) for tiles, _ in waiting) >= count:
         *found, undecided = _divided(rates, *_taken(waiting))
-        parts.append(undecided)
+        waiting.append(undecided)
         yield from found
 
 
@@ -214,20 +193,6 @@ def _runs(waiting: list[_Pieces]) -> Iterator[_Pieces]:
         for begin in range(0, len(tiles), TILES_AT_ONCE):
             run = slice(begin, begin + TILES_AT_ONCE)
             yield tiles[run], coefficients[..., run]
-
-
-def _parts_of_patches(rates: TileRates, tiles: Tiles, patches: list[PatchGroup]) -> tuple[_Pieces, _Undecided]:
-    """Patches, each as one tile: those that are pieces, and those that are not."""
-    pieces, parts = [], []
-    for each, element in zip(patches, divided_elements(rates.scheme, [own.signature for own in patches]), strict=True):
-        every = np.eye(element.control_count)
-        tile, rows = part_of_tile(element, every)
-        points = each.points if rows is every else times(rows, each.points)
-        if tile is None:
-            pieces.append((each.at, points))
-        else:
-            parts.append(TileParts(tile, points, each.at))
-    return _in_pieces(rates, tiles, pieces), _numbered(tiles, parts)
 
 
 def _divided(
@@ -288,14 +253,14 @@ def _in_pieces(rates: TileRates, tiles: Tiles, pieces: list[tuple[IntArray, Floa
 def _taken(waiting: list[_Undecided]) -> _Undecided:
     """All tiles of a list together, which is left empty."""
     first = ragged.starts(np.array([len(tiles) for tiles, _ in waiting]))
-    parts = [
-        part._replace(owner=begin + part.owner)
-        for begin, (_, own) in zip(first.tolist(), waiting, strict=True)
-        for part in own
-    ]
+    alike: dict[DividedTile, list[TileParts]] = {}
+    for begin, (_, own) in zip(first.tolist(), waiting, strict=True):
+        for part in own:
+            alike.setdefault(part.tile, []).append(part._replace(owner=begin + part.owner))
     tiles = Tiles.joined([own for own, _ in waiting])
     waiting.clear()
-    return _numbered(tiles, alike(parts))
+    values, owners = ([np.concatenate([part[i] for part in own], axis=-1) for own in alike.values()] for i in (1, 2))
+    return _numbered(tiles, list(map(TileParts, alike, values, owners)))
 
 
 def _numbered(tiles: Tiles, groups: list[TileParts]) -> tuple[Tiles, list[TileParts]]:
