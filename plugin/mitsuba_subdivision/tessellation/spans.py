@@ -29,8 +29,8 @@ from .tiles import DEEPEST, UNIT, Tiles
 MOST_BITS = 63
 
 
-def ranked(keys: NDArray[np.int64]) -> tuple[IndexArray, IndexArray]:
-    """Number integers from 0 on, in their order and equal ones alike; they are sorted in place.
+def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
+    """Number integers from 0 on, in their order and equal ones alike.
 
     Returns
     -------
@@ -38,9 +38,8 @@ def ranked(keys: NDArray[np.int64]) -> tuple[IndexArray, IndexArray]:
     first : (k,) int32
         First index of each number.
     """
-    order = sort(keys)
-    begins = _begins(keys)
-    return _numbers(order, begins), order[begins]
+    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
+    return number.astype(np.int32), first.astype(np.int32)
 
 
 def joined(high: IntArray, low: IntArray, bits: int) -> NDArray[np.int64]:
@@ -57,42 +56,6 @@ def joined(high: IntArray, low: IntArray, bits: int) -> NDArray[np.int64]:
     keys <<= bits
     keys |= low
     return keys
-
-
-def sort(keys: NDArray[np.int64]) -> IndexArray:
-    """Sort integers that are not negative in place, and return the permutation that does it stably."""
-    bits = len(keys).bit_length()
-    if int(keys.max(initial=0)).bit_length() + bits > MOST_BITS:
-        order = np.argsort(keys, kind="stable").astype(np.int32)
-        keys[:] = gathered(keys, order)
-        return order
-    # With their places in the lowest bits no two are equal: a sort that is not stable does, in a fifth of the time.
-    for chunk in chunks_of(len(keys)):
-        keys[chunk] <<= bits
-        keys[chunk] |= np.arange(chunk.start, chunk.stop)
-    keys.sort()
-    order = np.empty(len(keys), dtype=np.int32)
-    for chunk in chunks_of(len(keys)):
-        order[chunk] = keys[chunk] & ((1 << bits) - 1)
-        keys[chunk] >>= bits
-    return order
-
-
-def _begins(in_order: IntArray) -> NDArray[np.bool_]:
-    """Whether each sorted integer differs from the one before."""
-    begins = np.ones(len(in_order), dtype=bool)
-    np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
-    return begins
-
-
-def _numbers(order: IndexArray, begins: NDArray[np.bool_]) -> IndexArray:
-    """Numbers of integers whose sorting permutation is `order`, and which of them, sorted, are new."""
-    number, before = np.empty(len(order), dtype=np.int32), -1
-    for chunk in chunks_of(len(order)):
-        in_order = np.cumsum(begins[chunk], dtype=np.int32) + np.int32(before)
-        number[order[chunk]] = in_order
-        before = in_order[-1]
-    return number
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,12 +209,11 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     m = frames.domain.corner_count
     shift = DEEPEST - int(tiles.depth.max(initial=0))
     keys, is_backward = _side_keys(tiles, frames, shift)
-    order = sort(keys)
-    begins = _begins(keys)
-    keys, group = keys[begins], _numbers(order, begins)
+    keys, group = np.unique(keys, return_inverse=True)
     wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int16).ravel()
-    rate = np.maximum.reduceat(gathered(wanted, order), np.flatnonzero(begins))
-    del order, begins, wanted
+    rate = np.ones(len(keys), dtype=np.int16)
+    np.maximum.at(rate, group, wanted)
+    del wanted
     # Positions along all lines, one line after the other.
     begin, size = keys >> HALVINGS, (EDGE >> shift) >> (keys & ((1 << HALVINGS) - 1)).astype(np.int32)
     del keys

@@ -13,7 +13,7 @@ from ..evaluation.bernstein import times
 from ..evaluation.divided_element import divided_elements
 from ..evaluation.divided_tile import DividedTile, part_of_tile
 from ..mesh import ragged
-from ..mesh.connectivity import IndexArray, IntArray
+from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
@@ -22,7 +22,7 @@ from .cones import dot
 from .criterion import Criterion, Measure
 from .flat_tiles import TileParts, are_flat
 from .patch_frames import PatchFrames
-from .spans import joined, sort
+from .spans import joined
 from .tile_rates import TileRates
 from .tiles import DEEPEST, Tiles
 
@@ -272,11 +272,11 @@ def _numbered(tiles: Tiles, groups: list[TileParts]) -> tuple[Tiles, list[TilePa
     ]
 
 
-def _order(tiles: Tiles) -> IndexArray:
+def _order(tiles: Tiles) -> IntArray:
     """Tiles in the order of their patches' corners, and so of the elements, along a curve of Morton's."""
     depth = int(tiles.depth.max(initial=0))
     u, v = (_interleaved(axis.astype(np.int64) << (depth - tiles.depth)) for axis in tiles.origin.T)
-    return sort(joined(tiles.corner, (u | v << 1) << 1 | tiles.is_flipped, 2 * depth + 1))
+    return np.argsort(joined(tiles.corner, (u | v << 1) << 1 | tiles.is_flipped, 2 * depth + 1), kind="stable")
 
 
 def _interleaved(values: IntArray) -> IntArray:
