@@ -10,7 +10,7 @@ from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements, element_of
 from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows, transition
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
-from mitsuba_subdivision.evaluation.refined_rings import refined_together
+from mitsuba_subdivision.evaluation.refined_rings import refined_ring
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
@@ -121,11 +121,11 @@ def nothing_divided():
 def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
     refined = []
 
-    def counted(scheme, signatures, mesh):
-        refined.extend(signatures)
-        return refined_together(scheme, signatures, mesh)
+    def counted(scheme, signature):
+        refined.append(signature)
+        return refined_ring(scheme, signature)
 
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.refined_together", counted)
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.refined_ring", counted)
     elements = divided(LimitSurface(tagged(cube(), creases=[(a, b, 8.7) for a, b in RING])))
     inner = [each for each in below(elements) if each.piece is None]
     assert len(refined) == len({each.base for each in inner})

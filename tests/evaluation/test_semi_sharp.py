@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +12,10 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordin
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.refined_rings import (
-    MOST_CONTROLS_TOGETHER,
-    RingMesh,
     refined_children,
-    refined_together,
 )
 from mitsuba_subdivision.evaluation.sample_weights import LocatedSamples
 from mitsuba_subdivision.mesh.connectivity import Topology
-from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named
 from reference.exact_samples import angle, faces_of
@@ -357,55 +352,8 @@ def test_refinements_that_only_lower_sharpness_are_made_once(scheme, spread):
         assert counted_pieces(scheme, sharpness, spread, "uniform")[1] == refinements
 
 
-@pytest.mark.parametrize("scheme", BALLS)
-def test_each_level_is_refined_at_once_where_sharpness_mixes(scheme):
-    """Along creases that Chaikin's method mixes, the parts at all samples differ, on each level."""
-    counts = [counted_pieces(scheme, sharpness, 0.9, "chaikin")[1] for sharpness in np.arange(2.9, 10)]
-    assert np.diff(counts).max() == 1
-
-
-def together_and_alone(scheme, signatures):
-    """Every part of elements that are refined together, twice in the same mesh, and of those that are alone."""
-    mesh = RingMesh(scheme, Counter(signature.smoothed for signature in signatures))
-    # Those that have the same place in the mesh come in another order, and some are left out.
-    for chosen in (signatures, signatures[::-2]):
-        for signature, (rings, ring) in zip(chosen, mesh.refined(chosen), strict=True):
-            for number, (_, child, stencils) in enumerate(refined_children(scheme, signature)):
-                yield (child, stencils), rings.child(ring, number)
-
-
-@EVERY_CAGE
-def test_elements_refined_together_are_as_those_refined_alone(scheme, cage):
-    surface = LimitSurface(cage, scheme)
-    signatures = [group.signature for group in surface.patches.classes]
-    # Several with the same one-ring but for sharpness, and some without.
-    signatures += [signature.smoothed for signature in signatures]
-    # What becomes smooth beside what stays sharp is as smooth as alone.
-    signatures += [signature.sharpened(3) for signature in signatures if signature.sharpness < 7]
-    for (child, stencils), (same_child, same) in together_and_alone(surface.scheme, signatures):
-        assert same_child == child
-        np.testing.assert_array_equal(same, stencils)
-
-
-@pytest.mark.parametrize("valence", [8, 60])
-def test_elements_of_large_one_rings_are_refined_alone(valence):
-    """All stencils of those refined together are kept: for a valence n they take memory as n squared."""
-    cage = spokes(extraordinary_triangles(valence), valence, np.linspace(2, 3, valence))
-    surface = LimitSurface(cage, "loop")
-    signatures = {group.signature for group in surface.patches.classes if max(group.signature.valences) == valence}
-    large = {signature for signature in signatures if one_ring(signature).vertex_count > MOST_CONTROLS_TOGETHER}
-    assert bool(large) == (valence == 60)
-    refined, mesh = refined_together(surface.scheme, sorted(signatures, key=repr), None)
-    assert (mesh is None) == bool(large) == (not refined)
-    for signature, (rings, ring) in refined.items():
-        for number, (_, child, stencils) in enumerate(refined_children(surface.scheme, signature)):
-            same_child, same = rings.child(ring, number)
-            assert same_child == child
-            np.testing.assert_array_equal(same, stencils)
-
-
 class RolledFaces(CatmullClark):
-    """Begins with the last refined face: of several one-rings, with one of the last ring."""
+    """Begins with the last refined face."""
 
     def refine(self, topology):
         refinement = super().refine(topology)
@@ -421,12 +369,11 @@ class RolledFaces(CatmullClark):
         return [(domain, (part + 4) % refined.half_edge_count) for domain, part in parts]
 
 
-def test_elements_of_a_scheme_that_numbers_faces_in_its_own_way_are_refined_alone(np_rng):
+def test_the_order_in_which_a_scheme_numbers_faces_does_not_matter(np_rng):
     cage = with_bumps(sharp_ball("catmull_clark", 4.9, 0.9, "chaikin"))
     scheme = RolledFaces()
     scheme.crease_method = "chaikin"
     signature = LimitSurface(cage).patches.classes[0].signature
-    assert not RingMesh(scheme, Counter([signature.smoothed] * 2)).refined([signature])
     uv = np_rng.random((20, 2))
     expected, rolled = (element_stencils(s, signature, uv) for s in (LimitSurface(cage).scheme, scheme))
     assert np.abs(rolled - expected).max() <= POSITION

@@ -32,7 +32,7 @@ from ..mesh.signature import Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .patch_pieces import MAX_REFINEMENTS, Piece, whole_piece
-from .refined_rings import RefinedRing, RingMesh, refined_ring, refined_together, ring_pattern
+from .refined_rings import RefinedRing, refined_ring, ring_pattern
 
 # After these refinements nothing is semi-sharp: every refinement takes one from a sharpness, which is below `INFINITE`.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
@@ -62,7 +62,6 @@ class DividedElement:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature.smoothed).vertex_count
         self._steady = _steady_refinements(scheme, signature)
-        self._refined: RefinedRing | None = None
         self._children: dict[int, DividedElement] = {}
         self._stencils: dict[int, FloatArray] = {}
 
@@ -128,12 +127,9 @@ class DividedElement:
         """The element that is refined in place of this one: less sharp by the steady refinements."""
         return element_of(self.scheme, self.signature.sharpened(-self._steady)) if self._steady else self
 
-    @property
+    @cached_property
     def _ring(self) -> RefinedRing:
-        """The refined one-ring."""
-        if self._refined is None:
-            self._refined = RefinedRing(refined_ring(self.scheme, self.signature), 0)
-        return self._refined
+        return refined_ring(self.scheme, self.signature)
 
     @cached_property
     def regular_count(self) -> int:
@@ -236,29 +232,12 @@ def divided_elements(scheme: Scheme, signatures: Iterable[Signature]) -> list[Di
     in a way of its own.
     """
     elements = [element_of(scheme, signature) for signature in signatures]
-    undivided, mesh = list(dict.fromkeys(elements)), None
+    undivided = list(dict.fromkeys(elements))
     for _ in range(MOST_DEPTH + 1):
-        mesh = refine_elements(scheme, undivided, mesh)
         undivided = list(dict.fromkeys(child for element in undivided for child in element.child_elements))
         if not undivided:
             return elements
     raise not_isolated(scheme, undivided[0].signature, MOST_DEPTH + 1)
-
-
-def refine_elements(scheme: Scheme, elements: list[DividedElement], mesh: RingMesh | None) -> RingMesh | None:
-    """Refine those of some elements that are no pieces together, which takes less time than one by one.
-
-    Parameters
-    ----------
-    mesh : RingMesh or None
-        The result of the last call, as in `refined_together`.
-    """
-    bases = dict.fromkeys(element.base for element in elements if element.piece is None)
-    new = {base.signature: base for base in bases if base._refined is None}
-    found, mesh = refined_together(scheme, new, mesh)
-    for signature, refined in found.items():
-        new[signature]._refined = refined
-    return mesh
 
 
 def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeError:

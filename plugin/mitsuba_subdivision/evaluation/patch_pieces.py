@@ -14,7 +14,7 @@ from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
-from .refined_rings import RefinedRing, refined_ring, ring_pattern
+from .refined_rings import refined_ring, ring_pattern
 
 # An element without semi-sharp features consists of regular and self-similar pieces after this many refinements, or its
 # scheme is refused: the rules keep making new extraordinary points. The schemes of this package need one or two.
@@ -133,7 +133,7 @@ def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStruct
         return None
     if len(ring_pattern(scheme, signature.smoothed).domains) != len(scheme.domain.children):
         return None
-    ring = RefinedRing(refined_ring(scheme, signature), 0)
+    ring = refined_ring(scheme, signature)
     if ring.signature(0) != signature:
         return None
     matrix, regular = ring.stencils(0), []

@@ -20,12 +20,11 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import MOST_DEPTH, DividedElement, PartKind, not_isolated, refine_elements
+from .divided_element import MOST_DEPTH, DividedElement, PartKind, not_isolated
 from .equations import Evaluator, SampleRows, times
 from .irregular_patch import IrregularPatch
 from .normals import TANGENT_ROUNDING
 from .patch_pieces import Piece
-from .refined_rings import RingMesh
 
 # Weights of control points are sums over eigen-coordinates, in which large terms may cancel. Cancelled terms leave
 # rounding errors. So this part of them counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
@@ -113,10 +112,8 @@ class LocatedSamples:
     ) -> list[tuple[int, IntArray, IntArray]]:
         """Fill the depths and the leaves; the depth, the samples and the turns of each part of the leaves, in order."""
         scheme, domain = self.scheme, self.scheme.domain
-        mesh: RingMesh | None = None
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray, FloatArray, IntArray]]] = {}
         for depth in range(MOST_DEPTH + 1):
-            mesh = refine_elements(scheme, elements, mesh)
             first = ragged.offsets(np.bincount(element, minlength=len(elements)))
             kinds = np.array([each.kind for each in elements])
             total = (turn + np.array([each.turn for each in elements])[element]) % domain.corner_count

@@ -6,10 +6,8 @@ at both places. Stencils over an unfolded ring stay right, because the weights o
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -212,42 +210,6 @@ def _least_ahead(values: IntArray, step: IntArray) -> IntArray:
         values, step = least, step[step]
 
 
-class JoinedRings:
-    """One-rings beside each other, unconnected, in one mesh.
-
-    Parameters
-    ----------
-    signatures : sequence of Signature
-        Signatures without semi-sharp features.
-
-    Attributes
-    ----------
-    half_edges, vertices : list of int
-        The first half-edge and the first vertex of each one-ring. Its others follow in the order that they have in the
-        one-ring alone.
-    """
-
-    def __init__(self, signatures: Sequence[Signature]) -> None:
-        rings = [one_ring(signature).topology for signature in signatures]
-        *self.half_edges, _ = ragged.offsets([ring.half_edge_count for ring in rings]).tolist()
-        *self.vertices, vertex_count = ragged.offsets([ring.vertex_count for ring in rings]).tolist()
-        self.topology = Topology(
-            vertex_count,
-            np.concatenate([ring.face_sizes for ring in rings]),
-            np.concatenate([ring.face_vertices + first for ring, first in zip(rings, self.vertices, strict=True)]),
-            np.concatenate([ring.edge_names + first for ring, first in zip(rings, self.half_edges, strict=True)]),
-            np.concatenate([ring.vertex_rules for ring in rings]) if any(r.rules is not None for r in rings) else None,
-        )
-
-    def sharpness(self, elements: Iterable[tuple[int, Signature]]) -> SemiSharpness | None:
-        """Semi-sharp features at the corners of some elements, given as (number of the one-ring, signature).
-
-        None if there are none.
-        """
-        sharp = [(signature, self.half_edges[number]) for number, signature in elements if signature.is_semi_sharp]
-        return _local_sharpness(self.topology, sharp) if sharp else None
-
-
 @lru_cache(maxsize=4096)
 def _fans(smooth: Signature) -> list[FanHalfEdges]:
     """Half-edges of the fan at each corner of the element in the local mesh of its one-ring."""
@@ -255,12 +217,7 @@ def _fans(smooth: Signature) -> list[FanHalfEdges]:
 
 
 def _with_sharpness(local: Topology, signature: Signature) -> Topology:
-    """The topology of a one-ring, with the semi-sharp features of a signature."""
-    return local.with_rules(local.rules, _local_sharpness(local, [(signature, 0)]))
-
-
-def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]]) -> SemiSharpness:
-    """Semi-sharp features at the corners of elements, given with the first half-edge of the one-ring of each.
+    """The topology of a one-ring, with the semi-sharp features at the corners of its element.
 
     Features elsewhere in the one-ring do not matter to the element, but for the refined sharpness at the far
     ends of the edges that meet its corners.
@@ -268,25 +225,20 @@ def _local_sharpness(local: Topology, elements: Iterable[tuple[Signature, int]])
     edges, refined = np.zeros((2, local.half_edge_count))
     vertices = np.zeros(local.vertex_count)
     across: list[tuple[int, float, float, bool]] = []
-    half_edges: list[int] = []
-    rows: list[tuple[float, float, float]] = []
-    for signature, first in elements:
-        for (behind, ahead), fan in zip(_fans(signature.smoothed), signature.fans, strict=True):
-            if not isinstance(fan, TaggedFan) or fan.sharpness is None:
-                continue
-            centre = int(local.face_vertices[first + ahead[0]])
-            vertices[centre] = fan.sharpness.vertex
-            across += [(centre, *row) for row in fan.sharpness.across]
-            half_edges += [first + half_edge for half_edge in behind[::-1] + ahead]
-            rows += fan.sharpness.edges
-    at = np.array(half_edges)
-    # A third of the time that an array of tuples takes.
-    sharpness, here, there = np.fromiter(chain.from_iterable(rows), np.float64).reshape(-1, 3).T
-    edges[at], refined[at] = sharpness, here
-    twins = local.twin[at]
-    inside = twins >= 0
-    edges[twins[inside]], refined[twins[inside]] = sharpness[inside], there[inside]
+    for (behind, ahead), fan in zip(_fans(signature.smoothed), signature.fans, strict=True):
+        if not isinstance(fan, TaggedFan) or fan.sharpness is None:
+            continue
+        centre = int(local.face_vertices[ahead[0]])
+        vertices[centre] = fan.sharpness.vertex
+        across += [(centre, *row) for row in fan.sharpness.across]
+        at = np.array(behind[::-1] + ahead)
+        sharpness, here, there = np.array(fan.sharpness.edges).T
+        edges[at], refined[at] = sharpness, here
+        twins = local.twin[at]
+        inside = twins >= 0
+        edges[twins[inside]], refined[twins[inside]] = sharpness[inside], there[inside]
     vertex, across_sharpness, across_refined, sharpens = np.array(across, dtype=float).reshape(-1, 4).T
-    return SemiSharpness(
+    semi_sharpness = SemiSharpness(
         edges, refined, vertices, vertex.astype(np.int64), across_sharpness, across_refined, sharpens > 0
     )
+    return local.with_rules(local.rules, semi_sharpness)

@@ -209,11 +209,7 @@ class Signature:
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
     """Read off the signature of one element."""
     fans = fan_half_edges(topology, half_edge, kind)
-    smooth = smooth_signature(topology, fans, kind)
-    semi = topology.semi_sharpness
-    if semi is None:
-        return smooth
-    return with_sharpness(smooth, FanSharpnessRows(topology, half_edges_around(fans)[None], semi), 0)
+    return with_sharpness(smooth_signature(topology, fans, kind), topology, half_edges_around(fans))
 
 
 def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
@@ -273,52 +269,31 @@ def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
     return TaggedFan(fan.ahead, fan.behind, fan.rule, fan.is_closed, sharpness)
 
 
-class FanSharpnessRows:
-    """Semi-sharp features at the corners of many elements, whose signatures are equal but for these features.
+def with_sharpness(smooth: Signature, topology: Topology, around: IndexArray) -> Signature:
+    """Signature of an element with its semi-sharp features.
 
     Parameters
     ----------
-    around : (e, n) int
-        The result of `half_edges_around` for each element.
-    semi : SemiSharpness
-        Semi-sharp features of the mesh, in place of those of ``topology``.
+    smooth : Signature
+        Without them.
+    around : (n,) int32
+        The result of `half_edges_around`.
     """
-
-    def __init__(self, topology: Topology, around: IntArray, semi: SemiSharpness) -> None:
-        twins = topology.twin[around]
-        there = np.where(twins < 0, 0, semi.edges_refined[twins])
-        self._edges = semi.edges[around], semi.edges_refined[around], there
-        self._vertices = topology.face_vertices[around]
-        self._semi = semi
-
-    def at(self, element: int, smooth: Signature) -> list[FanSharpness | None]:
-        """Features at each corner of one of the elements; ``smooth`` is its signature without them."""
-        semi = self._semi
-        own = [values[element] for values in self._edges]
-        sharp = np.flatnonzero(np.any(own, axis=0)).tolist()
-        rows: list[tuple[float, float, float]] = [SMOOTH_EDGE] * len(own[0])
-        for index, row in zip(sharp, zip(*(values[sharp].tolist() for values in own), strict=True), strict=True):
-            rows[index] = row
-        vertices = self._vertices[element].tolist()
-        found: list[FanSharpness | None] = []
-        begin = 0
-        for fan in smooth.fans:
-            vertex = vertices[begin]
-            count = fan_face_count(fan)
-            begin += count
-            edges, sharpness = tuple(rows[begin - count : begin]), float(semi.vertices[vertex])
-            across = _across(semi, vertex) if len(semi.across_vertex) else ()
-            is_sharp = sharpness or across or any(row is not SMOOTH_EDGE for row in edges)
-            found.append(FanSharpness(edges, sharpness, across) if is_sharp else None)
-        return found
-
-
-def with_sharpness(smooth: Signature, rows: FanSharpnessRows, element: int) -> Signature:
-    """Signature of one of the elements of ``rows``, given its signature without semi-sharp features."""
-    fans = zip(smooth.fans, rows.at(element, smooth), strict=True)
-    found = Signature(
-        smooth.kind, tuple(fan if sharpness is None else _fan_with(fan, sharpness) for fan, sharpness in fans)
-    )
+    semi = topology.semi_sharpness
+    if semi is None:
+        return smooth
+    twins = topology.twin[around]
+    there = np.where(twins < 0, 0, semi.edges_refined[twins])
+    edges = list(zip(semi.edges[around].tolist(), semi.edges_refined[around].tolist(), there.tolist(), strict=True))
+    vertices, fans, begin = topology.face_vertices[around].tolist(), [], 0
+    for fan in smooth.fans:
+        vertex, end = vertices[begin], begin + fan_face_count(fan)
+        across = _across(semi, vertex) if len(semi.across_vertex) else ()
+        sharpness = FanSharpness(tuple(edges[begin:end]), float(semi.vertices[vertex]), across)
+        is_sharp = sharpness.vertex or across or any(edge != SMOOTH_EDGE for edge in sharpness.edges)
+        fans.append(_fan_with(fan, sharpness) if is_sharp else fan)
+        begin = end
+    found = Signature(smooth.kind, tuple(fans))
     # Caches the result of `smoothed`.
     vars(found)["_smoothed"] = smooth
     return found
