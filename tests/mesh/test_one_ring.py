@@ -152,24 +152,6 @@ def test_half_edges_around_each_corner_are_turns_apart(topology):
             assert topology.turn(fan[-1]) in (-1, ahead[0])
 
 
-@pytest.mark.parametrize("cut", [(), [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 5)]], ids=["whole", "cut"])
-def test_creases_of_a_signature_are_equal_if_those_at_its_corners_are(cut, np_rng):
-    """Whatever Chaikin's method makes of them, and on both sides of a cut."""
-    smooth = torus(5, 6)
-    t = smooth.topology
-    edges = {tuple(sorted((int(t.face_vertices[h]), int(t.face_vertices[t.next[h]])))) for h in t.edge_half_edge}
-    creases = {edge: np_rng.choice([2.0, 3.0]) for edge in sorted(edges - set(cut)) if np_rng.random() < 0.2}
-    all_creases = [*creases.items(), *((edge, 10.0) for edge in cut)]
-    cage = tagged(smooth, creases=[(*edge, sharpness) for edge, sharpness in all_creases], crease_method="chaikin")
-    found = []
-    for face, half_edge in enumerate(t.face_offsets[:-1].tolist()):
-        corners = set(polygons(t)[face])
-        there = {sharpness for edge, sharpness in creases.items() if corners & set(edge)}
-        found.append(signature_at(cage.cut_mesh.topology, half_edge, "face").has_equal_creases)
-        assert found[-1] == (len(there) <= 1)
-    assert len(set(found)) == 2
-
-
 @pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
 def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
     """Beside a crease that is, in a face that does not see it."""

@@ -8,12 +8,6 @@ A semi-sharp crease has thousands of parts along it, but few kinds: parts whose 
 divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Evaluation descends to the
 children that hold samples (`occupied_pieces`, `stencils_by_signature`); bounds divide parts that are not yet tight
 (`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
-
-*Steady* refinements are made once. An element with creases of sharpness 4.7 and 6.2 is refined by the same rules as one
-with 2.7 and 4.2: all of them are sharp before and after, and the amount makes no difference. Only the sharpness of
-their children differs: 3.7 and 5.2, and 1.7 and 3.2. So the signature is lowered by 2, the number of
-its `Signature.steady_refinements`, and refined; the children's sharpness is raised by 2 again. The children of 3.7 and
-5.2 are lowered in turn, by 1, to 2.7 and 4.2, which is refined already.
 """
 
 from __future__ import annotations
@@ -61,7 +55,6 @@ class DividedElement:
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature.smoothed).vertex_count
-        self._steady = _steady_refinements(scheme, signature)
         self._children: dict[int, DividedElement] = {}
         self._stencils: dict[int, FloatArray] = {}
 
@@ -102,14 +95,13 @@ class DividedElement:
     def child(self, number: int) -> tuple[DividedElement, FloatArray]:
         """One of the children, and its control points over those of the element: ``(K_child, K)`` float64."""
         if number not in self._stencils:
-            self._stencils[number] = self.base._ring.stencils(number)
+            self._stencils[number] = self._ring.stencils(number)
         return self.child_element(number), self._stencils[number]
 
     def child_element(self, number: int) -> DividedElement:
         """One of the children."""
         if number not in self._children:
-            signature = self.base._ring.signature(number).sharpened(self._steady)
-            self._children[number] = element_of(self.scheme, signature)
+            self._children[number] = element_of(self.scheme, self._ring.signature(number))
         return self._children[number]
 
     @property
@@ -121,11 +113,6 @@ class DividedElement:
     def child_elements(self) -> list[DividedElement]:
         """All children; none of a piece."""
         return [] if self.piece is not None else [self.child_element(number) for number in range(len(self.domains))]
-
-    @cached_property
-    def base(self) -> DividedElement:
-        """The element that is refined in place of this one: less sharp by the steady refinements."""
-        return element_of(self.scheme, self.signature.sharpened(-self._steady)) if self._steady else self
 
     @cached_property
     def _ring(self) -> RefinedRing:
@@ -251,10 +238,3 @@ def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeErr
         f"{scheme.name}: refinement leaves a {rest.kind} with fans {rest.fans} neither regular nor self-similar; "
         "expected a scheme that isolates extraordinary points"
     )
-
-
-def _steady_refinements(scheme: Scheme, signature: Signature) -> int:
-    """Number by which a signature is lowered; 0 where Chaikin's method mixes sharpness, as no two levels are alike."""
-    if scheme.crease_method == "chaikin" and not signature.has_equal_creases:
-        return 0
-    return signature.steady_refinements

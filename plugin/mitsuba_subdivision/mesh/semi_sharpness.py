@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -119,24 +118,6 @@ class FanSharpness(NamedTuple):
     edges: tuple[tuple[float, float, float], ...]
     vertex: float
     across: tuple[tuple[float, float, bool], ...]
-
-    @property
-    def least_refined(self) -> float:
-        """The least sharpness, after one refinement, of anything that is sharp; infinite where nothing is."""
-        # Of very many edges, most are smooth or as sharp as others.
-        refined = [least for sharpness, *ends in set(self.edges) if sharpness for least in ends]
-        refined += [each for sharpness, each, _ in self.across if sharpness]
-        if self.vertex:
-            refined.append(max(self.vertex - 1, 0.0))
-        return min(refined, default=math.inf)
-
-    def sharpened(self, by: int) -> FanSharpness:
-        """The same features, each sharper by the same amount; what is smooth stays smooth."""
-        return FanSharpness(
-            tuple((row[0] + by, row[1] + by, row[2] + by) if row[0] else row for row in self.edges),
-            self.vertex and self.vertex + by,
-            tuple((row[0] + by, row[1] + by, row[2]) if row[0] else row for row in self.across),
-        )
 
 
 def _lowered(sharpness: FloatArray) -> FloatArray:

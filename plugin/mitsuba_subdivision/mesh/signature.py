@@ -8,7 +8,6 @@ a vertex is all faces around it. The limit surface over an element depends on no
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeVar
@@ -137,37 +136,8 @@ class Signature:
     @property
     def sharpness(self) -> float:
         """The greatest sharpness of all semi-sharp features; 0 if there are none."""
-        return max((max([s.vertex, *(row[0] for row in s.edges + s.across)]) for s in self._sharpness), default=0.0)
-
-    @cached_property
-    def steady_refinements(self) -> int:
-        """Number of refinements that lower all sharpness by one and change no rule of the one-ring.
-
-        During these everything sharp stays sharp. The element refined so often has the parts of a less sharp one, whose
-        signature is this one `sharpened` by minus that number, but for their sharpness.
-        """
-        least = min((sharp.least_refined for sharp in self._sharpness), default=math.inf)
-        # After the last of these, everything has a sharpness above one, so that it is still sharp after one more.
-        return max(math.ceil(least) - 2, 0) if least < math.inf else 0
-
-    @property
-    def has_equal_creases(self) -> bool:
-        """Whether all its semi-sharp edges, and those across creases, have the same sharpness."""
-        sharp = (row[0] for fan in self._sharpness for row in (*fan.edges, *fan.across) if row[0])
-        first = next(sharp, 0.0)
-        return all(sharpness == first for sharpness in sharp)
-
-    def sharpened(self, by: int) -> Signature:
-        """The same with everything sharp made sharper by one amount, or less sharp; exact, as sharpness is below 10."""
-        if by == 0:
-            return self
-        if by not in self._sharpened:
-            self._sharpened[by] = Signature(self.kind, tuple(_sharpened(fan, by) for fan in self.fans))
-        return self._sharpened[by]
-
-    @cached_property
-    def _sharpened(self) -> dict[int, Signature]:
-        return {}
+        tags = [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
+        return max((max([tag.vertex, *(row[0] for row in tag.edges + tag.across)]) for tag in tags), default=0.0)
 
     def near(self) -> Signature:
         """The same without faces that are too far away to matter, see `TaggedFan.near`."""
@@ -186,10 +156,6 @@ class Signature:
     @cached_property
     def _smoothed(self) -> Signature:
         return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans))
-
-    @property
-    def _sharpness(self) -> list[FanSharpness]:
-        return [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
 
     def rotated(self, corner: int) -> Signature:
         """Return the signature of the same element, named by a later one of its corners, or of its vertex's faces."""
@@ -297,13 +263,6 @@ def with_sharpness(smooth: Signature, topology: Topology, around: IndexArray) ->
     # Caches the result of `smoothed`.
     vars(found)["_smoothed"] = smooth
     return found
-
-
-def _sharpened(fan: Fan, by: int) -> Fan:
-    """The same fan with everything sharp made sharper."""
-    if not isinstance(fan, TaggedFan) or fan.sharpness is None:
-        return fan
-    return _fan_with(fan, fan.sharpness.sharpened(by))
 
 
 def _across(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
