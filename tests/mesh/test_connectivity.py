@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
-from mitsuba_subdivision.mesh import connectivity
-from mitsuba_subdivision.mesh.connectivity import Topology, paired
+from mitsuba_subdivision.mesh.connectivity import paired
 from mitsuba_subdivision.refinement.refined_attributes import differences
 from reference.exact_samples import mesh_of
 
@@ -27,7 +26,7 @@ def runs(request, monkeypatch):
 
 
 @pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
-def test_computed_neighbours_are_those_of_the_tables(any_cage, as_arrays):
+def test_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     """On borders there is nothing beyond."""
     t = any_cage.topology
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
@@ -49,16 +48,6 @@ def test_walks_go_on_from_where_they_arrived():
     for t in (torus(5, 4).topology, mesh_of(4, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])):
         assert t.turn_back(t.turn_back(t.turn(t.turn(0)))) == 0
         assert t.preceding(t.preceding(t.following(t.following(0)))) == 0
-
-
-def test_many_quadrilaterals_are_tessellated_without_tables_of_neighbours(monkeypatch):
-    """They would be a third of what a large cage takes."""
-    monkeypatch.setattr("mitsuba_subdivision.mesh.ragged.CHUNK_LENGTH", 4 * 8 * 6 - 1)
-    cage = torus(8, 6)
-    LimitSurface(cage).sampling(3)
-    tables = {"next", "prev", "face", "_turned"}
-    assert not tables & vars(cage.topology).keys()
-    assert not tables & vars(cage.cut_mesh.topology).keys()
 
 
 def test_vertices_of_any_integer_type_are_the_same_cage():
@@ -104,18 +93,15 @@ def test_edges_are_numbered_without_gaps(any_cage):
     np.testing.assert_array_equal(topology.edge_half_edge, lowest)
 
 
-def test_pairs_of_vertices_have_distinct_numbers_below_their_count(any_cage, monkeypatch):
-    def checked(keys_of, count, key_count):
-        keys = keys_of(slice(0, count))
-        t = any_cage.topology
-        ends = np.sort([t.face_vertices, t.face_vertices[t.next]], axis=0)
-        assert len(np.unique(keys)) == len(np.unique(ends, axis=1).T)
-        assert keys.min() >= 0
-        assert keys.max() < key_count
-        return paired(keys_of, count, key_count)
-
-    monkeypatch.setattr(connectivity, "paired", checked)
-    assert Topology(any_cage.vertex_count, any_cage.face_sizes, any_cage.face_vertices).edge_count
+@pytest.mark.parametrize("unit", [1, 1 << 58], ids=["keys of few bits", "keys of many bits"])
+def test_half_edges_of_equal_keys_are_edges(unit, np_rng):
+    keys = np_rng.permutation(np.repeat(np.arange(20), [1, 2] * 10))
+    edge, twin, count = paired(unit * keys)
+    np.testing.assert_array_equal(edge, keys)
+    assert count == 20
+    for half_edge, other in enumerate(twin.tolist()):
+        same = set(np.flatnonzero(keys == keys[half_edge]).tolist()) - {half_edge}
+        assert same == ({other} if other >= 0 else set())
 
 
 def test_refinement_differs_where_one_mesh_is_sharp():

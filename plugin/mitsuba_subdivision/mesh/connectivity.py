@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, TypeVar, overload
+from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .ragged import chunks_of, first_indices, gathered
+from .ragged import first_indices, gathered
 from .semi_sharpness import SemiSharpness
 
 # Integers of any width; docstrings name it where it matters.
@@ -21,13 +20,6 @@ IndexArray = NDArray[np.int32]
 # Half-edges: many, or one.
 HalfEdges = NDArray[np.integer] | np.integer | int
 HalfEdgeArray = TypeVar("HalfEdgeArray", bound=NDArray[np.integer])
-# From one half-edge to another, -1 beyond a border.
-Walk = Callable[[int], Any]
-
-# Where all faces are quadrilaterals, these bits of a half-edge are its corner, and the others its face.
-QUAD_CORNER = 0b11
-# Meshes of so few half-edges keep lists for walks.
-FEW_HALF_EDGES = 1 << 13
 
 
 class VertexRule(IntEnum):
@@ -134,19 +126,11 @@ class Topology:
     def _edges(self) -> tuple[IndexArray, IndexArray, int]:
         """Edge and twin of each half-edge, and the number of edges."""
         if self.edge_names is not None:
-            return paired(self.edge_names.__getitem__, self.half_edge_count, int(self.edge_names.max(initial=0)) + 1)
-        return paired(self._vertex_pairs, self.half_edge_count, self.vertex_count * (self.vertex_count + 1) // 2)
-
-    def _vertex_pairs(self, half_edges: slice) -> IntArray:
-        """A number for the two vertices of each of some half-edges.
-
-        Pairs are numbered as in a triangle with a row for each higher vertex: one bit less than a square would take.
-        """
-        start = self.face_vertices[half_edges]
-        following = self.following(np.arange(half_edges.start, half_edges.stop, dtype=np.int32))
-        end = self.face_vertices.take(following)
-        high = np.maximum(start, end).astype(np.int64)
-        return high * (high + 1) // 2 + np.minimum(start, end)
+            return paired(self.edge_names)
+        # Pairs of vertices are numbered as in a triangle with a row for each higher vertex: one bit less than a square.
+        end = gathered(self.face_vertices, self.next)
+        high = np.maximum(self.face_vertices, end).astype(np.int64)
+        return paired(high * (high + 1) // 2 + np.minimum(self.face_vertices, end))
 
     @property
     def edge(self) -> IndexArray:
@@ -259,13 +243,6 @@ class Topology:
         """Half-edges of some faces in ascending order; ``is_chosen`` selects faces."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
 
-    # In large meshes where all faces are quadrilaterals, these are computed. That is faster than to look them up, and
-    # saves the tables. In small ones, the number of operations takes the time.
-
-    @cached_property
-    def _is_computed(self) -> bool:
-        return self.common_size == 4 and self.half_edge_count > ragged.CHUNK_LENGTH
-
     @overload
     def face_of(self, half_edges: np.integer | int) -> np.integer | int: ...
     @overload
@@ -280,9 +257,7 @@ class Topology:
     def following(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def following(self, half_edges: HalfEdges) -> HalfEdges:
         """`next` of some half-edges."""
-        if not self._is_computed:
-            return _looked_up(self.next, half_edges)
-        return (half_edges + 1) & QUAD_CORNER | half_edges & ~QUAD_CORNER
+        return _looked_up(self.next, half_edges)
 
     @overload
     def preceding(self, half_edges: np.integer | int) -> np.integer | int: ...
@@ -290,14 +265,10 @@ class Topology:
     def preceding(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def preceding(self, half_edges: HalfEdges) -> HalfEdges:
         """`prev` of some half-edges."""
-        if not self._is_computed:
-            return _looked_up(self.prev, half_edges)
-        return (half_edges - 1) & QUAD_CORNER | half_edges & ~QUAD_CORNER
+        return _looked_up(self.prev, half_edges)
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
-        if self._is_computed:
-            return _looked_up(self.twin, self.preceding(half_edge))
         return _looked_up(self._turned, half_edge)
 
     @cached_property
@@ -311,80 +282,43 @@ class Topology:
         # Indexing by () turns the zero-dimensional result for one half-edge into a number.
         return np.where(beyond < 0, -1, self.following(beyond))[()]
 
-    def walks(self) -> tuple[Walk, Walk, Walk]:
-        """`turn`, `turn_back` and `following`, for one half-edge at a time."""
-        if self.half_edge_count > FEW_HALF_EDGES:
-            return self.turn, self.turn_back, self.following
-        turn, turn_back, following = self._walk_views
-        return turn.__getitem__, turn_back.__getitem__, following.__getitem__
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Views of memory cannot be pickled, and are made again.
-        return {name: value for name, value in vars(self).items() if name != "_walk_views"}
-
-    @cached_property
-    def _walk_views(self) -> tuple[memoryview, memoryview, memoryview]:
-        """``(n_h,)`` where `walks` lead from each half-edge; faster than arrays for one at a time, and as small."""
-        every = np.arange(self.half_edge_count, dtype=np.int32)
-        return self.turn(every).data, self.turn_back(every).data, self.following(every).data
-
 
 def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:
     """``values[index]``: NumPy's ``take`` is faster than brackets for many indices, but slower for one."""
     return gathered(values, index) if isinstance(index, np.ndarray) else values[index]
 
 
-def paired(keys_of: Callable[[slice], IntArray], count: int, key_count: int) -> tuple[IndexArray, IndexArray, int]:
+def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:
     """Join half-edges of equal keys into edges.
 
     Parameters
     ----------
-    keys_of : callable
-        Keys of some half-edges: a number below ``key_count`` that a half-edge shares with the others of its edge alone.
-    count, key_count : int
-        Number of half-edges, and of keys that there may be.
+    keys : (n,) int64
+        A number from 0 on that a half-edge shares with the others of its edge alone.
 
     Returns
     -------
-    edge : (count,) int32
+    edge : (n,) int32
         0-based edge of each half-edge, in the order of the keys.
-    twin : (count,) int32
+    twin : (n,) int32
         The other half-edge of the edge, -1 if there is none. Where an edge has more than two, one of them.
     edge_count : int
     """
-    order, begins = _sorted_half_edges(keys_of, count, key_count)
-    edge, twin = np.empty_like(order), np.full_like(order, -1)
-    edge_count = 0
-    for chunk in chunks_of(count):
-        number = np.cumsum(begins[chunk], dtype=np.int32)
-        edge[order[chunk]] = number + (edge_count - 1)
-        edge_count += int(number[-1])
-        second = chunk.start + np.flatnonzero(~begins[chunk])
-        one, other = order[second - 1], order[second]
-        twin[one], twin[other] = other, one
-    return edge, twin, edge_count
-
-
-def _sorted_half_edges(
-    keys_of: Callable[[slice], IntArray], count: int, key_count: int
-) -> tuple[IndexArray, NDArray[np.bool_]]:
-    """Half-edges sorted by key, then by number, and whether each of them is the first of its key."""
-    begins = np.ones(count, dtype=bool)
-    half_edge_bits = np.uint64(count.bit_length())
-    if key_count << int(half_edge_bits) <= 1 << 64:
-        # A key and a half-edge fit into 64 bits. Numbers sort several times faster than indices into them.
-        keys = np.empty(count, dtype=np.uint64)
-        for chunk in chunks_of(count):
-            np.left_shift(keys_of(chunk).astype(np.uint64), half_edge_bits, out=keys[chunk])
-            keys[chunk] |= np.arange(chunk.start, chunk.stop, dtype=np.uint64)
+    bits = len(keys).bit_length()
+    if int(keys.max(initial=0)) < 1 << (63 - bits):
+        # A key and a half-edge fit into 63 bits. Numbers sort several times faster than indices into them.
+        keys = keys << bits | np.arange(len(keys))
         keys.sort()
-        order = np.empty(count, dtype=np.int32)
-        half_edge_mask = (np.uint64(1) << half_edge_bits) - np.uint64(1)
-        np.bitwise_and(keys, half_edge_mask, out=order, casting="unsafe")
-        keys >>= half_edge_bits
+        order = (keys & ((1 << bits) - 1)).astype(np.int32)
+        keys >>= bits
     else:
-        keys = np.concatenate([keys_of(chunk) for chunk in chunks_of(count)])
         order = np.argsort(keys, kind="stable").astype(np.int32)
         keys = keys[order]
+    begins = np.ones(len(keys), dtype=bool)
     np.not_equal(keys[1:], keys[:-1], out=begins[1:])
-    return order, begins
+    edge, twin = np.empty_like(order), np.full_like(order, -1)
+    edge[order] = np.cumsum(begins, dtype=np.int32) - 1
+    second = np.flatnonzero(~begins)
+    one, other = order[second - 1], order[second]
+    twin[one], twin[other] = other, one
+    return edge, twin, int(np.count_nonzero(begins))

@@ -8,13 +8,14 @@ a vertex is all faces around it. The limit surface over an element depends on no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from .connectivity import IndexArray, IntArray, Topology, VertexRule, Walk
+from .connectivity import HalfEdges, IndexArray, IntArray, Topology, VertexRule
 from .semi_sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
@@ -180,12 +181,11 @@ def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signa
 
 def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
     """Half-edges of the fan at each corner of the element that a half-edge names."""
-    turn, turn_back, following = topology.walks()
     corners = [half_edge]
     if kind == "face":
-        while (corner := int(following(corners[-1]))) != half_edge:
+        while (corner := int(topology.following(corners[-1]))) != half_edge:
             corners.append(corner)
-    return [_fan_half_edges(turn, turn_back, corner) for corner in corners]
+    return [_fan_half_edges(topology, corner) for corner in corners]
 
 
 def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
@@ -193,17 +193,17 @@ def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
     return np.concatenate([np.array(behind[::-1] + ahead, dtype=np.int32) for behind, ahead in fans])
 
 
-def _fan_half_edges(turn: Walk, turn_back: Walk, half_edge: int) -> FanHalfEdges:
-    def half_edges(current: int, step: Walk) -> list[int]:
+def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
+    def half_edges(current: int, step: Callable[[int], HalfEdges]) -> list[int]:
         found: list[int] = []
         while current >= 0 and not (found and current == half_edge):
             found.append(current)
             current = int(step(current))
         return found
 
-    ahead = half_edges(half_edge, turn)
-    closed = int(turn(ahead[-1])) >= 0
-    return [] if closed else half_edges(int(turn_back(half_edge)), turn_back), ahead
+    ahead = half_edges(half_edge, topology.turn)
+    is_closed = int(topology.turn(ahead[-1])) >= 0
+    return [] if is_closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back), ahead
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
