@@ -18,13 +18,6 @@ def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
     np.testing.assert_array_equal(topology.face[topology.next], topology.face)
 
 
-@pytest.fixture(params=[None, 3], ids=["in one run", "in runs of three"], autouse=True)
-def runs(request, monkeypatch):
-    """Long arrays are worked on in runs."""
-    if request.param:
-        monkeypatch.setattr("mitsuba_subdivision.mesh.ragged.CHUNK_LENGTH", request.param)
-
-
 @pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
 def test_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     """On borders there is nothing beyond."""

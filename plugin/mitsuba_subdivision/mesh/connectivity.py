@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .ragged import first_indices, gathered
+from .ragged import first_indices
 from .semi_sharpness import SemiSharpness
 
 # Integers of any width; docstrings name it where it matters.
@@ -128,7 +128,7 @@ class Topology:
         if self.edge_names is not None:
             return paired(self.edge_names)
         # Pairs of vertices are numbered as in a triangle with a row for each higher vertex: one bit less than a square.
-        end = gathered(self.face_vertices, self.next)
+        end = self.face_vertices[self.next]
         high = np.maximum(self.face_vertices, end).astype(np.int64)
         return paired(high * (high + 1) // 2 + np.minimum(self.face_vertices, end))
 
@@ -249,7 +249,7 @@ class Topology:
     def face_of(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def face_of(self, half_edges: HalfEdges) -> HalfEdges:
         """`face` of some half-edges."""
-        return half_edges // self.common_size if self.common_size else _looked_up(self.face, half_edges)
+        return half_edges // self.common_size if self.common_size else self.face[half_edges]
 
     @overload
     def following(self, half_edges: np.integer | int) -> np.integer | int: ...
@@ -257,7 +257,7 @@ class Topology:
     def following(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def following(self, half_edges: HalfEdges) -> HalfEdges:
         """`next` of some half-edges."""
-        return _looked_up(self.next, half_edges)
+        return self.next[half_edges]
 
     @overload
     def preceding(self, half_edges: np.integer | int) -> np.integer | int: ...
@@ -265,27 +265,22 @@ class Topology:
     def preceding(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
     def preceding(self, half_edges: HalfEdges) -> HalfEdges:
         """`prev` of some half-edges."""
-        return _looked_up(self.prev, half_edges)
+        return self.prev[half_edges]
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
-        return _looked_up(self._turned, half_edge)
+        return self._turned[half_edge]
 
     @cached_property
     def _turned(self) -> IndexArray:
         """``(n_h,)`` `turn` of each half-edge: looked up several times for each."""
-        return gathered(self.twin, self.prev)
+        return self.twin[self.prev]
 
     def turn_back(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
-        beyond = _looked_up(self.twin, half_edge)
+        beyond = self.twin[half_edge]
         # Indexing by () turns the zero-dimensional result for one half-edge into a number.
         return np.where(beyond < 0, -1, self.following(beyond))[()]
-
-
-def _looked_up(values: IndexArray, index: HalfEdges) -> IndexArray:
-    """``values[index]``: NumPy's ``take`` is faster than brackets for many indices, but slower for one."""
-    return gathered(values, index) if isinstance(index, np.ndarray) else values[index]
 
 
 def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:

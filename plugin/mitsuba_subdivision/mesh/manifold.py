@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology
-from .ragged import chunks_of, gathered
 
 # Faces with more corners than this are checked by sorting, vertices with more faces by pointer doubling.
 FEW_CORNERS = 8
@@ -87,7 +86,7 @@ def _is_later(keys: IntArray) -> NDArray[np.bool_]:
 def runs_with_twin(topology: Topology) -> NDArray[np.bool_]:
     """``(n_h,)`` whether each half-edge has a twin of the same direction."""
     t = topology
-    return (t.twin >= 0) & (t.face_vertices == gathered(t.face_vertices, t.twin))
+    return (t.twin >= 0) & (t.face_vertices == t.face_vertices[t.twin])
 
 
 def _has_single_fans(topology: Topology) -> bool:
@@ -98,17 +97,16 @@ def _has_single_fans(topology: Topology) -> bool:
     t = topology
     if t.vertex_face_count.max() > FEW_FACES:
         return not (fan_counts(t, fan_labels(t)[1]) > 1).any()
-    for run in chunks_of(t.vertex_count):
-        count = t.vertex_face_count[run]
-        start = np.where(t.open_fan_start[run] < 0, t.vertex_half_edge[run], t.open_fan_start[run])[count > 0]
-        current, count = start, count[count > 0]
-        for faces in range(1, 1 + int(count.max(initial=0))):
-            current = t.turn(current)
-            ends = (current < 0) | (current == start)
-            if (ends != (count == faces)).any():
-                return False
-            if ends.any():
-                start, current, count = (values[~ends] for values in (start, current, count))
+    count = t.vertex_face_count
+    start = np.where(t.open_fan_start < 0, t.vertex_half_edge, t.open_fan_start)[count > 0]
+    current, count = start, count[count > 0]
+    for faces in range(1, 1 + int(count.max(initial=0))):
+        current = t.turn(current)
+        ends = (current < 0) | (current == start)
+        if (ends != (count == faces)).any():
+            return False
+        if ends.any():
+            start, current, count = (values[~ends] for values in (start, current, count))
     return True
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology
 from .glued_faces import GluedFaces
-from .ragged import chunks_of
 from .semi_sharpness import SemiSharpness
 from .signature import (
     NEAR_FACES,
@@ -81,8 +80,7 @@ class OneRing:
         columns : (K, e) int32, optional
             Array for the result, which is a transposed view of it.
         """
-        # This is often the largest array of all, and is filled column by column. In chunks of elements the half-edges
-        # of the walks stay in the cache.
+        # This is often the largest array of all, and is filled column by column.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
         if len(half_edges) <= FEW_ELEMENTS:
@@ -91,8 +89,7 @@ class OneRing:
             for number, half_edge in enumerate(half_edges.tolist()):
                 columns[:, number] = self.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
         else:
-            for chunk in chunks_of(len(half_edges)):
-                self._gather_chunk(topology, half_edges[chunk], columns[:, chunk])
+            self._gather_columns(topology, half_edges, columns)
         for centre, first, last in self.cut_fans:
             columns[first], columns[last] = topology.border_neighbours(columns[centre])
         return columns.T
@@ -114,7 +111,7 @@ class OneRing:
         corners, turns = np.array(self.faces).T
         return corners[face], turns[face], steps
 
-    def _gather_chunk(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
+    def _gather_columns(self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32]) -> None:
         arrived = [half_edges] * len(self.faces)
         wanted = {walk: index for index, walk in enumerate(self.faces)}
         start = half_edges

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.ragged import gathered
 from ..mesh.signature import NEAR_FACES, near_behind
 from ..schemes.domain import FloatArray
 
@@ -34,7 +33,7 @@ def fan_codes(topology: Topology, *, near: bool = False) -> IntArray:
     t = topology
     far_vertices = _has_far_faces(t) if near else np.zeros(0, dtype=bool)
     face_count = np.where(far_vertices, NEAR_FACES, t.vertex_face_count) if far_vertices.any() else t.vertex_face_count
-    columns, cut = [gathered(row_codes([face_count, _vertex_codes(t)]), t.face_vertices)], None
+    columns, cut = [row_codes([face_count, _vertex_codes(t)])[t.face_vertices]], None
     if t.is_border_vertex.any():
         behind = _faces_clockwise(t)
         columns.append(behind)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import one_ring
-from ..mesh.ragged import gathered
 from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, signature_at
 from ..progress import counted
@@ -95,7 +94,7 @@ class PatchTable:
         """`half_edge_of_corner` of some corners."""
         if self.elements is self.topology:
             return corners
-        return gathered(self.half_edge_of_corner, corners)
+        return self.half_edge_of_corner[corners]
 
     @cached_property
     def _is_kept(self) -> NDArray[np.bool_] | None:
@@ -125,7 +124,7 @@ class PatchTable:
     @cached_property
     def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
         order, bounds = self._order
-        members = np.split(gathered(self._patch_codes[0], order), bounds)
+        members = np.split(self._patch_codes[0][order], bounds)
         signatures = [
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
             for corners in counted(members, "Classes of patches")
@@ -207,7 +206,7 @@ class PatchTable:
             return refined.table.controls.view(np.uint32), _REFINEMENTS.get(key, make)
         controls = self.controls
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
-            controls = gathered(control_of_vertex.astype(np.int32), controls)
+            controls = control_of_vertex.astype(np.int32)[controls]
         return controls.view(np.uint32), None
 
     def patch_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

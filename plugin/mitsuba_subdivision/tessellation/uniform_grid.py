@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.ragged import gathered
 from ..schemes.domain import FloatArray
 
 # Triangles are made in slices of about this many vertices, which stay in a core's cache.
@@ -154,7 +153,7 @@ class UniformGrid(ABC):
 
     def edge_start(self, corners: IntArray) -> IntArray:
         """Number of the first vertex inside each edge that begins at a corner, along the edge's lowest half-edge."""
-        start = gathered(self.topology.edge, corners).astype(np.int64)
+        start = self.topology.edge[corners].astype(np.int64)
         start *= self.rate - 1
         start += self._corner_count
         return start
@@ -177,7 +176,7 @@ class UniformGrid(ABC):
 
         Steps 0 and ``rate`` are the edge's ends.
         """
-        is_forward = gathered(self.owns_edge, corners)
+        is_forward = self.owns_edge[corners]
         # Sums wrap around 2^32, so that signs do no harm.
         start = self.edge_start(corners).astype(np.uint32)
         start += np.where(is_forward, np.uint32(2**32 - 1), np.uint32(self.rate - 1))
@@ -214,7 +213,7 @@ class UniformGrid(ABC):
 
     def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         """Vertices at corners."""
-        return gathered(self.corner_vertex, gathered(self.topology.face_vertices, corners))
+        return self.corner_vertex[self.topology.face_vertices[corners]]
 
     def side_parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
         """Parts at the corners and along the sides of patches that are whole elements.
@@ -231,10 +230,10 @@ class UniformGrid(ABC):
         parts = []
         uv = np.stack([along, np.zeros_like(along)], axis=1)
         for side in sides:
-            owners = np.flatnonzero(gathered(self.owns_edge, corners))
-            parts.append(self.edge_part(owners, gathered(corners, owners), side[1:-1], uv[1:-1]))
-            owners = np.flatnonzero(gathered(self.owns_vertex, corners))
-            parts.append(self.vertex_part(owners, gathered(corners, owners), side[:1]))
+            owners = np.flatnonzero(self.owns_edge[corners])
+            parts.append(self.edge_part(owners, corners[owners], side[1:-1], uv[1:-1]))
+            owners = np.flatnonzero(self.owns_vertex[corners])
+            parts.append(self.vertex_part(owners, corners[owners], side[:1]))
             corners = self.topology.following(corners)
         return parts
 
