@@ -157,10 +157,7 @@ class Scheme(ABC):
     def refine(self, topology: Topology) -> Refinement:
         """Apply the rules once to a whole mesh of supported faces and vertices; for stencils see `StencilTable.of`.
 
-        The numbers of refined faces and vertices must not depend on semi-sharpness. Stencils may depend on where
-        semi-sharp features are, and on the sharpness of those that this refinement makes smooth, but not on how much
-        sharpness it leaves of the others. In a mesh of unconnected parts the refined faces should come in the same
-        order as in each part alone; that saves time.
+        The numbers of refined faces and vertices must not depend on semi-sharpness.
         """
 
     @abstractmethod
