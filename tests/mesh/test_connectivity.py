@@ -86,10 +86,11 @@ def test_edges_are_numbered_without_gaps(any_cage):
     np.testing.assert_array_equal(topology.edge_half_edge, lowest)
 
 
-@pytest.mark.parametrize("unit", [1, 1 << 58], ids=["keys of few bits", "keys of many bits"])
-def test_half_edges_of_equal_keys_are_edges(unit, np_rng):
+@pytest.mark.parametrize(("unit", "kind"), [(1, np.int64), (1 << 58, np.int64), (1 << 26, np.int32)])
+def test_half_edges_of_equal_keys_are_edges(unit, kind, np_rng):
+    """Of few bits, so many that a half-edge does not fit beside them, and of half as many."""
     keys = np_rng.permutation(np.repeat(np.arange(20), [1, 2] * 10))
-    edge, twin, count = paired(unit * keys)
+    edge, twin, count = paired((unit * keys).astype(kind))
     np.testing.assert_array_equal(edge, keys)
     assert count == 20
     for half_edge, other in enumerate(twin.tolist()):

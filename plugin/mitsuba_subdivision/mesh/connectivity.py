@@ -288,7 +288,7 @@ def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:
 
     Parameters
     ----------
-    keys : (n,) int64
+    keys : (n,) int
         A number from 0 on that a half-edge shares with the others of its edge alone.
 
     Returns
@@ -302,7 +302,7 @@ def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) < 1 << (63 - bits):
         # A key and a half-edge fit into 63 bits. Numbers sort several times faster than indices into them.
-        keys = keys << bits | np.arange(len(keys))
+        keys = keys.astype(np.int64) << bits | np.arange(len(keys))
         keys.sort()
         order = (keys & ((1 << bits) - 1)).astype(np.int32)
         keys >>= bits

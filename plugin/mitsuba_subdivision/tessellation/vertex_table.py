@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 BLOCK_WEIGHTS = 1 << 16
 # And of about this many samples.
 BLOCK_SAMPLES = 1 << 14
-# Blocks of tables with so few weights, 3 MB, are kept.
-KEPT_WEIGHTS = 1 << 17
 # Where so many vertices have the same samples, one product of matrices evaluates them.
 SHARED = 1 << 10
 
@@ -105,7 +103,7 @@ class VertexTable:
         """
         positions, normals = (np.empty((self.vertex_count, 3), dtype=dtype) for _ in range(2))
         coordinates = np.ascontiguousarray(self.refined(control_points).T)
-        for block in self._blocks:
+        for block in self._blocks():
             values, origin, extent = block.sums(coordinates, dtype)
             if self.refinement is not None:
                 # Refined control points are rounded before they are seen from the origin.
@@ -120,7 +118,7 @@ class VertexTable:
         """``(vertex_count, k)`` points of the surface that ``(control_count, k)`` values make, also of copies."""
         found = np.empty((self.vertex_count, values.shape[1]))
         coordinates = np.ascontiguousarray(self.refined(values).T)
-        for block in self._blocks:
+        for block in self._blocks():
             (points,), origin, _ = block.sums(coordinates, np.float64, 1)
             found[block.vertices] = (points + block.of_patches(origin)).T
         return found
@@ -132,7 +130,7 @@ class VertexTable:
         """
         from ..patches import StencilRows
 
-        for block in self._blocks:
+        for block in self._blocks():
             weights = block.of_vertices(block.weights).transpose(0, 2, 1)
             yield StencilRows(block.vertices, block.of_patches(block.controls).T, weights)
 
@@ -147,17 +145,8 @@ class VertexTable:
         points, *tangents = matrices
         return VertexMatrices(points[self.weld_target], *tangents)
 
-    @property
-    def _blocks(self) -> Iterable[_Block]:
+    def _blocks(self) -> Iterator[_Block]:
         """All vertices, in blocks that bound temporary memory."""
-        widest = max((stencils.controls.shape[1] for stencils in self.classes), default=0)
-        return self._kept_blocks if self.vertex_count * widest <= KEPT_WEIGHTS else self._made_blocks()
-
-    @cached_property
-    def _kept_blocks(self) -> list[_Block]:
-        return list(self._made_blocks())
-
-    def _made_blocks(self) -> Iterator[_Block]:
         vertex_stencils = self.vertex_stencils
         vertex_counts = vertex_stencils.counts * vertex_stencils.run_counts
         is_shared = vertex_counts >= SHARED
