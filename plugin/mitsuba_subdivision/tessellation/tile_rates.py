@@ -23,10 +23,6 @@ from .tiles import UNIT, Tiles
 PARTS_AT_ONCE = 1 << 11
 # Tiles of fewer cells are not divided: four parts have at least so many.
 FEWEST_DIVIDED = 5
-# Forms in single precision are as much too small at most, and by so much of a tile's size: second derivatives are sums
-# of nine coefficients with weights of 4 times 6 at most, and their eighth counts.
-FORM_ROUNDING = 1.001
-SIZE_ROUNDING = 4 * 2.0**-23
 # Samples of a displacement along each side of a tile.
 HEIGHT_SAMPLES = 9
 
@@ -192,7 +188,7 @@ class TileRates:
     def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> NDArray[np.int16]:
         """`Tiles.sides`: as many segments as keep curves along feature edges to the limit."""
         sides = np.zeros_like(tiles.sides)
-        _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0].astype(np.float64)
+        _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0]
         along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
         for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
             on = np.flatnonzero(tiles.sides[:, side])
@@ -205,12 +201,10 @@ class TileRates:
     def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
         """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles.
 
-        In single precision, about a point of each tile: what that loses is added.
-
         Parameters
         ----------
         coefficients : (b, 3, t) float64
-        maps : (6, b, p, b) float32
+        maps : (6, b, p, b) float64
             As `_parts`.
         """
         found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
@@ -218,8 +212,7 @@ class TileRates:
         criterion, corner_count, parts_across = self.criterion, self.domain.corner_count, isqrt(maps.shape[2])
         for begin in range(0, coefficients.shape[2], length):
             tiles = slice(begin, begin + length)
-            origin = coefficients[0, :, tiles]
-            own = (coefficients[..., tiles] - origin).astype(np.float32)
+            own = coefficients[..., tiles]
             derivatives = list(times(maps[1:].reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2]))
             tangents = TangentCone.of(derivatives[0]), TangentCone.of(derivatives[1])
             cone = NormalCone.of(*tangents)
@@ -227,11 +220,8 @@ class TileRates:
                 limit = np.full(cone.sine.shape, criterion.error)
             else:
                 points = times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
-                boxes = points.min(axis=0) + origin, points.max(axis=0) + origin
-                limit = criterion.limit(*boxes, cone, derivatives[2:], parts_across)
-            form = FORM_ROUNDING * criterion.form(derivatives, tangents, cone, corner_count)
-            if criterion.measure is Measure.CHORD:
-                form[[0, 2]] += SIZE_ROUNDING * np.abs(own).max(axis=(0, 1))
+                limit = criterion.limit(points.min(axis=0), points.max(axis=0), cone, derivatives[2:], parts_across)
+            form = criterion.form(derivatives, tangents, cone, corner_count)
             found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
         return found
 
@@ -275,7 +265,7 @@ def axis_across(corners: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=16)
 def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
-    """``(6, b, 4^level, b)`` float32 maps from coefficients to those over parts, and of derivatives u, v, uu, uv, vv.
+    """``(6, b, 4^level, b)`` maps from coefficients to those over parts, and of derivatives u, v, uu, uv, vv.
 
     The parts are the copies of the domain, or the copies of these, and so on.
     """
@@ -283,4 +273,4 @@ def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
     maps = np.concatenate([parts, basis.two_derivatives])
     for _ in range(level):
         parts = (basis.halves @ parts[:, None]).reshape(-1, *parts.shape[1:])
-    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts), dtype=np.float32)
+    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts))
