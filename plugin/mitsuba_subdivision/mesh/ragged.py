@@ -15,10 +15,15 @@ A value for each row becomes one for each entry by ``np.repeat(values, lengths)`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 IntArray = NDArray[np.integer]
+
+# Entries of a chunk.
+CHUNK_LENGTH = 1 << 14
 
 
 def starts(lengths: IntArray) -> NDArray[np.int64]:
@@ -45,6 +50,16 @@ def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
     found = np.repeat(first - starts(lengths), lengths)
     found += np.arange(len(found))
     return found
+
+
+def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
+    """Successive slices of ``count`` entries, which bound temporary memory.
+
+    Where each entry has some parts, so many times shorter.
+    """
+    length = CHUNK_LENGTH // parts
+    for begin in range(0, count, length):
+        yield slice(begin, min(begin + length, count))
 
 
 def first_indices(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:

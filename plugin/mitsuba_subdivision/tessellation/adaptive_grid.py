@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.ragged import chunks_of
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
 from .spans import Spans, SpanVertices, cut_into_spans, first_of_each
@@ -95,14 +96,26 @@ class AdaptiveGrid:
     def _sample_vertices(self) -> IndexArray:
         """Vertices of all samples, those along sides and then those inside tiles."""
         spans, numbers = self.spans, self._numbers
-        step, span = ragged.index_in_row(spans.rate), np.repeat(np.arange(len(spans.rate)), spans.rate)
-        steps = np.where(spans.is_backward[span], spans.rate[span] - 1 - step, step - 1)
-        along = np.where(step == 0, numbers.point[span], numbers.first_inside[numbers.span[span]] + steps)
-        return np.concatenate([along, np.arange(numbers.vertex_count, self.vertex_count)]).astype(np.int32)
+        inside = np.arange(numbers.vertex_count, self.vertex_count, dtype=np.int32)
+        found, begin = np.empty(int(spans.rate.sum(dtype=np.int64)) + len(inside), dtype=np.int32), 0
+        for block in chunks_of(len(spans.rate)):
+            rate = spans.rate[block]
+            step, span = ragged.index_in_row(rate), block.start + np.repeat(np.arange(len(rate)), rate)
+            own = slice(begin, begin + len(step))
+            along = numbers.first_inside[numbers.span[span]] + np.where(
+                spans.is_backward[span], spans.rate[span] - 1 - step, step - 1
+            )
+            found[own] = np.where(step == 0, numbers.point[span], along)
+            begin += len(step)
+        found[begin:] = inside
+        return found
 
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
-        return self._sample_vertices()[self._sample_triangles()].view(np.uint32)
+        found, vertices = self._sample_triangles(), self._sample_vertices()
+        for block in chunks_of(len(found)):
+            found[block] = vertices[found[block]]
+        return found.view(np.uint32)
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` element of each triangle."""
@@ -124,11 +137,26 @@ class AdaptiveGrid:
 
         Made at each call: few ask for them more than once, and they would take memory as long as the grid lives.
         """
-        span, along = self.spans.samples()
-        counts = np.bincount(self.spans.side[span], minlength=self._corner_count * len(self.tiles))
-        sides = SideSamples(ragged.offsets(counts), self.spans.along_sides(span, along), self._corner_count)
-        del span, along, counts
-        return stitched(self.tiles.rates, sides, self.keeps_corner)
+        spans, m = self.spans, self._corner_count
+        inner_begin, begin = (
+            ragged.offsets(counts, np.int32) for counts in (self._inner_counts, self._triangle_counts())
+        )
+        found = np.empty((int(begin[-1]), 3), dtype=np.int32)
+        side_count, side_begin = int(spans.rate.sum(dtype=np.int64)), 0
+        for own in chunks_of(len(self.tiles), m):
+            of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
+            span, along = spans.samples(of_tiles)
+            counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))
+            sides = SideSamples(ragged.offsets(counts), spans.along_sides(span, along), m)
+            keeps = None if self.keeps_corner is None else self.keeps_corner[own]
+            triangles = stitched(self.tiles.rates[own], sides, keeps)
+            is_inner = triangles >= len(span)
+            triangles += np.where(is_inner, side_count - len(span) + inner_begin[own.start], side_begin).astype(
+                np.int32
+            )
+            found[begin[own.start] : begin[own.stop]] = triangles
+            side_begin += len(span)
+        return found
 
     def _inner_parameters(self) -> tuple[IndexArray, FloatArray]:
         """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in units of 1 / `UNIT`."""

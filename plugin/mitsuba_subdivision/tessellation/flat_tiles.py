@@ -47,12 +47,13 @@ def are_flat(rates: TileRates, tiles: Tiles, groups: list[TileParts]) -> NDArray
         ring = own.one_ring_points(points)
         lower[:, at], upper[:, at] = ring.min(axis=0), ring.max(axis=0)
     limit = rates.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
-    if rates.criterion.measure is Measure.EDGE:
-        return _extents(groups, np.eye(3)[..., None] * np.ones(len(tiles))) <= limit
-    axis = axis_across(corners)
-    extent = _extents(groups, axis[None])
     # A tile that is folded, or has no normal, is tested by its size only.
     fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & rates.scheme.has_convex_rules
+    others = [each.chosen(~fits[each.owner]) for each in groups]
+    if rates.criterion.measure is Measure.EDGE:
+        return fits | (_extents(others, np.eye(3)[..., None] * np.ones(len(tiles))) <= limit)
+    axis = axis_across(corners)
+    extent = _extents(others, axis[None])
     found = fits | (axis.any(axis=0) & (extent <= limit))
     folded = _are_folded(groups, axis, found & ~fits)
     if folded.any():

@@ -10,6 +10,7 @@ The sides of a crease are two lines with vertices of their own at the same posit
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
+from ..mesh.ragged import chunks_of
 from ..schemes.domain import FloatArray
 from .patch_frames import PatchFrames
 from .tile_sides import EDGE, HALVINGS, SidePoints, points_on_sides, side_lines, tile_corners
@@ -36,8 +38,13 @@ def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
     first : (k,) int32
         First index of each number.
     """
-    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
-    return number.astype(np.int32), first.astype(np.int32)
+    # As NumPy's `unique`, in less memory.
+    order = np.argsort(keys, kind="stable").astype(np.int32)
+    in_order, begins = keys[order], np.ones(len(keys), dtype=bool)
+    np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
+    number = np.empty(len(keys), dtype=np.int32)
+    number[order] = np.cumsum(begins, dtype=np.int32) - 1
+    return number, order[begins]
 
 
 def joined(high: IntArray, low: IntArray, bits: int) -> NDArray[np.int64]:
@@ -70,17 +77,23 @@ class Spans:
     is_backward: NDArray[np.bool_]  # (s,) bool: whether the numbers of the vertices inside fall along the side
     at: IndexArray  # (s,) int32: 0-based number shared by all spans at the same location
 
-    def samples(self) -> tuple[IndexArray, FloatArray]:
-        """The span of each sample along all sides, and its position along the span."""
-        span = np.repeat(np.arange(len(self.rate), dtype=np.int32), self.rate)
-        return span, ragged.index_in_row(self.rate) / self.rate[span]
+    def samples(self, block: slice = slice(None)) -> tuple[IndexArray, FloatArray]:
+        """The span of each sample along all sides, and its position along the span; for a block of spans."""
+        rate, first = self.rate[block], block.start or 0
+        span = np.repeat(np.arange(first, first + len(rate), dtype=np.int32), rate)
+        return span, ragged.index_in_row(rate) / np.repeat(rate, rate)
 
     def along(self, span: IntArray, part: FloatArray) -> FloatArray:
         """``(2, n)`` parameters, in their patches, of points at given fractions of spans."""
-        m, side = self.frames.domain.corner_count, self.side[span]
-        begin = self._corners(side)
-        way = self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin
-        return self.along_sides(span, part) * way + begin
+        m = self.frames.domain.corner_count
+        found = np.empty((2, len(span)))
+        for block in chunks_of(len(span)):
+            own = span[block]
+            side = self.side[own]
+            begin = self._corners(side)
+            way = self._corners(side + np.where(side % m == m - 1, 1 - m, 1)) - begin
+            found[:, block] = self.along_sides(own, part[block]) * way + begin
+        return found
 
     def along_sides(self, span: IntArray | slice, part: FloatArray) -> FloatArray:
         """``(n,)`` fractions of sides, of points at given fractions of spans."""
@@ -98,13 +111,20 @@ class Spans:
         found = [size * (at[tile] + step[number]) for at, step in zip(tiles.origin.T, steps, strict=True)]
         return np.stack(found).astype(np.int32)
 
-    def _beginnings(self) -> tuple[IndexArray, IntArray, list[SidePoints]]:
-        """``(2, s)`` points where spans begin, the corners that their patches begin at, and points on borders."""
-        points = tile_corners(self.tiles, self.frames.domain).reshape(2, -1).take(self.side, axis=1)
-        inside = np.flatnonzero(self.node & (self.node - 1))
-        points[:, inside] = self.along(inside, np.zeros(len(inside)))
-        corner = self.tiles.corner[self.side // self.frames.domain.corner_count]
-        return points, corner, points_on_sides(self.frames, corner, points)
+    def _blocks(self) -> Iterator[tuple[slice, IndexArray, list[SidePoints]]]:
+        """Blocks of spans, with the points where they begin, ``(2, n)``, and those of these that lie on borders."""
+        side, m = self.side, self.frames.domain.corner_count
+        for block in chunks_of(len(side)):
+            first = side[block.start] // m
+            own = self.tiles[first : side[block.stop - 1] // m + 1]
+            points = tile_corners(own, self.frames.domain).reshape(2, -1).take(side[block] - m * first, axis=1)
+            inside = np.flatnonzero(self.node[block] & (self.node[block] - 1))
+            points[:, inside] = self.along(block.start + inside, np.zeros(len(inside)))
+            yield block, points, points_on_sides(self.frames, self._corner(block), points)
+
+    def _corner(self, block: slice) -> IntArray:
+        """``(n,)`` the corner that the patch of each span begins at."""
+        return self.tiles.corner[self.side[block] // self.frames.domain.corner_count]
 
     @cached_property
     def _points(self) -> tuple[IndexArray, IndexArray]:
@@ -113,24 +133,30 @@ class Spans:
         vertex_count, count = int(frames.vertex.max(initial=0)) + 1, t.half_edge_count
         on_edge, on_spoke, at_centre = vertex_count + count * np.arange(3)
         depth = int(self.tiles.depth.max(initial=0))
-        (x, y), corner, borders = self._beginnings()
-        name = at_centre + t.face_count + corner.astype(np.int64)
-        for border in borders:
-            if border.is_spoke:
-                is_centre = border.at == UNIT
-                name[border.on] = np.where(is_centre, at_centre + t.face_of(border.edge), on_spoke + border.edge)
-                x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
-        # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
-        for border in borders:
-            if not border.is_spoke:
-                name[border.on] = on_edge + frames.edge[border.edge]
-                x[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at)
-                y[border.on] = 0
-        on, edge = self._vertices(borders)
-        name[on], x[on], y[on] = frames.vertex[edge], 0, 0
-        position = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
-        keys = joined(name, position, 2 * depth + 3)
-        del x, y, corner, borders, border, on, edge, name, position
+        bits = 2 * depth + 3
+        most = at_centre + t.face_count + count
+        names: IntArray = np.empty(len(self.side), dtype=np.int32 if most < 1 << 31 else np.int64)
+        positions: IntArray = np.empty(len(self.side), dtype=np.int32 if bits < 32 else np.int64)
+        for block, (x, y), borders in self._blocks():
+            name = at_centre + t.face_count + self._corner(block).astype(np.int64)
+            for border in borders:
+                if border.is_spoke:
+                    is_centre = border.at == UNIT
+                    faces = t.face_of(border.edge)
+                    name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
+                    x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
+            # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.
+            for border in borders:
+                if not border.is_spoke:
+                    name[border.on] = on_edge + frames.edge[border.edge]
+                    x[border.on] = np.where(frames.is_backward[border.edge], EDGE - border.at, border.at)
+                    y[border.on] = 0
+            on, edge = self._vertices(borders)
+            name[on], x[on], y[on] = frames.vertex[edge], 0, 0
+            names[block] = name
+            positions[block] = (x >> (DEEPEST - depth)).astype(np.int64) << (depth + 1) | y >> (DEEPEST - depth)
+        keys = joined(names, positions, bits)
+        del names, positions
         return ranked(keys)
 
     def _vertices(self, borders: list[SidePoints]) -> tuple[IntArray, IntArray]:
@@ -154,13 +180,15 @@ class Spans:
         span, of_span = self.at, first_of_each(self.at)
         if _is_finer(edge, frames.edge) or _is_finer(vertex, frames.vertex):
             of_points = np.zeros(len(point), dtype=np.int32)
-            *_, borders = self._beginnings()
-            for border in borders:
-                if not border.is_spoke:
-                    of_points[border.on] = edge[border.edge]
-            on, half_edge = self._vertices(borders)
-            of_points[on] = vertex[half_edge]
-            half_edge = side_lines(self.tiles, self.frames).half_edge[self.side]
+            for block, _, borders in self._blocks():
+                name = of_points[block]
+                for border in borders:
+                    if not border.is_spoke:
+                        name[border.on] = edge[border.edge]
+                on, half_edge = self._vertices(borders)
+                name[on] = vertex[half_edge]
+            half_edges = [side_lines(self.tiles[block], self.frames).half_edge for block in chunks_of(len(self.tiles))]
+            half_edge = np.concatenate(half_edges)[self.side]
             of_spans = np.where(half_edge >= 0, edge[half_edge], 0)
             point, of_point = ranked(joined(point, of_points, 32))
             span, of_span = ranked(joined(span, of_spans, 32))
@@ -186,8 +214,8 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     m = frames.domain.corner_count
     shift = DEEPEST - int(tiles.depth.max(initial=0))
     keys, is_backward = _side_keys(tiles, frames, shift)
-    keys, number = np.unique(keys, return_inverse=True)
-    group = number.astype(np.int32)
+    group, first = ranked(keys)
+    keys = keys[first]
     wanted = np.maximum(tiles.rates[:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]], tiles.sides).astype(np.int16).ravel()
     rate = np.ones(len(keys), dtype=np.int16)
     np.maximum.at(rate, group, wanted)
@@ -236,10 +264,16 @@ def _side_keys(tiles: Tiles, frames: PatchFrames, shift: int) -> tuple[NDArray[n
 
     Of sides that begin at the same place, the longest come first.
     """
-    sides = side_lines(tiles, frames)
-    # Levels of lines are multiples of the least tile's size.
-    low = sides.low >> shift << HALVINGS | sides.halvings
-    return joined(sides.line >> shift, low, DEEPEST + 1 - shift + HALVINGS), sides.is_backward
+    count = frames.domain.corner_count * len(tiles)
+    line, low = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.int32)
+    is_backward = np.empty(count, dtype=bool)
+    for block in chunks_of(len(tiles)):
+        sides = side_lines(tiles[block], frames)
+        own = slice(frames.domain.corner_count * block.start, frames.domain.corner_count * block.stop)
+        # Levels of lines are multiples of the least tile's size.
+        line[own], low[own] = sides.line >> shift, sides.low >> shift << HALVINGS | sides.halvings
+        is_backward[own] = sides.is_backward
+    return joined(line, low, DEEPEST + 1 - shift + HALVINGS), is_backward
 
 
 def _is_finer(names: IntArray, others: IntArray) -> bool:

@@ -29,7 +29,7 @@ PARAMETER_ROUNDING = 1e-9
 class SideSamples:
     """Samples along the sides of tiles."""
 
-    # (m t + 1,) int64: the first sample of each side of each tile; the last one of a side is the first one of the
+    # (m t + 1,) int32: the first sample of each side of each tile; the last one of a side is the first one of the
     # next
     side_start: IntArray
     along: FloatArray  # (n,) float64: position of each sample along its side, in [0, 1)
@@ -93,12 +93,13 @@ def stitched(rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_
     is_inner = has_inner(rates, sides.corner_count)
     is_plain = np.diff(sides.side_start[:: sides.corner_count]) == sides.corner_count
     first_inner = len(sides.along) + ragged.starts(inner_counts(rates, sides.corner_count))
-    found = [
-        *_plain(sides, np.flatnonzero(is_plain)),
-        *_strips(rates, sides, np.flatnonzero(is_inner), first_inner, keeps_corner),
-        *_strips_across(rates, sides, np.flatnonzero(~is_inner & ~is_plain)),
-    ]
-    found += _inner(rates, np.flatnonzero(is_inner), first_inner, sides.corner_count)
+    plain, inner, others = map(np.flatnonzero, (is_plain, is_inner, ~is_inner & ~is_plain))
+    found = _plain(sides, plain)
+    if len(inner):
+        found += _strips(rates, sides, inner, first_inner, keeps_corner)
+        found += _inner(rates, inner, first_inner, sides.corner_count)
+    if len(others):
+        found += _strips_across(rates, sides, others)
     triangles, tile = (np.concatenate(each, dtype=np.int32) for each in zip(*found, strict=True))
     return triangles.take(np.argsort(tile, kind="stable"), axis=0)
 
@@ -106,7 +107,7 @@ def stitched(rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_
 def _plain(sides: SideSamples, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
     """Triangles of tiles whose only samples are their corners."""
     corners = [[0, 1, 2]] if sides.corner_count == 3 else [[0, 1, 3], [1, 2, 3]]
-    return [(sides.start()[tiles, None] + np.array(own), tiles) for own in corners]
+    return [(sides.start()[tiles, None] + np.array(own, dtype=np.int32), tiles) for own in corners]
 
 
 def _inner_sample(rates: IntArray, first: IntArray, u: IntArray, v: IntArray, corner_count: int) -> IntArray:

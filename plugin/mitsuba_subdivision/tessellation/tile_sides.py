@@ -49,7 +49,7 @@ def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) ->
 class SidePoints:
     """Points on one side of their patches."""
 
-    on: IntArray  # (n,) int64: which of them lie there
+    on: IndexArray  # (n,) int32: which of them lie there
     edge: IntArray  # (n,) int32: half-edge of the element along that side; for a spoke, in whose middle it begins
     at: IntArray  # (n,) int32: position along the half-edge, or along the spoke
     is_spoke: bool
@@ -67,7 +67,7 @@ def points_on_sides(frames: PatchFrames, corner: IntArray, points: IndexArray) -
         sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
     found, edge = [], corner
     for number, (distance, along) in enumerate(sides):
-        on = np.flatnonzero(distance == 0)
+        on = np.flatnonzero(distance == 0).astype(np.int32)
         whole, other = on[is_whole[on]], on[~is_whole[on]]
         found.append(SidePoints(whole, edge[whole], 2 * along[whole], is_spoke=False))
         edge = t.following(edge)
