@@ -5,7 +5,7 @@ From the ground up:
 - `refined_rings` runs the rules of a scheme once on an element, or on many elements at once; `refined_fans` on faces
   around a vertex of high valence, which share most of the result.
 - `patch_pieces` finds the pieces that an element consists of: regular patches, and patches with one extraordinary
-  point, for which it finds the subdivision matrices. `occupied_pieces` does so only where there are samples;
+  point, for which it finds the subdivision matrices. `LocatedSamples` does so only where there are samples;
   `divided_element` divides all of an element, and equal parts of any elements once.
 - `eigenbasis` has the eigenvectors of a subdivision matrix, `ring_symmetry` those of high valences, `equations` the
   equations that evaluate a patch by them.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .ragged import first_indices
+from .ragged import first_indices, sorted_order
 from .semi_sharpness import SemiSharpness
 
 # Integers of any width; docstrings name it where it matters.
@@ -299,18 +299,7 @@ def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:
         The other half-edge of the edge, -1 if there is none. Where an edge has more than two, one of them.
     edge_count : int
     """
-    bits = len(keys).bit_length()
-    if int(keys.max(initial=0)) < 1 << (63 - bits):
-        # A key and a half-edge fit into 63 bits. Numbers sort several times faster than indices into them.
-        keys = keys.astype(np.int64) << bits | np.arange(len(keys))
-        keys.sort()
-        order = (keys & ((1 << bits) - 1)).astype(np.int32)
-        keys >>= bits
-    else:
-        order = np.argsort(keys, kind="stable").astype(np.int32)
-        keys = keys[order]
-    begins = np.ones(len(keys), dtype=bool)
-    np.not_equal(keys[1:], keys[:-1], out=begins[1:])
+    order, begins = sorted_order(keys)
     edge, twin = np.empty_like(order), np.full_like(order, -1)
     edge[order] = np.cumsum(begins, dtype=np.int32) - 1
     second = np.flatnonzero(~begins)

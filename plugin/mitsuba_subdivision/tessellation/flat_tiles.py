@@ -143,7 +143,7 @@ def _have_curved_sides(
     found = np.zeros(len(tiles), dtype=bool)
     for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
         on_side = are_asked & (tiles.sides[:, side] > 0)
-        for each in groups:
+        for each in groups if on_side.any() else ():
             own = each.chosen(on_side[each.owner])
             if not len(own.owner):
                 continue

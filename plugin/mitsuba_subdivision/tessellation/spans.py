@@ -38,10 +38,7 @@ def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
     first : (k,) int32
         First index of each number.
     """
-    # As NumPy's `unique`, in less memory.
-    order = np.argsort(keys, kind="stable").astype(np.int32)
-    in_order, begins = keys[order], np.ones(len(keys), dtype=bool)
-    np.not_equal(in_order[1:], in_order[:-1], out=begins[1:])
+    order, begins = ragged.sorted_order(keys)
     number = np.empty(len(keys), dtype=np.int32)
     number[order] = np.cumsum(begins, dtype=np.int32) - 1
     return number, order[begins]
@@ -256,7 +253,7 @@ def cut_into_spans(tiles: Tiles, frames: PatchFrames) -> Spans:
     node[rows] = nodes
     del group, begin, size, before, counts, of_row
     tiles = replace(tiles, sides=np.empty((len(tiles), 0), dtype=np.int16))
-    return Spans(tiles, frames, side, span_rate[at], node, is_backward[side], at.astype(np.int32))
+    return Spans(tiles, frames, side, span_rate[at], node, is_backward[side], at.astype(np.int32, copy=False))
 
 
 def _side_keys(tiles: Tiles, frames: PatchFrames, shift: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
