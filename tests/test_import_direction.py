@@ -306,7 +306,7 @@ VIOLATIONS = {
     "relative": ("schemes/a.py", "from ..evaluation.element import element_stencils"),
     "relative package": ("schemes/a.py", "from .. import evaluation"),
     "of the package itself": ("cage/a.py", "from .. import LimitSurface"),
-    "in a function": ("tessellation/a.py", "def f():\n    from ..kernels import WeightKernel"),
+    "in a function": ("tessellation/a.py", "def f():\n    from ..kernels import VertexKernel"),
     "for type checking": ("patches/a.py", "if TYPE_CHECKING:\n    from ..surface import LimitSurface"),
     "module beside the packages": ("inspection.py", "from .shapes import registration"),
     "kernels of the surface": ("kernels/a.py", "from ..surface import LimitSurface"),

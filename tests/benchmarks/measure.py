@@ -31,14 +31,14 @@ def total(_obj, binary, rate, repeats, _variant):
     """
     import drjit as dr
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.kernels import WeightKernel
+    from mitsuba_subdivision.kernels import VertexKernel
 
     positions, quads = read_bin(binary)
     runs = []
     for _ in range(max(2, repeats)):
         clock = Clock()
         surface = msub.LimitSurface(msub.ControlCage(positions, quads))
-        kernel = WeightKernel(surface.sampling(rate), Float)
+        kernel = VertexKernel(surface.sampling(rate), Float)
         points = Float(surface.cage.positions.ravel())
         found = kernel(points)
         dr.eval(found)
@@ -63,9 +63,8 @@ def stages(obj, binary, rate, repeats, _variant):
     """Each step by itself."""
     import drjit as dr
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.evaluation.element import stencils_by_signature
     from mitsuba_subdivision.files.obj_reader import read_obj
-    from mitsuba_subdivision.kernels import WeightKernel
+    from mitsuba_subdivision.kernels import VertexKernel
     from mitsuba_subdivision.mesh.connectivity import Topology
 
     positions, quads = read_bin(binary)
@@ -81,14 +80,11 @@ def stages(obj, binary, rate, repeats, _variant):
         cage = msub.ControlCage(positions, quads)
         clock.lap("validate, with connectivity")
         surface = msub.LimitSurface(cage)
-        classes = surface.patches.classes
+        _ = surface.patches.classes
         clock.lap("patch table")
-        uv = np.stack(np.meshgrid(*[np.arange(rate + 1) / rate] * 2), axis=-1).reshape(-1, 2)
-        stencils_by_signature(surface.scheme, [patch_class.signature for patch_class in classes], uv)
-        clock.lap("weights")
         table = surface.sampling(rate)
-        clock.lap("sampling table, with weights")
-        kernel = WeightKernel(table, Float)
+        clock.lap("polynomials of vertices")
+        kernel = VertexKernel(table, Float)
         points = Float(cage.positions.ravel())
         dr.eval(points)
         clock.lap("device_arrays")

@@ -9,7 +9,7 @@ from drjit.llvm.ad import Float
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
-from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels import VertexKernel
 from patches.closed_cages import cube_with_valence_2
 from reference.exact_samples import angle, bumpy, faces_of
 from reference.refined_cages import refine_first
@@ -62,7 +62,7 @@ def normals_on_every_path(cage, scheme="catmull_clark", rate=RATE):
     surface = LimitSurface(cage, scheme)
     table = surface.sampling(rate)
     start, uv = table.locations()
-    _, kernel = WeightKernel(table, Float)(Float(cage.positions.ravel().astype(np.float32)))
+    _, kernel = VertexKernel(table, Float)(Float(cage.positions.ravel().astype(np.float32)))
     return {
         "table": table.apply(cage.positions)[1],
         "single table": table.apply(cage.positions, np.float32)[1],
@@ -239,18 +239,18 @@ def test_gradients_are_finite_and_zero_where_there_is_no_normal(make):
     cage = make(5, 0.3)
     table = LimitSurface(cage).sampling(RATE)
     points = Float(cage.positions.ravel().astype(np.float32))
-    zero = (WeightKernel(table, Float)(points)[1].numpy().reshape(-1, 3) == 0).all(axis=1)
+    zero = (VertexKernel(table, Float)(points)[1].numpy().reshape(-1, 3) == 0).all(axis=1)
     assert zero.any()
     for wanted, is_nothing in ((zero, True), (~zero, False)):
         dr.enable_grad(points)
         dr.set_grad(points, 0)
-        _, normals = WeightKernel(table, Float)(points)
+        _, normals = VertexKernel(table, Float)(points)
         dr.backward(dr.sum(normals * Float(np.repeat(wanted, 3).astype(np.float32) * np.arange(1, 1 + 3 * len(zero)))))
         gradient = dr.grad(points).numpy()
         assert np.isfinite(gradient).all()
         assert (np.abs(gradient).max() == 0) == is_nothing
     dr.set_grad(points, 1)
-    _, normals = WeightKernel(table, Float)(points)
+    _, normals = VertexKernel(table, Float)(points)
     dr.forward_to(normals)
     change = dr.grad(normals).numpy().reshape(-1, 3)
     assert np.isfinite(change).all()

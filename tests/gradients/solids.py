@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import drjit as dr
 import numpy as np
-from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.patches import SurfacePieces
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
@@ -41,7 +41,7 @@ def joined(found):
 def derivatives_of(surface, directions, rate, types):
     """Integrals over a tessellation, and their derivatives, for each of some directions of the control points."""
     table = surface.sampling(rate)
-    kernel = WeightKernel(table, types.float)
+    kernel = VertexKernel(table, types.float)
     derivatives = []
     for direction in directions:
         points = types.floats(surface.cage.positions.ravel())

@@ -8,7 +8,7 @@ import pytest
 from gradients import solids
 from gradients.surfaces import CLOSED, motions, moved
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.affine_map import placed
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.llvm import llvm_problem
@@ -130,7 +130,7 @@ def test_the_derivative_of_volume_by_the_placement_is_that_of_the_determinant(su
     arrays = sys.modules["drjit.llvm.ad"]
     to_world = arrays.Matrix4f64(matrix)
     dr.enable_grad(to_world)
-    vertices = WeightKernel(table, types.float)(types.floats(surface.cage.positions.ravel()))
+    vertices = VertexKernel(table, types.float)(types.floats(surface.cage.positions.ravel()))
     positions, _ = placed(*vertices, to_world, types.vector3)
     found = solids.of_triangles(types, positions, table.triangles)
     volume = found["volume"][0]
@@ -157,7 +157,7 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     fields = {"inner": (inner, 0), "upwards": (upwards, 0), "stretch": (stretch, 12), "shear": (shear, 0)}
     fields["right"] = (right, 3)
     exact = surface.stiffness(solids.STIFFNESS_ORDER) @ positions
-    kernel, table = WeightKernel(surface.sampling(3), types.float), surface.sampling(3)
+    kernel, table = VertexKernel(surface.sampling(3), types.float), surface.sampling(3)
     points = types.floats(positions.ravel())
     dr.enable_grad(points)
     dr.backward(solids.of_triangles(types, kernel(points)[0], table.triangles)["area"][0])

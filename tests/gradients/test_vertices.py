@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from gradients.surfaces import ALL
-from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.affine_map import placed
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.tessellation import Criterion, Measure
@@ -61,7 +61,7 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     surface, start = ALL[name](), MATRIX @ np.diag([mirror, 1, 1, 1])
     table = table_of(surface, tessellation)
     positions = surface.cage.positions
-    kernel = WeightKernel(table, arrays.Float64)
+    kernel = VertexKernel(table, arrays.Float64)
 
     def vertices(points, matrix):
         return placed(*kernel(points), matrix, arrays.Array3f64)

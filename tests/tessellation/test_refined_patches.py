@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import Attribute, named_cages
-from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import bumpy, cube_with_hexagon, cube_with_valence_2, mixed_torus, prism
 from reference.refined_cages import refine_first
@@ -112,7 +112,7 @@ def test_the_kernel_has_the_same_values_and_derivatives(surfaces, float64):
     direction = float64(rng.standard_normal(dr.width(points)))
     found = []
     for surface in surfaces:
-        kernel = WeightKernel(surface.sampling(3), float64)
+        kernel = VertexKernel(surface.sampling(3), float64)
         moving = float64(points)
         dr.enable_grad(moving)
         values = kernel(moving)

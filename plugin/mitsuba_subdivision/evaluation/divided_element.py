@@ -6,7 +6,7 @@ consists of three regular pieces at every level (`IrregularPatch`).
 
 A semi-sharp crease has thousands of parts along it, but few kinds: parts whose one-rings have the same signature are
 divided alike. So each signature is one `DividedElement`, whatever elements it is part of. Evaluation descends to the
-children that hold samples (`LocatedSamples`, `stencils_by_signature`); bounds divide parts that are not yet tight
+children that hold samples (`LocatedSamples`, `sampled_polynomials`); bounds divide parts that are not yet tight
 (`divided_tile`); kernels and integrals need all pieces (`piece_tree`, `DividedElement.coefficients`).
 """
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +22,6 @@ from .normals import unit_normals
 from .patch_pieces import isolated_signature
 from .refined_rings import refined_children
 from .sample_weights import LocatedSamples, frame_magnitude, without_collapsed
-
-# Stencils of more weights are not kept. Those of a cage with very many classes then take 16 MB at most.
-KEPT_WEIGHTS = 1 << 17
 
 # Curvature near an extraordinary point goes with (|λ_4| / λ_2²)ⁿ. A ratio nearer to one than this counts as one.
 CONSTANT = 1e-9
@@ -146,7 +141,17 @@ def element_stencils(
         they are the derivatives, times a positive factor for each sample. They are zero where the surface is folded
         whatever the control points are.
     """
-    return stencils_of_samples(scheme, [signature], [len(uv)], np.asarray(uv, dtype=np.float64), corner)[0]
+    uv = np.asarray(uv, dtype=np.float64)
+    corner = np.zeros(len(uv), dtype=np.int64) if corner is None else corner
+    located = LocatedSamples(scheme, [element_of(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
+    rows = located.rows("stabilized", np.float64, 1)
+    magnitude = located.per_sample([frame_magnitude(*each) for each in zip(located.leaves, rows, strict=True)])
+    (weights,) = located.weights([np.concatenate([each.rows[:1], each.tangents]) for each in rows])
+    stencils = np.ascontiguousarray(weights.swapaxes(0, 1))
+    stencils[1:] = _by_uv(stencils[1:].swapaxes(1, 2), located.jacobian).swapaxes(1, 2)
+    without_collapsed(stencils[1:], _by_uv(magnitude, np.abs(located.jacobian)))
+    stencils.flags.writeable = False
+    return stencils
 
 
 def derivative_stencils(
@@ -165,66 +170,6 @@ def derivative_stencils(
     if derivatives == 2:
         found[3:] = _second_by_uv(found[3:], located.jacobian) * scale[1]
     return found.swapaxes(1, 2)
-
-
-def stencils_by_signature(scheme: Scheme, signatures: Sequence[Signature], uv: FloatArray) -> list[FloatArray]:
-    """`element_stencils` of the same samples ``(s, 2)`` on elements of several signatures, which may repeat."""
-    if len(uv) * sum(one_ring(each.smoothed).vertex_count for each in signatures) > KEPT_WEIGHTS:
-        return _same_samples(scheme, tuple(signatures), uv)
-    return [*_kept_stencils(scheme, tuple(signatures), uv.tobytes())]
-
-
-@lru_cache(maxsize=16)
-def _kept_stencils(scheme: Scheme, signatures: tuple[Signature, ...], uv: bytes) -> list[FloatArray]:
-    """Stencils that are kept, because many shapes have elements of the same signatures with the same samples.
-
-    They are kept together: the last bits of a sum may depend on what is summed with it.
-    """
-    return _same_samples(scheme, signatures, np.frombuffer(uv).reshape(-1, 2))
-
-
-def _same_samples(scheme: Scheme, signatures: tuple[Signature, ...], uv: FloatArray) -> list[FloatArray]:
-    different = list(dict.fromkeys(signatures))
-    counts = [len(uv)] * len(different)
-    found = stencils_of_samples(scheme, different, counts, np.tile(uv, (len(different), 1)))
-    by_signature = dict(zip(different, found, strict=True))
-    return [by_signature[signature] for signature in signatures]
-
-
-def stencils_of_samples(
-    scheme: Scheme,
-    signatures: Sequence[Signature],
-    counts: Sequence[int],
-    uv: FloatArray,
-    corner: IntArray | None = None,
-) -> list[FloatArray]:
-    """`element_stencils` of samples on elements of several signatures, one element after the other.
-
-    Parameters
-    ----------
-    signatures : sequence of Signature
-        All different.
-    counts : sequence of int
-        Number of samples of each element.
-    uv : (s, 2) float64
-    corner : (s,) int64, optional
-    """
-    elements = [element_of(scheme, signature) for signature in signatures]
-    corner = np.zeros(len(uv), dtype=np.int64) if corner is None else corner
-    element = np.repeat(np.arange(len(elements)), counts)
-    located = LocatedSamples(scheme, elements, element, uv, corner, merge=True)
-    rows = located.rows("stabilized", np.float64, 1)
-    magnitude = located.per_sample([frame_magnitude(*each) for each in zip(located.leaves, rows, strict=True)])
-    magnitude = _by_uv(magnitude, np.abs(located.jacobian))
-    found = []
-    weights = located.weights([np.concatenate([each.rows[:1], each.tangents]) for each in rows])
-    for own, at in zip(weights, located.slices(), strict=True):
-        stencils = np.ascontiguousarray(own.swapaxes(0, 1))
-        stencils[1:] = _by_uv(stencils[1:].swapaxes(1, 2), located.jacobian[..., at]).swapaxes(1, 2)
-        without_collapsed(stencils[1:], magnitude[:, at])
-        stencils.flags.writeable = False
-        found.append(stencils)
-    return found
 
 
 def _times_points(weights: list[FloatArray], points: list[FloatArray]) -> FloatArray:

@@ -79,9 +79,6 @@ class LocatedSamples:
     uv : (s, 2) float64
         Parameters, with (0, 0) at the sample's corner. They stay exact near it.
     corner : (s,) int64
-    merge : bool
-        Whether samples that come to lie at the same parameters of equal parts go on as one, as the vertices of
-        tessellations do along semi-sharp creases.
 
     Attributes
     ----------
@@ -98,17 +95,15 @@ class LocatedSamples:
         element: IntArray,
         uv: FloatArray,
         corner: IntArray,
-        *,
-        merge: bool = False,
     ) -> None:
         self.scheme, self._given = scheme, (elements, element, uv, corner)
         self.leaves: list[Leaves] = []
         self._depths: list[_Depth] = []
-        found = self._descend(list(elements), element, uv, corner, merge)
+        found = self._descend(list(elements), element, uv, corner)
         self.leaf_sample, self.jacobian = self._ascend(found, len(uv))
 
     def _descend(
-        self, elements: list[DividedElement], element: IntArray, uv: FloatArray, turn: IntArray, merge: bool
+        self, elements: list[DividedElement], element: IntArray, uv: FloatArray, turn: IntArray
     ) -> list[tuple[int, IntArray, IntArray]]:
         """Fill the depths and the leaves; the depth, the samples and the turns of each part of the leaves, in order."""
         scheme, domain = self.scheme, self.scheme.domain
@@ -138,8 +133,7 @@ class LocatedSamples:
             below = [
                 numbers.setdefault(elements[key // 4].child_element(key % 4), len(numbers)) for key in pairs.tolist()
             ]
-            key = np.array(below)[pair], turn[inner], in_child
-            element_below, turn_below, uv_below, at_below = _distinct(*key) if merge else _sorted(*key)
+            element_below, turn_below, uv_below, at_below = _sorted(np.array(below)[pair], turn[inner], in_child)
             in_pairs = np.split(np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))[:-1])
             groups: list[tuple[int, int, IntArray, int, IntArray]] = [
                 (number // 4, number % 4, inner[own], own_below, at_below[own])
@@ -282,14 +276,3 @@ def _sorted(element: IntArray, turn: IntArray, uv: FloatArray) -> tuple[IntArray
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
     return element[order], turn[order], uv[order], number
-
-
-def _distinct(element: IntArray, turn: IntArray, uv: FloatArray) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-    """Different samples, sorted by their elements, and which of these each of those given is."""
-    order = np.lexsort((*uv.T, turn, element))
-    element, turn, uv = element[order], turn[order], uv[order]
-    is_new = np.ones(len(order), dtype=bool)
-    is_new[1:] = (element[1:] != element[:-1]) | (turn[1:] != turn[:-1]) | (uv[1:] != uv[:-1]).any(axis=1)
-    number = np.empty_like(order)
-    number[order] = np.cumsum(is_new) - 1
-    return element[is_new], turn[is_new], uv[is_new], number

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .apply_weights import EvaluatedVertices, WeightKernel
+    from .vertex_kernel import EvaluatedVertices, VertexKernel
 
-__all__ = ["EvaluatedVertices", "WeightKernel"]
+__all__ = ["EvaluatedVertices", "VertexKernel"]
 
-__getattr__ = deferred(__name__, {"EvaluatedVertices": "apply_weights", "WeightKernel": "apply_weights"})
+__getattr__ = deferred(__name__, {"EvaluatedVertices": "vertex_kernel", "VertexKernel": "vertex_kernel"})

@@ -40,6 +40,11 @@ class ArrayTypes:
         """Whether floats have 64 bits."""
         return bool(dr.type_v(self.float) == dr.VarType.Float64)
 
+    @property
+    def numpy_float(self) -> type:
+        """The same precision in NumPy."""
+        return np.float64 if self.is_double else np.float32
+
     @classmethod
     def of(cls, float_type: type) -> ArrayTypes:
         """The types of the same backend and precision as a flat array, such as ``drjit.llvm.ad.Float``.
@@ -117,6 +122,11 @@ class ArrayTypes:
         """Pad flat 3-vectors to four components, for packet loads."""
         v: Vector3 = dr.unravel(self.vector3, flat)
         return dr.ravel(self.vector4(v.x, v.y, v.z, 0))
+
+    def unpadded(self, padded: FloatBuffer, count: int) -> FloatBuffer:
+        """The first ``count`` of padded 3-vectors, flat."""
+        v: Vector4 = dr.gather(self.vector4, padded, dr.arange(self.index, count))
+        return dr.ravel(self.vector3(v.x, v.y, v.z))
 
     def packet(self, padded: FloatBuffer, index: Index, active: Mask = True) -> Vector3:
         """Fetch a padded 3-vector."""

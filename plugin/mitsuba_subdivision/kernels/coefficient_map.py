@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -84,8 +84,7 @@ class CoefficientMap:
         if steps.parts is not None:
             dr.eval(sums)
             steps.parts.add_transposed(type(sums)(sums), sums)
-        own = types.fetch(types.vector4, sums, dr.arange(types.index, steps.refined_count))
-        found = dr.ravel(types.vector3(own.x, own.y, own.z))
+        found = types.unpadded(sums, steps.refined_count)
         return found if steps.refinement is None else steps.refinement.transposed(found)
 
     @cached_property
@@ -102,12 +101,12 @@ class _Steps:
         Map to the control points of the cage refined once.
     refined_count, point_count : int
         Of these control points, and of all together with those of parts.
-    parts : _Rows or None
+    parts : WeightRows or None
         Control points of parts.
     rings : tuple of three index arrays, or None
         Control points that are packets of the coefficients: their indices, those of what they are relative to or
         `NOTHING`, and the packets.
-    pieces : _Rows or None
+    pieces : WeightRows or None
         Coefficients of pieces.
     """
 
@@ -120,19 +119,19 @@ class _Steps:
         of_piece = table.packets_of_piece
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
         self.point_count = self.refined_count
-        # Control points of parts follow all others.
         for maps, (first, count, control_count, first_piece, piece_count, _, _) in zip(
             table.maps, table.classes.tolist(), strict=True
         ):
             for begin, stencils, weights in maps:
-                own_first, own_count, is_part = first, control_count, stencils is not None
+                own_first, own_count = first, control_count
                 if stencils is not None:
-                    own_first, own_count = self.point_count, len(stencils)
+                    # Control points of parts follow all others, and so do their indices.
+                    own_first, own_count = len(controls) + self.point_count - self.refined_count, len(stencils)
                     parts.add(stencils[:, None], first, count, control_count, self.point_count, count, 1)
                     self.point_count += count * own_count
                 to, step = of_piece * (first_piece + begin), of_piece * piece_count
-                pieces.add(weights, own_first, count, own_count, to, of_piece, step, is_part=is_part)
-        listed = types.indices(controls)
+                pieces.add(weights, own_first, count, own_count, to, of_piece, step)
+        listed = types.indices(controls, np.arange(self.refined_count, self.point_count))
         self.parts, self.pieces = (each.rows(types, listed) if each.added else None for each in (parts, pieces))
         self.rings = None
         if table.classes[:, 6].any():
@@ -157,8 +156,7 @@ class _Blocks:
     ----------
     added : list of tuple of ints
         Of what was added: how many blocks; of each its number of patches; the index of its first control, and how many
-        controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches;
-        and whether its controls are those of parts.
+        controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches.
     """
 
     def __init__(self, width: int) -> None:
@@ -168,16 +166,7 @@ class _Blocks:
         self._row_count = 0
 
     def add(
-        self,
-        weights: np.ndarray,
-        first: int,
-        count: int,
-        control_count: int,
-        to: int,
-        apart: int,
-        step: int,
-        *,
-        is_part: bool = False,
+        self, weights: np.ndarray, first: int, count: int, control_count: int, to: int, apart: int, step: int
     ) -> None:
         """Add a block for each of some ``(b, width, K)`` weights."""
         key = id(weights)
@@ -185,81 +174,100 @@ class _Blocks:
             self._weights[key] = weights, self._row_count
             self._row_count += len(weights) * control_count
         row = self._weights[key][1]
-        self.added.append((len(weights), count, first, control_count, row, to, apart, step, int(is_part)))
+        self.added.append((len(weights), count, first, control_count, row, to, apart, step))
 
-    def rows(self, types: ArrayTypes, controls: IndexBuffer) -> _Rows:
+    def rows(self, types: ArrayTypes, controls: IndexBuffer) -> WeightRows:
         """Upload the blocks."""
-        precision = np.float64 if types.is_double else np.float32
-        weights = np.zeros((self._row_count, -(-self.width // PACKET) * PACKET), dtype=precision)
-        for block, row in self._weights.values():
-            own = weights[row : row + len(block) * block.shape[2]].reshape(len(block), block.shape[2], -1)
-            own[:, :, : self.width] = block.swapaxes(1, 2)
-            # The transposed map needs the weights of the first control point, which the others are relative to, so that
-            # rows sum to one for constants and to zero for other coefficients.
-            own[:, 0, : self.width] = -block[:, :, 1:].sum(axis=2)
-            own[:, 0, 0] += 1
+        weights = padded_rows([block for block, _ in self._weights.values()], types.numpy_float)
         added = np.array(self.added)
         index = ragged.index_in_row(added[:, 0])
-        _, count, first, control_count, row, to, apart, step, is_part = np.repeat(added, added[:, 0], axis=0).T
+        _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
         # Controls of a block's patches are as far apart as there are patches.
-        columns = [count, first, count, control_count, row + index * control_count, to + index * apart, step, is_part]
-        return _Rows(types, self.width, np.stack(columns, axis=1), weights, controls)
+        columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
+        block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
+        packet = (to + index * apart)[block] + patch * step[block]
+        return WeightRows(types, self.width, columns, weights, controls, block, patch, packet)
 
 
-class _Rows:
-    """Blocks on a device: a lane for each patch of each block.
+class WeightRows:
+    """Blocks of weights on a device, and a lane for each patch of each block.
 
     Parameters
     ----------
     width : int
-        As in `_Blocks`.
-    columns : (b, 8) int
-        Of each block its number of patches; the index of its first control, how far those of a patch are apart, and how
-        many they are; its first row of weights; where it writes to, how far patches are apart there; and whether the
-        indices of controls are themselves those of control points, instead of places in `controls`.
+        Number of vectors that a row of weights computes.
+    columns : (b, 4) int
+        Of each block the index of its first control in ``controls``, how far those of a patch are apart, and how many
+        they are; its first row of weights.
     weights : (w, ..) float
         A row for each control point of a block, with a number for each vector that it makes.
     controls : index array
         Indices of control points.
+    block, patch, packet : (n,) int
+        Of each lane: its block, its patch, and where it writes to. Lanes of a block are consecutive, so that they read
+        the same weights.
+    extent_weights : (b,) float, optional
+        If given, another packet follows the vectors of each lane: this, times how far the control points of the patch
+        are from the first of them along each axis.
+    least_extent : float
+        That is taken to be at least this part of the distance from the origin.
     """
 
     def __init__(
-        self, types: ArrayTypes, width: int, columns: np.ndarray, weights: np.ndarray, controls: IndexBuffer
+        self,
+        types: ArrayTypes,
+        width: int,
+        columns: np.ndarray,
+        weights: np.ndarray,
+        controls: IndexBuffer,
+        block: np.ndarray,
+        patch: np.ndarray,
+        packet: np.ndarray,
+        extent_weights: np.ndarray | None = None,
+        least_extent: float = 0,
     ) -> None:
         self._types, self._width, self._controls = types, width, controls
-        self._row_size = weights.shape[1]
-        lane_count = columns[:, 0]
-        self._count = int(lane_count.sum())
-        # Lanes of a block are consecutive, so that they read the same weights.
-        self._block = types.indices(np.repeat(np.arange(len(columns)), lane_count))
-        self._blocks = types.indices(np.concatenate([ragged.starts(lane_count)[:, None], columns[:, 1:]], axis=1))
+        self._row_size, self._count = weights.shape[1], len(block)
+        self._lane = tuple(types.indices(each) for each in (block, patch, packet))
+        self._columns = types.indices(columns)
         self._weights = types.floats(weights)
+        self._extent_weights = None if extent_weights is None else types.floats(extent_weights)
+        self._least_extent = least_extent
+        # Packets of a lane.
+        self.packet_count = piece_packets(width) + (extent_weights is not None)
 
     def write(self, padded: FloatBuffer, found: FloatBuffer) -> None:
         """Scatter packets of all vectors, computed from the padded control points."""
         types = self._types
-        control, control_count, row, packet = self._lanes()
+        block, control, control_count, row, packet = self._lanes()
         origin = types.packet(padded, control(types.index(0)))
+        has_extent = self._extent_weights is not None
 
         def add(k, *sums):
             relative = types.packet(padded, control(k)) - origin
             weights = self._row(row + k)
-            return k + 1, *(dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=True))
+            added = [dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=False)]
+            if has_extent:
+                added.append(dr.maximum(sums[-1], dr.abs(relative)))
+            return k + 1, *added
 
         zero: Vector3 = dr.zeros(types.vector3, self._count)
-        start = (dr.full(types.index, 1, self._count), *(types.vector3(zero) for _ in range(self._width)))
+        start = (dr.full(types.index, 1, self._count), *(types.vector3(zero) for _ in range(self._width + has_extent)))
         _, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
         sums[0] = sums[0] + origin
-        numbers = [number for vector in sums for number in vector]
+        numbers = [number for vector in sums[: self._width] for number in vector]
         numbers += [types.float(0)] * (-len(numbers) % PACKET)
+        if has_extent:
+            extent = dr.maximum(sums[-1], dr.abs(origin) * self._least_extent)
+            extent *= types.fetch(types.float, self._extent_weights, block)
+            numbers += [*extent, types.float(0)]
         for i in range(0, len(numbers), PACKET):
             dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET, mode=NO_CONFLICTS)
 
     def add_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
         """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
-        types = self._types
-        control, control_count, row, packet = self._lanes()
-        of_lane = piece_packets(self._width)
+        types, of_lane = self._types, self.packet_count
+        _, control, control_count, row, packet = self._lanes()
         numbers = types.row(gradient, PACKET * of_lane, packet // of_lane)
         vectors = [types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self._width)]
 
@@ -273,25 +281,40 @@ class _Rows:
         start: tuple[Index] = (dr.zeros(types.index, self._count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
-    def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index, Index]:
-        """Per lane: a function that finds its control points, their number, its first row of weights and packet."""
+    def _lanes(self) -> tuple[Index, Callable[[Index], Index], Index, Index, Index]:
+        """Per lane: its block; a function that finds its control points; their number, its first row and packet."""
         types = self._types
         lane: Index = dr.arange(types.index, self._count)
-        block = types.fetch(types.index, self._block, lane)
-        first_lane, first_control, patch_count, control_count = types.fetch(types.index4, self._blocks, 2 * block)
-        row, first_packet, step, is_part = types.fetch(types.index4, self._blocks, 2 * block + 1)
-        patch = lane - first_lane
-        at, is_listed = first_control + patch, is_part == 0
+        block, patch, packet = (types.fetch(types.index, each, lane) for each in self._lane)
+        first_control, apart, control_count, row = types.fetch(types.index4, self._columns, block)
+        at = first_control + patch
 
         def control(k: Index) -> Index:
-            index = dr.fma(k, patch_count, at)
-            return dr.select(is_listed, types.fetch(types.index, self._controls, index, is_listed), index)
+            return types.fetch(types.index, self._controls, dr.fma(k, apart, at))
 
-        return control, control_count, row, dr.fma(patch, step, first_packet)
+        return block, control, control_count, row, packet
 
     def _row(self, row: Index) -> list:
         """A row of weights, one for each vector."""
         return self._types.row(self._weights, self._row_size, row)[: self._width]
+
+
+def padded_rows(blocks: Sequence[np.ndarray], dtype: type) -> np.ndarray:
+    """Blocks ``(b, m, K)``, in which the first control point is the origin, as rows of `WeightRows`.
+
+    Rows are those of all control points of a block, then of the next one. Weights of the origin are those of the
+    transposed map, which make sums one for constants and zero for other coefficients.
+    """
+    size = -(-blocks[0].shape[1] // PACKET) * PACKET
+    found = np.zeros((sum(len(block) * block.shape[2] for block in blocks), size), dtype=dtype)
+    end = 0
+    for block in blocks:
+        begin, end = end, end + len(block) * block.shape[2]
+        own = found[begin:end].reshape(len(block), block.shape[2], size)[:, :, : block.shape[1]]
+        own[:] = block.swapaxes(1, 2)
+        own[:, 0] = -block[:, :, 1:].sum(axis=2)
+        own[:, 0, 0] += 1
+    return found
 
 
 class _Coefficients(dr.CustomOp):

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
-import numpy as np
 
 from ..evaluation.divided_element import PartKind
 from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, FrameKind
@@ -272,7 +271,7 @@ class PieceKernel:
         self._has_tips = bool((kinds == _TIP).any())
         self._has_frames = bool((table.nodes[:, 3] & FRAMES).any())
         if self._has_tips:
-            self._weights = types.floats(table.weights(self._row_size, np.float64 if types.is_double else np.float32))
+            self._weights = types.floats(table.weights(self._row_size, types.numpy_float))
             self._rings = types.indices(table.rings)
         self._is_split = table.refinement is not None
 

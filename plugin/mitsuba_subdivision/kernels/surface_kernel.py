@@ -413,7 +413,7 @@ class AreaSampler:
         self._count = len(cells.areas)
         if not cells.areas.sum() > 0:
             raise ValueError("the surface has no area; expected one to draw points from")
-        precision = np.float64 if types.is_double else np.float32
+        precision = types.numpy_float
         # Probabilities are differences of the rounded cumulative sums.
         until = (np.cumsum(cells.areas) / cells.areas.sum()).astype(precision)
         until[-1] = 1

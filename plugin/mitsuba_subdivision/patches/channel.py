@@ -22,7 +22,7 @@ from ..progress import counted
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
-from .stencil_matrices import value_matrix
+from .stencil_matrices import vertex_matrices
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -127,7 +127,7 @@ class SubdividedChannel(_OfLayout):
 
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights that `evaluate` multiplies values by; rows sum to one."""
-        return value_matrix(self.patches, self.value_index, len(self.values), half_edge, uv)
+        return vertex_matrices(self.patches, self.value_index, len(self.values), half_edge, uv, 1)[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,27 +107,37 @@ def _sample_rows(
             yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights)
 
 
-def value_matrix(
-    patches: PatchTable, control_of_vertex: IntArray, control_count: int, half_edge: IntArray, uv: FloatArray
-) -> sparse.csr_array:
-    """`StencilMatrices.p` alone, quickly for the vertices of a tessellation; arguments as for `sample_matrices`."""
+def vertex_matrices(
+    patches: PatchTable,
+    control_of_vertex: IntArray,
+    control_count: int,
+    half_edge: IntArray,
+    uv: FloatArray,
+    count: int = 3,
+) -> list[sparse.csr_array]:
+    """Weights of points and of two tangents, or of points alone, quickly for the vertices of a tessellation.
+
+    Arguments as for `sample_matrices`. Tangents as `element_stencils` has them.
+    """
     from scipy import sparse
 
     refined = patches.refined
     if refined is None:
-        return joined_matrices(_value_rows(patches, control_of_vertex, half_edge, uv), 1, (len(uv), control_count))[0]
+        rows = _vertex_rows(patches, control_of_vertex, half_edge, uv, count)
+        return joined_matrices(rows, count, (len(uv), control_count))
     # Otherwise there would be too many classes.
-    rows = np.arange(refined.table.topology.vertex_count)
-    parts = _value_rows(refined.table, rows, *_in_refined(patches, refined, half_edge, uv))
+    every = np.arange(refined.table.topology.vertex_count)
+    rows = _vertex_rows(refined.table, every, *_in_refined(patches, refined, half_edge, uv), count)
     of_mesh = sparse.csr_array(
         (np.ones(len(control_of_vertex)), (np.arange(len(control_of_vertex)), control_of_vertex)),
         shape=(len(control_of_vertex), control_count),
     )
-    return (joined_matrices(parts, 1, (len(uv), len(rows)))[0] @ (refined.matrix @ of_mesh)).tocsr()
+    matrix = refined.matrix @ of_mesh
+    return [(own @ matrix).tocsr() for own in joined_matrices(rows, count, (len(uv), len(every)))]
 
 
-def _value_rows(
-    patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray
+def _vertex_rows(
+    patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray, count: int
 ) -> Iterator[StencilRows]:
     class_index, patch, patch_corner = patches.patch_at(half_edge)
     # Samples of the same class in the same place of their patches have the same weights.
@@ -137,13 +147,13 @@ def _value_rows(
     begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
     for own in np.split(np.arange(len(order)), begins)[1:]:
         patch_class, distinct = patches.classes[class_index[order[own[0]]]], order[own[is_new[own]]]
-        stencils = element_stencils(patches.scheme, patch_class.signature, uv[distinct], patch_corner[distinct])[0]
+        stencils = element_stencils(patches.scheme, patch_class.signature, uv[distinct], patch_corner[distinct])[:count]
         which = np.cumsum(is_new[own]) - 1
-        run = max(1, CHUNK // stencils.shape[1])
+        run = max(1, CHUNK // stencils.shape[2])
         for begin in range(0, len(own), run):
             at = order[own[begin : begin + run]]
-            weights = stencils[which[begin : begin + run]]
-            yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights[None])
+            weights = stencils[:, which[begin : begin + run]]
+            yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights)
 
 
 def _in_refined(

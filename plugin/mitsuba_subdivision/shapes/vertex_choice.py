@@ -18,7 +18,7 @@ from ..surface import LimitSurface
 from .vertices import Vertices, split_weld_targets
 
 if TYPE_CHECKING:
-    from ..kernels import EvaluatedVertices, WeightKernel
+    from ..kernels import EvaluatedVertices, VertexKernel
     from ..tessellation import AttributeTable, VertexTable
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
@@ -86,10 +86,10 @@ def _evaluators(
     is_jit = float_type is not None
     if not is_jit and (table.vertex_count <= WORTH_A_KERNEL or llvm_problem() is not None):
         return partial(_weighted, table), None
-    from ..kernels import WeightKernel
+    from ..kernels import VertexKernel
 
     kernel_type = float_type or dr.llvm.Float
-    kernel = _KERNELS.get((table, kernel_type), lambda: WeightKernel(table, kernel_type))
+    kernel = _KERNELS.get((table, kernel_type), lambda: VertexKernel(table, kernel_type))
     if not is_jit:
         return lambda points: kernel(mapped(kernel_type, np.array(points))), None
     return kernel, kernel.evaluated if dr.is_diff_v(kernel_type) else None
@@ -117,11 +117,11 @@ def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
     """Flat control points as ``(count, 3)``. Raises ValueError if their number is not `count`."""
     found = np.array(points, dtype=np.float64)
     if found.size != 3 * count:
-        from ..kernels.apply_weights import coordinates_expected
+        from ..kernels.vertex_kernel import coordinates_expected
 
         raise ValueError(coordinates_expected(found.size, count))
     return found.reshape(-1, 3)
 
 
 # Weights on the device, shared by shapes of one table.
-_KERNELS: Shared[WeightKernel] = Shared()
+_KERNELS: Shared[VertexKernel] = Shared()

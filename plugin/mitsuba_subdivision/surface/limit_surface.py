@@ -598,7 +598,11 @@ class LimitSurface:
         """
         if not isinstance(table, tessellation.VertexTable):
             table = self.sampling(table)
-        return table.matrices()
+        from ..patches.stencil_matrices import vertex_matrices
+
+        cut, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
+        points, *tangents = vertex_matrices(self.patches, cut, count, *table.locations())
+        return tessellation.VertexMatrices(points[table.weld_target], *tangents)
 
     def attribute_table(self, table: VertexTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.

@@ -1,7 +1,8 @@
-"""Tessellation of patches into triangles: sample locations, shared vertices, and the stencils that evaluate them.
+"""Tessellation of patches into triangles: sample locations, shared vertices, and the polynomials that they lie on.
 
-`uniform_table` and `adaptive_table` both build a `VertexTable`: a vertex is a limit stencil of a class of patches
-times the control points of one of these. Their grids (`Grid`) number and locate vertices and triangles.
+`uniform_table` and `adaptive_table` both build a `VertexTable`: a vertex is a point of a polynomial, whose coefficients
+are weights of a class of patches times the control points of one of these. Their grids (`Grid`) number and locate
+vertices and triangles.
 
 This package, `kernels` and `shapes` distinguish five kinds of points:
 
@@ -10,7 +11,7 @@ control point      A vertex of the cage, which may move. If the patches are thos
                    control points follow from these.
 mesh vertex        A vertex of `PatchTable.topology`: the cage cut along its creases, where a control point has a copy
                    on each side. Attributes have meshes of their own, cut along their seams as well.
-sample             A point of a patch's grid. All patches of a class have the same samples, and each sample one stencil.
+sample             A point of a patch's grid. All patches of a class have the same samples.
 vertex             A vertex of the tessellation. Neighbouring patches share vertices, and one of them evaluates these.
 split vertex       A vertex of the tessellation with attributes (`AttributeTable`), and so of Mitsuba's mesh: vertices
                    on seams are split into a copy for each side.
@@ -21,12 +22,11 @@ These maps convert between them:
 ===================  ==================================================================================================
 `control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.
 `controls`           From a patch to the control points of its one-ring.
-`first_vertex`       From a run of samples on a patch to the vertex of the first one; those of the others follow.
 `weld_target`        From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
 `surface_vertex`     From a split vertex to the vertex that it is a copy of.
 ===================  ==================================================================================================
 
-A patch belongs to a class (`PatchClass`), whose limit stencils (`ClassStencils`) are made once for all its patches. The
+A patch belongs to a class (`PatchClass`), whose weights (`VertexPolynomials`) are made once for all its patches. The
 corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
 """
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from .criterion import Criterion, DisplacementBound, Measure, Sensor
     from .uniform import uniform_table
     from .uniform_grid import UniformGrid
-    from .vertex_stencils import ClassStencils, VertexStencils
+    from .vertex_polynomials import VertexPolynomials
     from .vertex_table import Tessellation, VertexMatrices, VertexTable
 
 # Segments along an edge of the control cage. Triangles are numbered by 32 bits, and memory ends long before that.
@@ -52,7 +52,6 @@ __all__ = [
     "HIGHEST_RATE",
     "AttributeLayout",
     "AttributeTable",
-    "ClassStencils",
     "Criterion",
     "DisplacementBound",
     "Measure",
@@ -60,7 +59,7 @@ __all__ = [
     "Tessellation",
     "UniformGrid",
     "VertexMatrices",
-    "VertexStencils",
+    "VertexPolynomials",
     "VertexTable",
     "adaptive_table",
     "uniform_table",
@@ -71,15 +70,14 @@ __getattr__ = deferred(
     {
         "AttributeLayout": "attribute_table",
         "AttributeTable": "attribute_table",
-        "ClassStencils": "vertex_stencils",
         "Criterion": "criterion",
         "DisplacementBound": "criterion",
         "Measure": "criterion",
-        "VertexStencils": "vertex_stencils",
         "Sensor": "criterion",
         "Tessellation": "vertex_table",
         "UniformGrid": "uniform_grid",
         "VertexMatrices": "vertex_table",
+        "VertexPolynomials": "vertex_polynomials",
         "VertexTable": "vertex_table",
         "adaptive_table": "adaptive",
         "uniform_table": "uniform",

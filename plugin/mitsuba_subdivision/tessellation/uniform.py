@@ -6,21 +6,16 @@ import operator
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..evaluation.element import stencils_by_signature
-from ..evaluation.product_patch import product_patch
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
 from ..patches import PatchClass, PatchTable
-from ..progress import counted
 from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
 from .memory import require_memory
 from .quad_grid import QuadGrid
 from .uniform_grid import GridPart, UniformGrid
-from .vertex_stencils import WEIGHTS_TOGETHER, ClassStencils, VertexStencils
+from .vertex_polynomials import PatchVertices, VertexPolynomials, vertex_polynomials
 from .vertex_table import VertexTable
 
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
@@ -50,8 +45,8 @@ def uniform_table(
         count = control_count or patches.topology.vertex_count
         control = np.arange(count) if control_of_vertex is None else control_of_vertex
         controls, refinement = patches.control_rows(control, count)
-        vertex_stencils, copies = _vertex_stencils(patches, grid, controls), _copies(patches, grid, control)
-        return VertexTable(count, patches.patch_count, grid, vertex_stencils, controls, copies, refinement)
+        polynomials, copies = _polynomials(patches, grid), _copies(patches, grid, control)
+        return VertexTable(count, patches.patch_count, grid, polynomials, controls, copies, refinement)
 
     return _TABLES.get((patches, checked_rate(rate), Content(control_of_vertex), control_count), make)
 
@@ -91,58 +86,31 @@ def checked_rate(rate: int, name: str = "tessellation rate") -> int:
     return checked
 
 
-def _vertex_stencils(patches: PatchTable, grid: UniformGrid, controls: NDArray[np.uint32]) -> VertexStencils:
-    """The vertices, class by class: part by part of the grid, with the stencils of all classes that have any.
-
-    Patches that are whole elements come before others; of both, those whose weights are products come first, then those
-    with fewer control points.
-    """
-    found: list[ClassStencils] = []
-    # Of each kind: its class, samples, patches and first vertices.
-    kinds: list[tuple[int, IntArray, IntArray, IntArray]] = []
-    for classes, uv, all_parts in _layouts(patches, grid):
-        bounds = ragged.offsets([len(patch_class.corners) for patch_class in classes]).astype(np.int32)
-        parts = [part for part in all_parts if len(part.samples)]
-        ends = [np.searchsorted(part.patches, bounds).tolist() for part in parts]
-        # At low rates, patches of other classes may evaluate all samples of a class.
-        used = [i for i in range(len(classes)) if any(own[i] < own[i + 1] for own in ends)]
-        for index in used:
-            for part, own in zip(parts, ends, strict=True):
-                rows = slice(own[index], own[index + 1])
-                if rows.start < rows.stop:
-                    number = len(found) + used.index(index)
-                    kinds.append((number, part.samples, part.patches[rows] - bounds[index], part.first_vertex[rows]))
-        found += _stencils(patches.scheme, [classes[index] for index in used], uv, controls)
-    class_of_kind, samples, patch, first_vertex = zip(*kinds, strict=True)
-    return VertexStencils(
-        tuple(found),
-        np.array(class_of_kind),
-        np.array([len(own) for own in samples]),
-        np.concatenate(samples),
-        np.array([len(own) for own in patch]),
-        np.concatenate(patch),
-        np.concatenate(first_vertex),
-    )
-
-
-def _stencils(
-    scheme: Scheme, classes: list[PatchClass], uv: FloatArray, controls: NDArray[np.uint32]
-) -> list[ClassStencils]:
-    """Stencils of some classes at the same parameters."""
-    most = max((each.controls.shape[1] for each in classes), default=1)
-    step = max(1, WEIGHTS_TOGETHER // (3 * len(uv) * most))
-    groups = [classes[begin : begin + step] for begin in range(0, len(classes), step)]
-    weights: list[FloatArray] = []
-    for group in counted(groups, "Weights of groups of patch classes"):
-        weights += stencils_by_signature(scheme, [each.signature for each in group], uv)
-    return [
-        ClassStencils.of(each, own, uv, controls, product_patch(scheme, each.signature))
-        for each, own in zip(classes, weights, strict=True)
-    ]
+def _polynomials(patches: PatchTable, grid: UniformGrid) -> tuple[VertexPolynomials, ...]:
+    """What the vertices lie on, class by class and part by part of the grid."""
+    classes: list[PatchClass] = []
+    uv: list[FloatArray] = []
+    found: list[PatchVertices] = []
+    for own_classes, samples, parts in _layouts(patches, grid):
+        bounds = ragged.offsets([len(patch_class.corners) for patch_class in own_classes])
+        for part in parts:
+            count = len(part.samples)
+            of_class = np.searchsorted(bounds, part.patches, side="right") - 1
+            patch = part.patches - bounds[of_class]
+            repeated = [np.repeat(each.astype(np.int32), count) for each in (len(classes) + of_class, patch)]
+            sample = np.tile(part.samples.astype(np.int32), len(patch))
+            found.append(PatchVertices(*repeated, sample, part.vertices.ravel()))
+        classes += own_classes
+        uv += [samples] * len(own_classes)
+    vertices = PatchVertices(*map(np.concatenate, zip(*found, strict=True)))
+    # At low rates, patches of other classes may have all samples of a class.
+    used = np.unique(vertices.patch_class)
+    vertices = vertices._replace(patch_class=np.searchsorted(used, vertices.patch_class))
+    return vertex_polynomials(patches.scheme, [classes[i] for i in used], [uv[i] for i in used], vertices)
 
 
 def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:
-    """Classes whose patches have grids of a kind, in the order of `_vertex_stencils`, and `UniformGrid.layout` of all.
+    """Classes whose patches have grids of a kind, and `UniformGrid.layout` of all.
 
     A patch's grid is that of a whole element, or of an element's corner.
     """
@@ -155,7 +123,6 @@ def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[Patc
         element = patches.elements.face_of(corners[:1])
         of_kind[bool(patches.is_whole[element][0])].append((patch_class, corners))
     for found in filter(None, of_kind.values()):
-        found.sort(key=lambda each: _order(patches, each[0]))
         corners = np.concatenate([corners for _, corners in found])
         if refined is not None and isinstance(grid, QuadGrid):
             # Even where an element is whole, a patch of the cage refined once covers one of its corners only.
@@ -163,11 +130,6 @@ def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[Patc
         else:
             layout = grid.layout(corners)
         yield [patch_class for patch_class, _ in found], *layout
-
-
-def _order(patches: PatchTable, patch_class: PatchClass) -> tuple[bool, int]:
-    """What classes are sorted by: those whose weights are products come first, then those with fewer control points."""
-    return product_patch(patches.scheme, patch_class.signature) is None, patch_class.controls.shape[1]
 
 
 def _copies(patches: PatchTable, grid: UniformGrid, control_of_vertex: IntArray) -> IntArray:

@@ -1,8 +1,8 @@
-"""A tessellation: limit stencils of every vertex, made once and applied whenever the control points move."""
+"""A tessellation: a polynomial under every vertex, made once and applied whenever the control points move."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -10,41 +10,29 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.normals import LEAST_EXTENT, unit_normals
-from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
-from .vertex_stencils import ClassStencils, VertexStencils
+from .vertex_polynomials import VertexPolynomials
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from scipy import sparse
 
-    from ..patches import StencilRows
-
-# Vertices are evaluated in blocks of about this many weights, whose arrays stay in a core's cache.
-BLOCK_WEIGHTS = 1 << 16
-# And of about this many samples.
-BLOCK_SAMPLES = 1 << 14
-# Where so many vertices have the same samples, one product of matrices evaluates them.
-SHARED = 1 << 10
-
 
 @dataclass(frozen=True, eq=False)
 class VertexTable:
-    """A tessellation: its vertices as weights over control points, its triangles, and their elements.
+    """A tessellation: its vertices as points on polynomials, its triangles, and their elements.
 
-    A vertex is a limit stencil of a class of patches times the control points of one of these patches. Weights do not
-    depend on where control points are; of an adaptive tessellation, the triangles do.
+    A polynomial's coefficients are weights times the control points of a patch. Weights do not depend on where control
+    points are; of an adaptive tessellation, the triangles do.
     """
 
     control_count: int
     patch_count: int
     grid: Grid  # Numbers the vertices and triangles, and says where on the surface they lie
-    vertex_stencils: VertexStencils  # The stencil and the patch of each vertex
-    # (n,) uint32: `ClassStencils.controls` of all classes: control points or, if there is a ``refinement``, refined
-    # ones
+    polynomials: tuple[VertexPolynomials, ...]  # What the vertices lie on
+    # (n,) uint32: control points of the patches of all classes; if there is a ``refinement``, refined ones
     controls: NDArray[np.uint32]
     # (2, n) int64: vertices that take their position from another one, and that one. Along a crease, either side has
     # vertices of its own, with normals of their own but the same positions, bit by bit.
@@ -52,11 +40,6 @@ class VertexTable:
     # (n, control_count) sparse array or None: makes refined control points of the cage's, where the patches are those
     # of the cage refined once
     refinement: sparse.csr_array | None = None
-
-    @property
-    def classes(self) -> tuple[ClassStencils, ...]:
-        """The classes that have samples to evaluate."""
-        return self.vertex_stencils.classes
 
     @property
     def vertex_count(self) -> int:
@@ -102,102 +85,21 @@ class VertexTable:
             Normals are zero where the surface has none, see `SurfaceSamples`.
         """
         positions, normals = (np.empty((self.vertex_count, 3), dtype=dtype) for _ in range(2))
-        coordinates = np.ascontiguousarray(self.refined(control_points).T)
-        for block in self._blocks():
-            values, origin, extent = block.sums(coordinates, dtype)
-            if self.refinement is not None:
-                # Refined control points are rounded before they are seen from the origin.
-                extent = np.maximum(extent, LEAST_EXTENT[64] * np.abs(origin))
-            frame_weights = block.of_vertices(block.frame_weights.astype(dtype))
-            positions[block.vertices] = (values[0] + block.of_patches(origin)).T
-            normals[block.vertices] = unit_normals(values[1:3], frame_weights, block.of_patches(extent)).T
+        points, are_rounded = self.refined(control_points), self.refinement is not None
+        for part in self.polynomials:
+            for found in part.sums(self.controls, points, dtype):
+                positions[found.vertex] = found.points
+                normals[found.vertex] = found.normals(are_rounded=are_rounded)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
     def interpolated(self, values: FloatArray) -> FloatArray:
         """``(vertex_count, k)`` points of the surface that ``(control_count, k)`` values make, also of copies."""
-        found = np.empty((self.vertex_count, values.shape[1]))
-        coordinates = np.ascontiguousarray(self.refined(values).T)
-        for block in self._blocks():
-            (points,), origin, _ = block.sums(coordinates, np.float64, 1)
-            found[block.vertices] = (points + block.of_patches(origin)).T
+        found, points = np.empty((self.vertex_count, values.shape[1])), self.refined(values)
+        for part in self.polynomials:
+            for some in part.sums(self.controls, points, np.float64, 1):
+                found[some.vertex] = some.points
         return found
-
-    def stencil_rows(self) -> Iterator[StencilRows]:
-        """Weights of every vertex and its two tangents over `refined` control points, some vertices at a time.
-
-        Each vertex has its own, also where its position is taken from another one (`weld_target`).
-        """
-        from ..patches import StencilRows
-
-        for block in self._blocks():
-            weights = block.of_vertices(block.weights).transpose(0, 2, 1)
-            yield StencilRows(block.vertices, block.of_patches(block.controls).T, weights)
-
-    def matrices(self) -> VertexMatrices:
-        """The same weights as sparse matrices, of positions and of tangents."""
-        from ..patches.stencil_matrices import joined_matrices
-
-        width = self.control_count if self.refinement is None else self.refinement.shape[0]
-        matrices = joined_matrices(self.stencil_rows(), 3, (self.vertex_count, width))
-        if self.refinement is not None:
-            matrices = [matrix @ self.refinement for matrix in matrices]
-        points, *tangents = matrices
-        return VertexMatrices(points[self.weld_target], *tangents)
-
-    def _blocks(self) -> Iterator[_Block]:
-        """All vertices, in blocks that bound temporary memory."""
-        vertex_stencils = self.vertex_stencils
-        vertex_counts = vertex_stencils.counts * vertex_stencils.run_counts
-        is_shared = vertex_counts >= SHARED
-        sizes = np.array([stencils.controls.shape[1] for stencils in self.classes], dtype=np.int64)[
-            vertex_stencils.class_of_kind
-        ]
-        first_runs = ragged.starts(vertex_stencils.run_counts)
-        for kind in np.flatnonzero(is_shared).tolist():
-            count = int(vertex_stencils.counts[kind])
-            length = max(1, min(BLOCK_SAMPLES // count, BLOCK_WEIGHTS // int(sizes[kind])))
-            end = int(first_runs[kind] + vertex_stencils.run_counts[kind])
-            for begin in range(int(first_runs[kind]), end, length):
-                yield self._product_block(kind, slice(begin, min(begin + length, end)))
-        for size in np.unique(sizes[~is_shared]).tolist():
-            kinds = np.flatnonzero(~is_shared & (sizes == size))
-            number = (np.cumsum(vertex_counts[kinds]) - 1) // max(1, BLOCK_WEIGHTS // size)
-            for own in np.split(kinds, np.flatnonzero(np.diff(number)) + 1):
-                yield self._gathered_block(own, first_runs[own])
-
-    def _product_block(self, kind: int, own: slice) -> _Block:
-        """Some runs of one kind."""
-        vertex_stencils = self.vertex_stencils
-        stencils, samples = self.classes[int(vertex_stencils.class_of_kind[kind])], vertex_stencils.samples_of(kind)
-        weights = stencils.weights[:, samples].transpose(0, 2, 1)
-        vertices = np.add.outer(np.arange(len(samples)), vertex_stencils.first_vertex[own])
-        return _Block(vertices.ravel(), weights, stencils.controls[vertex_stencils.patch[own]].T, None)
-
-    def _gathered_block(self, kinds: IntArray, first_runs: IntArray) -> _Block:
-        """All runs of some kinds, on patches with as many control points."""
-        vertex_stencils = self.vertex_stencils
-        # Of each run.
-        run, kind = (
-            ragged.ranges(first_runs, vertex_stencils.run_counts[kinds]),
-            np.repeat(kinds, vertex_stencils.run_counts[kinds]),
-        )
-        number, counts = vertex_stencils.class_of_kind[kind], vertex_stencils.counts[kind]
-        classes, used = np.unique(vertex_stencils.class_of_kind[kinds], return_index=True)
-        first_control = np.zeros(len(self.classes), dtype=np.int64)
-        patch_count = np.zeros(len(self.classes), dtype=np.int64)
-        first_control[classes] = [self.classes[index].first_control for index in classes]
-        patch_count[classes] = [len(self.classes[index].controls) for index in classes]
-        at = np.multiply.outer(np.arange(self.classes[classes[0]].controls.shape[1]), patch_count[number])
-        at += first_control[number] + vertex_stencils.patch[run]
-        sample_starts = ragged.starts(vertex_stencils.counts[kinds])
-        samples = vertex_stencils.samples[ragged.ranges(vertex_stencils.starts[kinds], vertex_stencils.counts[kinds])]
-        of_classes = np.split(samples, sample_starts[used[1:]])
-        weights = [self.classes[index].weights[:, own] for index, own in zip(classes, of_classes, strict=True)]
-        sample = ragged.ranges(np.repeat(sample_starts, vertex_stencils.run_counts[kinds]), counts)
-        vertices = ragged.ranges(vertex_stencils.first_vertex[run].astype(np.int64), counts)
-        controls = np.repeat(self.controls.take(at), counts, axis=1)
-        return _Block(vertices, np.concatenate(weights, axis=1).transpose(0, 2, 1), controls, sample)
 
 
 class VertexMatrices(NamedTuple):
@@ -216,57 +118,6 @@ class VertexMatrices(NamedTuple):
     p: sparse.csr_array
     tangent_u: sparse.csr_array
     tangent_v: sparse.csr_array
-
-
-class _Block(NamedTuple):
-    """Vertices on patches with as many control points. Vertices and patches come last: NumPy's loops are then long."""
-
-    vertices: IntArray  # (n,) int64
-    weights: FloatArray  # (3, K, S) float64: of some samples
-    controls: NDArray[np.uint32]  # (K, p) uint32: of some patches
-    # (n,) int64 or None: of each vertex, which has a column of ``controls`` of its own. If None, there is a vertex
-    # for each sample on each of the patches: those of the first sample come first.
-    sample: IntArray | None
-
-    @property
-    def frame_weights(self) -> FloatArray:
-        """``(2, S)`` sums of the absolute weights of each tangent."""
-        return np.abs(self.weights[1:]).sum(axis=1)
-
-    def of_vertices(self, values: NDArray) -> NDArray:
-        """``(.., n)`` from values ``(.., S)`` of samples."""
-        if self.sample is None:
-            return values.repeat(self.controls.shape[1], axis=-1)
-        return values.take(self.sample, axis=-1)
-
-    def of_patches(self, values: NDArray) -> NDArray:
-        """``(.., n)`` from values ``(.., p)`` of patches."""
-        return values if self.sample is not None else np.tile(values, self.weights.shape[2])
-
-    def sums(
-        self, coordinates: FloatArray, dtype: DTypeLike, row_count: int = 3
-    ) -> tuple[NDArray, FloatArray, NDArray]:
-        """Weights times control points, of which coordinates ``(k, control_count)`` come first.
-
-        Returns
-        -------
-        values : (row_count, k, n)
-            Points, seen from the origin of their patch, and tangents.
-        origin : (k, p) float64
-            A control point of each patch.
-        extent : (k, p)
-            How far the others are from it along each axis.
-        """
-        points = coordinates.take(self.controls, axis=1)
-        origin = points[:, 0].copy()
-        points -= origin[:, None]
-        relative, weights = points.astype(dtype, copy=False), self.weights[:row_count].astype(dtype)
-        if self.sample is None:
-            matrix = weights.swapaxes(1, 2).reshape(-1, weights.shape[1])
-            values = (matrix @ relative).reshape(len(relative), row_count, -1).swapaxes(0, 1)
-        else:
-            values = np.einsum("dkn,xkn->dxn", weights.take(self.sample, axis=2), relative)
-        return values, origin, np.abs(relative).max(axis=1)
 
 
 class Grid(Protocol):

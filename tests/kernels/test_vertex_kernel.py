@@ -10,7 +10,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.kernels import WeightKernel
+from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import bumpy
 
@@ -64,7 +64,7 @@ def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     copies = np.flatnonzero(table.weld_target != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
     assert len(copies) == 16
-    positions, normals = (vectors(v) for v in WeightKernel(table, float_type)(upload(float_type, cage.positions)))
+    positions, normals = (vectors(v) for v in VertexKernel(table, float_type)(upload(float_type, cage.positions)))
     assert np.array_equal(positions[copies], positions[table.weld_target[copies]])
     assert ((normals[copies] * normals[table.weld_target[copies]]).sum(axis=1) < 0.9).all()
     assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
@@ -88,7 +88,7 @@ def forward_derivatives(kernel, float_type, positions, direction):
 @pytest.mark.parametrize("rate", [1, 5])
 def test_equals_sampling_table(surface, rate, float_type):
     table = surface.sampling(rate)
-    positions, normals = WeightKernel(table, float_type)(upload(float_type, surface.cage.positions))
+    positions, normals = VertexKernel(table, float_type)(upload(float_type, surface.cage.positions))
     expected = table.apply(surface.cage.positions)
     np.testing.assert_allclose(vectors(positions), expected[0], atol=tolerance(float_type))
     # Normals lose the digits that cancel in the cross product of two nearly parallel tangents.
@@ -96,7 +96,7 @@ def test_equals_sampling_table(surface, rate, float_type):
 
 
 def test_far_from_the_origin_loses_only_the_rounding_of_points(surface, float_type):
-    kernel = WeightKernel(surface.sampling(4), float_type)
+    kernel = VertexKernel(surface.sampling(4), float_type)
     # Exact in float32, like the control points rounded to 2**-10.
     points = np.round(surface.cage.positions * 1024) / 1024
     shift = np.array([1024.0, -2048.0, 512.0])
@@ -120,7 +120,7 @@ def test_classes_share_kernels(surface, kernels, float_type):
         general = [stencils for stencils in table.classes if stencils.product is None]
         sizes = {-(-stencils.controls.shape[1] // 4) for stencils in general}
         expected = 1 + (len(general) < len(table.classes)) + len(sizes)
-    kernel = WeightKernel(table, float_type)
+    kernel = VertexKernel(table, float_type)
     assert len(launched(kernel, upload(float_type, surface.cage.positions))) == expected
 
 
@@ -130,13 +130,13 @@ def test_kernels_do_not_depend_on_where_arrays_lie(surface, float_type):
     found, kept = set(), []
     for count in range(5):
         # What lies between them moves the arrays of the next table.
-        kept.append([np.empty(40 * count, dtype=np.uint8), WeightKernel(surface.sampling(3), float_type)])
+        kept.append([np.empty(40 * count, dtype=np.uint8), VertexKernel(surface.sampling(3), float_type)])
         found.add(tuple(kernel["hash"] for kernel in launched(kept[-1][1], points)))
     assert len(found) == 1
 
 
 def test_values_are_the_same_with_and_without_derivatives(surface, float_type):
-    kernel = WeightKernel(surface.sampling(3), float_type)
+    kernel = VertexKernel(surface.sampling(3), float_type)
     points = upload(float_type, surface.cage.positions)
     without = kernel(points)
     dr.enable_grad(points)
@@ -145,7 +145,7 @@ def test_values_are_the_same_with_and_without_derivatives(surface, float_type):
 
 
 def test_forward_and_backward_derivatives_agree(surface, float_type, np_rng):
-    kernel = WeightKernel(surface.sampling(3), float_type)
+    kernel = VertexKernel(surface.sampling(3), float_type)
     flat = surface.cage.positions.ravel()
     direction = np_rng.normal(size=flat.size)
     forward = forward_derivatives(kernel, float_type, surface.cage.positions, direction)
@@ -169,7 +169,7 @@ def test_derivatives_equal_finite_differences(surface, float_type, np_rng):
     step = 1e-5
     ahead, behind = (table.apply(surface.cage.positions + side * step * direction) for side in (1, -1))
 
-    found = forward_derivatives(WeightKernel(table, float_type), float_type, surface.cage.positions, direction)
+    found = forward_derivatives(VertexKernel(table, float_type), float_type, surface.cage.positions, direction)
     for derivative, a, b in zip(found, ahead, behind, strict=True):
         expected = (a - b) / (2 * step)
         # Central differences in float64: truncation of order step**2, rounding of order 1e-16 / step.
@@ -178,7 +178,7 @@ def test_derivatives_equal_finite_differences(surface, float_type, np_rng):
 
 def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
     cage = named_cages.cube()
-    kernel, points = WeightKernel(LimitSurface(cage).sampling(2), float_type), dr.zeros(float_type, 24)
+    kernel, points = VertexKernel(LimitSurface(cage).sampling(2), float_type), dr.zeros(float_type, 24)
     dr.enable_grad(points)
     positions, normals = kernel(points)
     dr.backward(dr.sum(positions) + dr.sum(normals))
@@ -188,14 +188,14 @@ def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
 def test_normals_do_not_depend_on_scale(surface, float_type, scale):
-    kernel = WeightKernel(surface.sampling(3), float_type)
+    kernel = VertexKernel(surface.sampling(3), float_type)
     normals = vectors(kernel(upload(float_type, surface.cage.positions))[1])
     scaled = vectors(kernel(upload(float_type, scale * surface.cage.positions))[1])
     np.testing.assert_allclose(scaled, normals, atol=50 * tolerance(float_type))
 
 
 def test_wrong_number_of_control_points_is_an_error(float_type):
-    kernel = WeightKernel(LimitSurface(named_cages.cube()).sampling(2), float_type)
+    kernel = VertexKernel(LimitSurface(named_cages.cube()).sampling(2), float_type)
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel(dr.zeros(float_type, 21))
 
@@ -206,7 +206,7 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     gc.freeze()
     table = surface.sampling(3)
     seen = [weakref.ref(found) for found in (table, table.vertex_stencils, table.vertex_stencils.patch, *table.classes)]
-    kernel = WeightKernel(table, float_type)
+    kernel = VertexKernel(table, float_type)
     del table
     gc.collect()
     gc.unfreeze()

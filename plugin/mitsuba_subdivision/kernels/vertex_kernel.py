@@ -1,0 +1,287 @@
+"""Vertices of a tessellation on any backend: coefficients of polynomials, and points and normals on these."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import numpy as np
+
+from ..mesh import ragged
+from ..patches.piece_table import PACKET, piece_packets
+from .array_types import NO_CONFLICTS, ArrayTypes
+from .coefficient_map import WeightRows, padded_rows
+from .control_values import WeightedValues
+from .polynomial import Monomials
+from .types import Float, FloatBuffer, Index, IndexBuffer, Vector3
+from .unit_normal import LEAST_EXTENT, TANGENT_ROUNDING, RoundingBound, UnitNormal
+
+if TYPE_CHECKING:
+    from ..tessellation import VertexPolynomials, VertexTable
+
+
+class VertexKernel:
+    """A tessellation on the device, evaluated whenever its control points move.
+
+    Points and tangents are linear in the control points: forward mode applies the same map, reverse mode its transpose.
+
+    Parameters
+    ----------
+    float_type : type
+        Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights have its precision.
+    """
+
+    def __init__(self, table: VertexTable, float_type: type) -> None:
+        self.vertex_count, self.control_count = table.vertex_count, table.control_count
+        self._types = types = ArrayTypes.of(float_type)
+        self.vector3 = types.vector3
+        self._refined_count, self._refinement = table.control_count, None
+        if table.refinement is not None:
+            self._refined_count = table.refinement.shape[0]
+            self._refinement = WeightedValues.shared(table.refinement, float_type)
+        controls, are_rounded = types.indices(table.controls), table.refinement is not None
+        self.parts = [_Part(types, each, controls, are_rounded) for each in table.polynomials]
+        self._weld_target = types.indices(table.weld_target) if table.copies.size else None
+
+    def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Evaluate every vertex of the tessellation.
+
+        Raises ValueError if the number of control points is not that of the table.
+
+        Parameters
+        ----------
+        control_points : flat Dr.Jit float array, (3 control_count)
+            x, y, z of each control point.
+
+        Returns
+        -------
+        positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
+            Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
+            Differentiable with respect to the control points, forward and backward.
+        """
+        found = self.evaluated(dr.detach(control_points))
+        if dr.grad_enabled(control_points):
+            return found.attached(control_points)
+        return self.welded(found.positions), found.normals
+
+    def evaluated(self, control_points: FloatBuffer) -> EvaluatedVertices:
+        """Evaluate every vertex, from detached control points.
+
+        Raises ValueError if the number of control points is not that of the table.
+        """
+        if dr.width(control_points) != 3 * self.control_count:
+            raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
+        coefficients, found = self.coefficients(control_points), self._vectors()
+        for part, own in zip(self.parts, coefficients, strict=True):
+            part.evaluate(own, found)
+        return EvaluatedVertices(self, coefficients, *found)
+
+    def changes(self, coefficients: list[FloatBuffer], control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Changes of points and normals, where control points change by those given; flat, detached."""
+        found = self._vectors()
+        for part, own, change in zip(self.parts, coefficients, self.coefficients(control_points), strict=True):
+            part.evaluate(own, found, change)
+        return found
+
+    def gradient(self, coefficients: list[FloatBuffer], positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
+        """Gradient by the control points, from those by points and normals; flat, detached."""
+        dr.eval(positions, normals)
+        sums: FloatBuffer = dr.zeros(self._types.float, PACKET * self._refined_count)
+        for part, own in zip(self.parts, coefficients, strict=True):
+            part.rows.add_transposed(part.transposed(own, positions, normals), sums)
+        found = self._types.unpadded(sums, self._refined_count)
+        return found if self._refinement is None else self._refinement.transposed(found)
+
+    def coefficients(self, control_points: FloatBuffer) -> list[FloatBuffer]:
+        """Coefficients of all polynomials, part by part."""
+        points = control_points if self._refinement is None else self._refinement.product(control_points)
+        padded = self._types.padded(points)
+        return [part.coefficients(padded) for part in self.parts]
+
+    def welded(self, positions: FloatBuffer) -> FloatBuffer:
+        """The positions, with both sides of a crease equal bit by bit; see `VertexTable.weld_target`."""
+        return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
+
+    def _vectors(self) -> tuple[FloatBuffer, FloatBuffer]:
+        return dr.empty(self._types.float, 3 * self.vertex_count), dr.empty(self._types.float, 3 * self.vertex_count)
+
+
+class _Part:
+    """Vertices on polynomials of the same monomials. A lane has a polynomial, and loops over its vertices."""
+
+    def __init__(self, types: ArrayTypes, part: VertexPolynomials, controls: IndexBuffer, are_rounded: bool) -> None:
+        self._types = types
+        self._powers = part.powers.tolist()
+        self._monomials, self._count = Monomials(self._powers), len(part.block)
+        first_row = ragged.starts(part.blocks[:, 2])
+        precision = dr.type_v(types.float)
+        self.rows = WeightRows(
+            types,
+            len(part.powers),
+            np.column_stack([part.blocks, first_row]),
+            padded_rows(part.weights, types.numpy_float),
+            controls,
+            part.block,
+            part.patch,
+            np.arange(self._count) * (piece_packets(len(part.powers)) + 1),
+            TANGENT_ROUNDING[precision] * part.tangent_weights,
+            LEAST_EXTENT[precision] if are_rounded else 0,
+        )
+        self._first_vertex, self._vertex, self._sample = map(
+            types.indices, (part.first_vertex, part.vertex, part.sample)
+        )
+        self._st = types.floats(part.st)
+
+    @property
+    def _size(self) -> int:
+        """Numbers of a polynomial."""
+        return PACKET * self.rows.packet_count
+
+    def coefficients(self, padded: FloatBuffer) -> FloatBuffer:
+        """Coefficients, from padded control points."""
+        found: FloatBuffer = dr.empty(self._types.float, self._size * self._count)
+        self.rows.write(padded, found)
+        return found
+
+    def evaluate(
+        self, coefficients: FloatBuffer, buffers: Sequence[FloatBuffer], change: FloatBuffer | None = None
+    ) -> None:
+        """Scatter points and normals, or how they change where coefficients do."""
+        numbers = self._numbers(coefficients)
+        changed, bound = None if change is None else self._numbers(change), self._bound(numbers)
+
+        def add(vertex: Index, s: Float, t: Float) -> tuple:
+            p, du, dv = self._values(numbers, s, t)
+            normal = UnitNormal(du, dv, bound)
+            vectors = p, normal.value
+            if changed is not None:
+                p, change_u, change_v = self._values(changed, s, t)
+                vectors = p, normal.forward(change_u, change_v)
+            for buffer, value in zip(buffers, vectors, strict=True):
+                dr.scatter(buffer, value, vertex, mode=NO_CONFLICTS)
+            return ()
+
+        self._loop((), add, "vertices")
+
+    def transposed(self, coefficients: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
+        """Gradients by the coefficients, from those by points and normals."""
+        types = self._types
+        numbers = self._numbers(coefficients)
+        bound = self._bound(numbers)
+
+        def add(vertex: Index, s: Float, t: Float, *sums: Vector3) -> tuple:
+            _, du, dv = self._values(numbers, s, t)
+            p, normal = (dr.gather(types.vector3, each, vertex) for each in (positions, normals))
+            by_u, by_v = UnitNormal(du, dv, bound).backward(normal)
+            added = []
+            for (a, b), total in zip(self._powers, sums, strict=True):
+                one, of_s, of_t = _monomial(a, b, s, t)
+                own = dr.fma(p, one, total)
+                own = own if of_s is None else dr.fma(by_u, of_s, own)
+                added.append(own if of_t is None else dr.fma(by_v, of_t, own))
+            return tuple(added)
+
+        zero: Vector3 = dr.zeros(types.vector3, self._count)
+        sums = self._loop(tuple(types.vector3(zero) for _ in self._powers), add, "vertex_gradients")
+        found: FloatBuffer = dr.empty(types.float, self._size * self._count)
+        lane: Index = dr.arange(types.index, self._count)
+        flat = [number for vector in sums for number in vector]
+        flat += [types.float(0)] * (self._size - len(flat))
+        for i in range(0, len(flat), PACKET):
+            packet = dr.fma(lane, self.rows.packet_count, i // PACKET)
+            dr.scatter(found, types.vector4(*flat[i : i + PACKET]), packet, mode=NO_CONFLICTS)
+        return found
+
+    def _numbers(self, coefficients: FloatBuffer) -> list[Float]:
+        lane: Index = dr.arange(self._types.index, self._count)
+        return self._types.row(coefficients, self._size, lane)
+
+    def _bound(self, numbers: list[Float]) -> RoundingBound:
+        one = self._types.float(1)
+        return RoundingBound(one, one, self._types.vector3(*numbers[-4:-1]))
+
+    def _values(self, numbers: list[Float], s: Float, t: Float) -> tuple[Vector3, Vector3, Vector3]:
+        """The point and the two tangents."""
+        count = 3 * len(self._powers)
+        found = [self._monomials.values(numbers[i:count:3], s, t) for i in range(3)]
+        point, du, dv = (self._types.vector3(*each) for each in zip(*found, strict=True))
+        return point, du, dv
+
+    def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
+        """Loop over the vertices of each lane's polynomial, of which the numbers and parameters are given."""
+        types = self._types
+        lane: Index = dr.arange(types.index, self._count)
+        first, last = (types.fetch(types.index, self._first_vertex, lane + i) for i in (0, 1))
+
+        def body(at: Index, *state) -> tuple:
+            vertex, sample = (types.fetch(types.index, each, at) for each in (self._vertex, self._sample))
+            s, t = types.fetch(types.vector2, self._st, sample)
+            return at + 1, *add(vertex, s, t, *state)
+
+        _, *found = dr.while_loop((first, *start), lambda at, *_: at < last, body, label=label)
+        return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedVertices:
+    """Vertices of a tessellation, with the coefficients that their derivatives by the control points need."""
+
+    kernel: VertexKernel
+    coefficients: list[FloatBuffer]  # Of each part
+    # flat Dr.Jit float arrays, (3 vertex_count): points and unit normals; detached
+    positions: FloatBuffer
+    normals: FloatBuffer
+
+    def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Positions and normals attached to control points, without evaluating them.
+
+        Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
+
+        Returns
+        -------
+        positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
+        """
+        positions, normals = dr.custom(_Evaluation, self, control_points)
+        return self.kernel.welded(positions), normals
+
+
+class _Evaluation(dr.CustomOp):
+    """Control points to points and normals: linear maps to coefficients, points and tangents, and these' normals."""
+
+    def eval(self, vertices, control_points):  # noqa: ARG002 - what derivatives are by
+        self.vertices = vertices
+        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
+        return type(vertices.positions)(vertices.positions), type(vertices.normals)(vertices.normals)
+
+    def forward(self):
+        vertices = self.vertices
+        self.set_grad_out(vertices.kernel.changes(vertices.coefficients, self.grad_in("control_points")))
+
+    def backward(self):
+        vertices = self.vertices
+        self.set_grad_in("control_points", vertices.kernel.gradient(vertices.coefficients, *self.grad_out()))
+
+    def name(self):
+        return "VertexKernel"
+
+
+def coordinates_expected(count: int, control_count: int) -> str:
+    """Message for ``count`` coordinates that do not fit ``control_count`` control points."""
+    return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"
+
+
+def _monomial(a: int, b: int, s: Float, t: Float) -> tuple[Float, Float | None, Float | None]:
+    """A monomial ``s^a t^b`` and its two derivatives; None for those that are zero."""
+    one = _power(s, a) * _power(t, b)
+    of_s = a * _power(s, a - 1) * _power(t, b) if a else None
+    of_t = b * _power(s, a) * _power(t, b - 1) if b else None
+    return one, of_s, of_t
+
+
+def _power(x: Float, exponent: int) -> Float:
+    found = 1.0
+    for _ in range(exponent):
+        found = found * x
+    return found
