@@ -9,9 +9,7 @@ import pytest
 from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
-from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.sample_weights import LocatedSamples
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark
@@ -312,17 +310,6 @@ def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng)
 def grid_of(scheme, rate=RATE):
     uv = np.stack(np.meshgrid(np.arange(rate + 1), np.arange(rate + 1)), axis=-1).reshape(-1, 2) / rate
     return uv[scheme.domain.inside(uv) >= 0]
-
-
-@pytest.mark.parametrize("method", ["uniform", "chaikin"])
-@pytest.mark.parametrize("name", BALLS)
-def test_an_element_has_no_more_pieces_than_samples(name, method):
-    for sharpness in (1.9, 5.9, 9.9):
-        surface = LimitSurface(sharp_ball(name, sharpness, 0.9, method), name)
-        element, uv = element_of(surface.scheme, surface.patches.classes[0].signature), grid_of(surface.scheme)
-        nought = np.zeros(len(uv), dtype=np.int64)
-        located = LocatedSamples(surface.scheme, [element], nought, uv, nought, merge=True)
-        assert sum(len(leaves.parts) for leaves in located.leaves) <= len(uv)
 
 
 class RolledFaces(CatmullClark):

@@ -47,14 +47,6 @@ def surface(request):
     return LimitSurface(named_cages.extraordinary({"valence 5": 5, "large valence": 12}[request.param], closed=False))
 
 
-@pytest.fixture(params=["together", "apart"], autouse=True)
-def kernels(request, monkeypatch):
-    """Classes of few patches share a kernel, or do not, and regular ones take that for products."""
-    if request.param == "apart":
-        monkeypatch.setattr("mitsuba_subdivision.kernels.apply_weights.FEW_SAMPLES", 0)
-    return request.param
-
-
 @pytest.mark.core
 def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     cube = named_cages.cube()
@@ -112,15 +104,11 @@ def launched(kernel, points):
         return [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
 
 
-def test_classes_share_kernels(surface, kernels, float_type):
+def test_classes_share_kernels(surface, float_type):
     table = surface.sampling(4)
-    # One packs the control points.
-    expected = 2
-    if kernels == "apart":
-        general = [stencils for stencils in table.classes if stencils.product is None]
-        sizes = {-(-stencils.controls.shape[1] // 4) for stencils in general}
-        expected = 1 + (len(general) < len(table.classes)) + len(sizes)
     kernel = VertexKernel(table, float_type)
+    # One packs the control points; one each for coefficients and vertices, on planes and on polynomials of the scheme.
+    expected = 1 + 2 * len(table.polynomials)
     assert len(launched(kernel, upload(float_type, surface.cage.positions))) == expected
 
 

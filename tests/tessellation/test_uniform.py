@@ -29,41 +29,29 @@ def samples_of(surface, element, corner, uv):
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 2, 3, 8])
-def test_runs_write_every_vertex_once(scheme, name, rate):
+def test_every_vertex_lies_on_one_polynomial(scheme, name, rate):
     table = surface_of(scheme, name).sampling(rate)
-    assert_runs_write_every_vertex_once(table)
+    assert_every_vertex_lies_on_one_polynomial(table)
     assert table.triangles.max() == table.vertex_count - 1
 
 
-def assert_runs_write_every_vertex_once(table):
-    written = []
-    for vertex_stencils in (table.vertex_stencils, table.vertex_stencils.along_patches()):
-        patch_count = np.array([len(stencils.controls) for stencils in table.classes])[vertex_stencils.class_of_kind][
-            vertex_stencils.kind
-        ]
-        assert vertex_stencils.patch.min() >= 0
-        assert (vertex_stencils.patch < patch_count).all()
-        for vertex, count in zip(
-            vertex_stencils.first_vertex, vertex_stencils.counts[vertex_stencils.kind], strict=True
-        ):
-            written.append(vertex + np.arange(count))
-        np.testing.assert_array_equal(np.sort(np.concatenate(written)), np.arange(table.vertex_count))
-        written.clear()
+def assert_every_vertex_lies_on_one_polynomial(table):
+    parts = table.polynomials
+    vertices = np.concatenate([part.vertex for part in parts])
+    np.testing.assert_array_equal(np.sort(vertices), np.arange(table.vertex_count))
+    for part in parts:
+        assert (part.patch < part.blocks[part.block, 1]).all()
+        assert (np.diff(part.first_vertex) > 0).all()
+        assert part.first_vertex[-1] == len(part.vertex) == len(part.sample)
 
 
 @EVERY_SURFACE
 @pytest.mark.parametrize("rate", [1, 5])
-def test_weights_sum_to_one_for_points_and_zero_for_tangents(scheme, name, rate):
-    table = surface_of(scheme, name).sampling(rate)
-    for number, stencils in enumerate(table.classes):
-        kinds = np.flatnonzero(table.vertex_stencils.class_of_kind == number)
-        sample_count = 1 + max(table.vertex_stencils.samples_of(kind).max() for kind in kinds.tolist())
-        assert stencils.weights.shape[0] == 3
-        assert stencils.weights.shape[1] >= sample_count
-        assert stencils.weights.shape[2] == stencils.controls.shape[1]
-        sums = stencils.weights.sum(axis=2)
-        np.testing.assert_allclose(sums[0], 1, rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=ROUNDING)
+def test_weights_sum_to_one_for_constants_and_to_zero_for_other_coefficients(scheme, name, rate):
+    for part in surface_of(scheme, name).sampling(rate).polynomials:
+        for weights in part.weights:
+            is_constant = (part.powers == 0).all(axis=1)
+            assert np.abs(weights.sum(axis=2) - is_constant).max() <= ROUNDING
 
 
 def test_vertices_of_the_cage_that_no_face_uses_have_none_in_the_tessellation():
@@ -222,14 +210,14 @@ def test_normals_are_numbers_where_float32_overflows(scheme, name):
     np.testing.assert_allclose(lengths[lengths > 0], 1, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("shared", [1, 10, 1 << 30])
-@pytest.mark.parametrize("weights", [1, 500, 1 << 20])
-def test_blocks_do_not_show(shared, weights, monkeypatch):
+@pytest.mark.parametrize("coefficients", [1, 1000])
+@pytest.mark.parametrize("weights", [1, 5000])
+def test_runs_do_not_show(weights, coefficients, monkeypatch):
     surface = surface_of("catmull_clark", "mixed torus")
     table = surface.sampling(3)
     expected = table.apply(surface.cage.positions)
-    for name, value in (("SHARED", shared), ("BLOCK_WEIGHTS", weights), ("BLOCK_SAMPLES", weights)):
-        monkeypatch.setattr(f"mitsuba_subdivision.tessellation.vertex_table.{name}", value)
+    for name, value in (("WEIGHTS_AT_ONCE", weights), ("COEFFICIENTS_AT_ONCE", coefficients)):
+        monkeypatch.setattr(f"mitsuba_subdivision.tessellation.vertex_polynomials.{name}", value)
     for found, one in zip(table.apply(surface.cage.positions), expected, strict=True):
         np.testing.assert_allclose(found, one, rtol=0, atol=ROUNDING)
 

@@ -125,7 +125,7 @@ class ArrayTypes:
 
     def unpadded(self, padded: FloatBuffer, count: int) -> FloatBuffer:
         """The first ``count`` of padded 3-vectors, flat."""
-        v: Vector4 = dr.gather(self.vector4, padded, dr.arange(self.index, count))
+        v: Vector3 = dr.gather(self.vector4, padded, dr.arange(self.index, count))
         return dr.ravel(self.vector3(v.x, v.y, v.z))
 
     def packet(self, padded: FloatBuffer, index: Index, active: Mask = True) -> Vector3:

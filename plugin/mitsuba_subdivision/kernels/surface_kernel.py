@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.shared import Content, LaterArray, Shared
-from .apply_weights import coordinates_expected
 from .array_types import ArrayTypes
 from .coefficient_map import CoefficientMap
 from .element_walk import ElementWalk, Location
@@ -22,6 +21,7 @@ from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .vectors import cross, over, rounding, unit
+from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplingCells
