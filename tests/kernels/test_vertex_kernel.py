@@ -193,9 +193,10 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     # The collector looks at what is new only.
     gc.freeze()
     table = surface.sampling(3)
-    seen = [weakref.ref(found) for found in (table, table.vertex_stencils, table.vertex_stencils.patch, *table.classes)]
+    kept = [table, *table.polynomials, *(part.patch for part in table.polynomials)]
+    seen = [weakref.ref(found) for found in kept]
     kernel = VertexKernel(table, float_type)
-    del table
+    del table, kept
     gc.collect()
     gc.unfreeze()
     assert [found() for found in seen] == [None] * len(seen)

@@ -10,7 +10,7 @@ From the ground up:
 - `tangent_frame` has tangents for the normal where the derivatives fail, `normals` the normals.
 - `irregular_patch` puts these together for a patch with one extraordinary point, `sample_weights` for samples in any
   parts of elements, and `element` has what they make: points, derivatives, curvature and limit stencils.
-- `polynomial_basis` and `bernstein` have regular patches as polynomials, `piece_tree` all pieces of an element for
-  kernels, `product_patch` regular patches whose weights are products, and `scheme_laws` the laws that the rules of
-  every scheme keep.
+- `polynomial_basis` and `bernstein` have regular patches as polynomials, `sampled_polynomials` those pieces of an
+  element that hold given samples, `piece_tree` all pieces, and `scheme_laws` the laws that the rules of every scheme
+  keep.
 """

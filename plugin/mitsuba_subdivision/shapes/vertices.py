@@ -29,8 +29,7 @@ class Vertices:
         Flat positions and unit normals of flat control points, both relative to the centre of the control points as
         they were loaded (`RecentredPoints`): arrays of Dr.Jit, or of NumPy.
     evaluate_tangents : callable, optional
-        The same with the tangents that derivatives by the control points need. Without it, there are no such
-        derivatives.
+        The same with what derivatives by the control points need. Without it, there are no such derivatives.
     copied : (n,) int, optional
         The vertex that `evaluate` returns for each vertex of the shape, where seams have several copies of one.
     displacement : DeviceDisplacement or HostDisplacement, optional
@@ -124,7 +123,7 @@ def require_control_points(control_points: FloatBuffer, count: int) -> None:
     Raises ValueError if there are more or fewer, or one is not a finite number.
     """
     if len(control_points) != 3 * count:
-        from ..kernels.apply_weights import coordinates_expected
+        from ..kernels.vertex_kernel import coordinates_expected
 
         raise ValueError(coordinates_expected(len(control_points), count))
     if is_recording():

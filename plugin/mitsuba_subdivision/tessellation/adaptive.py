@@ -76,11 +76,13 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     order, is_new = _by_sample(of_class, uv)
     different = order[is_new]
     counts = np.bincount(of_class[different], minlength=len(classes))
-    sample = np.empty_like(order)
+    sample = np.empty(len(order), dtype=np.int32)
     sample[order] = ragged.index_in_row(counts)[np.cumsum(is_new) - 1]
     own_uv = np.split(np.ascontiguousarray(uv[:, different].T), np.cumsum(counts)[:-1])
     used = np.flatnonzero(counts)
-    vertices = PatchVertices(np.searchsorted(used, of_class), patch, sample, np.arange(len(order)))
+    number = np.zeros(len(classes), dtype=np.int32)
+    number[used] = np.arange(len(used))
+    vertices = PatchVertices(number[of_class], patch, sample, np.arange(len(order), dtype=np.uint32))
     return vertex_polynomials(table.scheme, [classes[i] for i in used], [own_uv[i] for i in used], vertices)
 
 

@@ -22,16 +22,16 @@ from ..schemes.scheme import Scheme
 
 # Coefficients are computed for runs of patches with about so many weights, and vertices in runs of about so many
 # coefficients, whose arrays stay in a core's cache.
-WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 18, 1 << 18
+WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 17, 1 << 18
 
 
 class PatchVertices(NamedTuple):
     """Vertices of a tessellation as samples of patches, in any order."""
 
-    patch_class: IndexArray  # (n,) int: index of the class of each vertex's patch
-    patch: IndexArray  # (n,) int: the patch, counted from the first of the class
-    sample: IndexArray  # (n,) int: which of the class's samples it is
-    vertex: IndexArray  # (n,) int: its number
+    patch_class: IndexArray  # (n,) int32: index of the class of each vertex's patch
+    patch: IndexArray  # (n,) int32: the patch, counted from the first of the class
+    sample: IndexArray  # (n,) int32: which of the class's samples it is
+    vertex: NDArray[np.uint32]  # (n,) uint32: its number
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,7 @@ class VertexPolynomials:
 
         Coefficients are relative to a control point of each patch, and have the precision of ``dtype``.
         """
-        # Vertices come last: NumPy's loops are then long.
-        derivatives = np.ascontiguousarray(_monomials(self.powers, self.st)[:row_count].swapaxes(1, 2), dtype=dtype)
+        monomials = _monomials(self.powers, self.st)[:row_count].astype(dtype)
         first_block = 0
         for weights in self.weights:
             begin, end = np.searchsorted(self.block, [first_block, first_block + len(weights)]).tolist()
@@ -86,7 +85,7 @@ class VertexPolynomials:
                 for start in range(0, len(lane), run):
                     some = lane[start : start + run]
                     vertices = slice(int(ends[0]) + start, int(ends[0]) + start + len(some))
-                    factors = derivatives.take(self.sample[vertices], axis=2)
+                    factors = monomials.take(self.sample[vertices], axis=2)
                     values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(some, axis=2))
                     yield VertexSums(self.vertex[vertices], values, *(each[..., some] for each in of_lanes))
             first_block += len(weights)
@@ -128,7 +127,8 @@ def vertex_polynomials(
         sampled_polynomials(element_of(scheme, each.signature), own, known)
         for each, own in counted(list(zip(classes, uv, strict=True)), "Polynomials of patch classes")
     ]
-    sample = ragged.starts(np.array([len(own) for own in uv]))[vertices.patch_class] + vertices.sample
+    sample = ragged.starts(np.array([len(own) for own in uv])).astype(np.int32)[vertices.patch_class]
+    sample += vertices.sample
     counts = [len(own) for own in uv]
     forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), zip(*found, strict=True), strict=True)
     built = [_joined(powers, classes, parts, counts, vertices, sample) for powers, parts in forms]
@@ -163,19 +163,19 @@ def _joined(
     blocks = np.concatenate(
         [np.tile([classes[i].first_control, *classes[i].controls.shape], (len(parts[i].rows), 1)) for i in used]
     )
-    which = np.flatnonzero(block_of_sample[sample] >= 0)
-    sample = sample[which]
     patch_count = int(blocks[:, 1].max())
-    keys = block_of_sample[sample] * patch_count + vertices.patch[which]
+    block_of_vertex = block_of_sample[sample]
+    which = np.flatnonzero(block_of_vertex >= 0)
+    keys = block_of_vertex[which] * patch_count + vertices.patch[which]
     # Stable: this is fast where keys are sorted in large parts, as those of a uniform grid are.
     order = np.argsort(keys, kind="stable")
-    in_order = keys[order]
-    first = np.flatnonzero(np.diff(in_order, prepend=-1))
-    block, patch = np.divmod(in_order[first], patch_count)
+    keys, which = keys[order], which[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    block, patch = np.divmod(keys[first], patch_count)
     held = np.flatnonzero(block_of_sample >= 0)
     magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])[block_of_sample[held]]
     tangent_weights = np.zeros(len(blocks))
-    slopes = (np.abs(_monomials(powers, st[held])[1:]) * magnitude).sum(axis=2).max(axis=0)
+    slopes = (np.abs(_monomials(powers, st[held])[1:]) * magnitude.T).sum(axis=1).max(axis=0)
     np.maximum.at(tangent_weights, block_of_sample[held], slopes)
     return VertexPolynomials(
         powers,
@@ -185,15 +185,19 @@ def _joined(
         block.astype(np.int32),
         patch.astype(np.int32),
         np.append(first, len(keys)),
-        vertices.vertex[which[order]].astype(np.uint32),
-        sample[order].astype(np.int32),
+        vertices.vertex[which],
+        sample[which],
         st,
     )
 
 
 def _monomials(powers: IntArray, st: FloatArray) -> FloatArray:
-    """``(3, s, m)`` values of monomials and their two derivatives at ``(s, 2)`` parameters."""
-    (a, b), (s, t) = powers.T, st.T[:, :, None]
-    along_s, along_t = s**a, t**b
-    by_s, by_t = a * s ** np.maximum(a - 1, 0), b * t ** np.maximum(b - 1, 0)
-    return np.stack([along_s * along_t, by_s * along_t, along_s * by_t])
+    """``(3, m, s)`` values of monomials and their two derivatives at ``(s, 2)`` parameters.
+
+    Parameters come last: NumPy's loops are then long.
+    """
+    (a, b), (s, t) = powers.T, st.T
+    power_s, power_t = (np.vander(each, int(powers.max()) + 1, increasing=True).T for each in (s, t))
+    along_s, along_t = power_s[a], power_t[b]
+    # The factors of derivatives that vanish are zero, whatever the power.
+    return np.stack([along_s * along_t, a[:, None] * power_s[a - 1] * along_t, b[:, None] * along_s * power_t[b - 1]])
