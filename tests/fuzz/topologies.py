@@ -383,7 +383,6 @@ def tessellation_problem(surface):
     normals = [
         table.apply(surface.cage.positions)[1],
         surface._evaluate_from(start, uv, "stabilized", np.float64).n,
-        table.apply(surface.cage.positions, np.float32)[1],
     ]
     lengths = np.linalg.norm(normals, axis=2)
     if not ((lengths == 0) | (np.abs(lengths - 1) < SINGLE_LENGTH)).all():

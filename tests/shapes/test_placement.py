@@ -10,7 +10,6 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.llvm import llvm_problem
 
 SINGLE = 2e-6
 # Degrees between exact normals and those of float32 sums, wherever the shape is; 3e-5 are measured.
@@ -64,20 +63,11 @@ def placed(tessellation, transform):
     return tessellation.positions @ matrix[:3, :3].T + matrix[:3, 3], normals
 
 
-@pytest.fixture(params=["in memory", "with a kernel"])
-def scalar_kernels(request, monkeypatch):
-    """Scalar variants evaluate by NumPy, or by LLVM."""
-    if request.param == "with a kernel":
-        if llvm_problem():
-            pytest.skip(llvm_problem())
-        monkeypatch.setattr("mitsuba_subdivision.shapes.vertex_choice.WORTH_A_KERNEL", 0)
-
-
 # Far from the origin
 
 
 @pytest.mark.parametrize("how", ["to_world", "cage", "cage, and back"])
-@pytest.mark.usefixtures("variants_all_rgb", "scalar_kernels")
+@pytest.mark.usefixtures("variants_all_rgb")
 def test_a_far_place_costs_normals_nothing_and_points_no_more_than_a_ply_loses(tmp_path, how):
     cage = named_cages.extraordinary(5)
     tessellation = LimitSurface(cage).tessellate(RATE)
@@ -150,7 +140,7 @@ def test_derivatives_by_control_points_are_the_same_far_away(shading, mode):
 
 @pytest.mark.parametrize("name", ["far", "turned", "mirrored"])
 @pytest.mark.parametrize("cage", [named_cages.extraordinary(3), seamed()], ids=["smooth", "seamed"])
-@pytest.mark.usefixtures("variants_all_rgb", "scalar_kernels")
+@pytest.mark.usefixtures("variants_all_rgb")
 def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
     shape = make(cage)
     parameters = mi.traverse(shape)
@@ -175,7 +165,7 @@ def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
         np.testing.assert_array_equal(buffer(shape, each), buffer(make(cage), each))
 
 
-@pytest.mark.usefixtures("variants_all_rgb", "scalar_kernels")
+@pytest.mark.usefixtures("variants_all_rgb")
 def test_the_middle_of_a_far_cage_is_turned_with_it():
     cage = named_cages.cube()
     cage, transform = cage.with_positions(cage.positions + SHIFT), transformation("turned")

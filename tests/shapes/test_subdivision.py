@@ -9,7 +9,6 @@ import pytest
 from mitsuba_subdivision import LimitSurface, example_file
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.llvm import llvm_problem
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
 from reference.exact_samples import SCHEMES, angle, samples_at
 
@@ -55,23 +54,6 @@ def test_vertices_lie_on_the_limit_surface_with_its_normals():
     np.testing.assert_array_equal(buffer(shape, "faces"), expected.triangles)
     np.testing.assert_array_equal(buffer(shape, "face_element"), expected.element)
     assert shape.bbox().contains(mi.ScalarPoint3f(*map(float, expected.positions.mean(axis=0))))
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_scalar_variants_evaluate_large_meshes_with_the_kernel(monkeypatch):
-    if llvm_problem():
-        pytest.skip(llvm_problem())
-    cage = named_cages.extraordinary(5)
-    expected = make(cage)
-    monkeypatch.setattr("mitsuba_subdivision.shapes.vertex_choice.WORTH_A_KERNEL", 0)
-    shape = make(cage)
-    for moved in (0.0, 0.5):
-        for one in (expected, shape):
-            parameters = mi.traverse(one)
-            parameters["control_points"] = np.ravel(cage.positions * (1 + moved))
-            parameters.update()
-        for name in ("vertex_positions", "vertex_normals"):
-            np.testing.assert_allclose(buffer(shape, name), buffer(expected, name), atol=SINGLE)
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -173,7 +173,8 @@ class _Part:
 
         def add(vertex: Index, s: Float, t: Float, *sums: Vector3) -> tuple:
             _, du, dv = self._values(numbers, s, t)
-            p, normal = (dr.gather(types.vector3, each, vertex) for each in (positions, normals))
+            p: Vector3 = dr.gather(types.vector3, positions, vertex)
+            normal: Vector3 = dr.gather(types.vector3, normals, vertex)
             by_u, by_v = UnitNormal(du, dv, bound).backward(normal)
             added = []
             for (a, b), total in zip(self._powers, sums, strict=True):

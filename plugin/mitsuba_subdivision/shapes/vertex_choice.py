@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ..device_arrays import mapped
 from ..kernels.types import FloatBuffer
-from ..llvm import llvm_problem
 from ..mesh.shared import Shared
 from ..surface import LimitSurface
 from .vertices import Vertices, split_weld_targets
@@ -22,9 +21,6 @@ if TYPE_CHECKING:
     from ..tessellation import AttributeTable, VertexTable
     from .displacement import ShapeDisplacement
     from .parameters import Parameters
-
-# Above this many vertices, scalar variants evaluate them with LLVM: compiling a kernel may take a tenth of a second.
-WORTH_A_KERNEL = 300_000
 
 
 def vertices_of(
@@ -80,31 +76,26 @@ def vertices_of(
 def _evaluators(
     table: VertexTable, parameters: Parameters, float_type: type | None
 ) -> tuple[Callable[[FloatBuffer], tuple[FloatBuffer, FloatBuffer]], Callable[[FloatBuffer], EvaluatedVertices] | None]:
-    """What evaluates the tessellation's vertices, and, where there are derivatives, also their tangents."""
+    """What evaluates the tessellation's vertices, and, where there are derivatives, also what these need."""
     if parameters.evaluator != "stabilized" or parameters.sample_offset:
         return partial(_sampled, table, parameters, float_type), None
-    is_jit = float_type is not None
-    if not is_jit and (table.vertex_count <= WORTH_A_KERNEL or llvm_problem() is not None):
-        return partial(_weighted, table), None
+    if float_type is None:
+        return partial(_in_numpy, table), None
     from ..kernels import VertexKernel
 
-    kernel_type = float_type or dr.llvm.Float
-    kernel = _KERNELS.get((table, kernel_type), lambda: VertexKernel(table, kernel_type))
-    if not is_jit:
-        return lambda points: kernel(mapped(kernel_type, np.array(points))), None
-    return kernel, kernel.evaluated if dr.is_diff_v(kernel_type) else None
+    kernel = _KERNELS.get((table, float_type), lambda: VertexKernel(table, float_type))
+    return kernel, kernel.evaluated if dr.is_diff_v(float_type) else None
 
 
-def _weighted(table: VertexTable, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-    """Weights times control points, in NumPy."""
-    positions, normals = table.apply(_rows(points, table.control_count), np.float32)
-    return positions.ravel(), normals.ravel()
+def _in_numpy(table: VertexTable, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+    positions, normals = table.apply(_rows(points, table.control_count))
+    return positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel()
 
 
 def _sampled(
     table: VertexTable, parameters: Parameters, float_type: type | None, points: FloatBuffer
 ) -> tuple[FloatBuffer, FloatBuffer]:
-    """Vertices sample by sample in float32, by another evaluator than the weights, for comparison."""
+    """Vertices sample by sample in float32, by another evaluator, for comparison."""
     cage = parameters.surface.cage
     surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), parameters.surface.scheme)
     positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
@@ -123,5 +114,5 @@ def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
     return found.reshape(-1, 3)
 
 
-# Weights on the device, shared by shapes of one table.
+# Kernels, shared by shapes of one table.
 _KERNELS: Shared[VertexKernel] = Shared()

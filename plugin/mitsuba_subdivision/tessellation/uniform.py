@@ -96,21 +96,22 @@ def _polynomials(patches: PatchTable, grid: UniformGrid) -> tuple[VertexPolynomi
         for part in parts:
             count = len(part.samples)
             of_class = np.searchsorted(bounds, part.patches, side="right") - 1
-            patch = part.patches - bounds[of_class]
-            repeated = [np.repeat(each.astype(np.int32), count) for each in (len(classes) + of_class, patch)]
-            sample = np.tile(part.samples.astype(np.int32), len(patch))
-            found.append(PatchVertices(*repeated, sample, part.vertices.ravel().astype(np.uint32)))
+            patch = (part.patches - bounds[of_class]).astype(np.int32)
+            of_class = (len(classes) + of_class).astype(np.int32)
+            found.append(
+                PatchVertices(
+                    np.repeat(of_class, count),
+                    np.repeat(patch, count),
+                    np.tile(part.samples.astype(np.int32), len(patch)),
+                    part.vertices.ravel().astype(np.uint32),
+                )
+            )
         classes += own_classes
         uv += [samples] * len(own_classes)
     vertices = PatchVertices(*map(np.concatenate, zip(*found, strict=True)))
     # The largest arrays.
     del found
-    # At low rates, patches of other classes may have all samples of a class.
-    used = np.flatnonzero(np.bincount(vertices.patch_class))
-    number = np.zeros(len(classes), dtype=np.int32)
-    number[used] = np.arange(len(used))
-    vertices = vertices._replace(patch_class=number[vertices.patch_class])
-    return vertex_polynomials(patches.scheme, [classes[i] for i in used], [uv[i] for i in used], vertices)
+    return vertex_polynomials(patches.scheme, classes, uv, vertices)
 
 
 def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:

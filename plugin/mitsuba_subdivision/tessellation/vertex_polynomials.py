@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..evaluation.divided_element import element_of
 from ..evaluation.normals import LEAST_EXTENT, unit_normals
@@ -28,9 +28,9 @@ WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 17, 1 << 18
 class PatchVertices(NamedTuple):
     """Vertices of a tessellation as samples of patches, in any order."""
 
-    patch_class: IndexArray  # (n,) int32: index of the class of each vertex's patch
-    patch: IndexArray  # (n,) int32: the patch, counted from the first of the class
-    sample: IndexArray  # (n,) int32: which of the class's samples it is
+    patch_class: IntArray  # (n,): index of the class of each vertex's patch
+    patch: IntArray  # (n,): the patch, counted from the first of the class
+    sample: IntArray  # (n,): which of the class's samples it is
     vertex: NDArray[np.uint32]  # (n,) uint32: its number
 
 
@@ -57,14 +57,12 @@ class VertexPolynomials:
     sample: IndexArray  # (n,) int32: row of ``st`` of each vertex
     st: FloatArray  # (s, 2) float64: parameters from the middle of the domain
 
-    def sums(
-        self, controls: NDArray[np.uint32], points: FloatArray, dtype: DTypeLike, row_count: int = 3
-    ) -> Iterator[VertexSums]:
+    def sums(self, controls: NDArray[np.uint32], points: FloatArray, row_count: int = 3) -> Iterator[VertexSums]:
         """Points, or with three rows points and tangents, of all vertices, some at a time.
 
-        Coefficients are relative to a control point of each patch, and have the precision of ``dtype``.
+        Coefficients are relative to a control point of each patch.
         """
-        monomials = _monomials(self.powers, self.st)[:row_count].astype(dtype)
+        monomials = _monomials(self.powers, self.st)[:row_count]
         first_block = 0
         for weights in self.weights:
             begin, end = np.searchsorted(self.block, [first_block, first_block + len(weights)]).tolist()
@@ -73,12 +71,14 @@ class VertexPolynomials:
                 lanes = slice(first, min(first + step, end))
                 block = self.block[lanes]
                 first_control, patch_count, control_count = self.blocks[block].T
-                at = (first_control + self.patch[lanes])[:, None] + patch_count[:, None] * np.arange(control_count[0])
+                at = first_control + self.patch[lanes] + patch_count * np.arange(control_count[0])[:, None]
                 own = points[controls[at]]
-                origin = own[:, 0].copy()
-                relative = (own - origin[:, None]).astype(dtype)
-                coefficients = (weights[block - first_block].astype(dtype) @ relative).transpose(1, 2, 0)
-                of_lanes = origin.T, np.abs(relative).max(axis=1).T, self.tangent_weights[block]
+                origin = own[0]
+                relative = own - origin
+                extent = np.abs(relative).max(axis=0)
+                relative = np.ascontiguousarray(relative.swapaxes(0, 1))
+                coefficients = (weights[block - first_block] @ relative).transpose(1, 2, 0)
+                of_lanes = origin.T, extent.T, self.tangent_weights[block]
                 ends = self.first_vertex[lanes.start : lanes.stop + 1]
                 lane = np.repeat(np.arange(len(block)), np.diff(ends))
                 run = max(1, COEFFICIENTS_AT_ONCE // coefficients[:, :, 0].size)
@@ -94,10 +94,10 @@ class VertexPolynomials:
 class VertexSums(NamedTuple):
     """Some vertices."""
 
-    vertex: IndexArray  # (n,)
-    values: NDArray  # (d, k, n): relative to ``origin``
+    vertex: NDArray[np.uint32]  # (n,)
+    values: FloatArray  # (d, k, n) float64: relative to ``origin``
     origin: FloatArray  # (k, n) float64: a control point of the patch
-    extent: NDArray  # (k, n): how far the others are from it along each axis
+    extent: FloatArray  # (k, n) float64: how far the others are from it along each axis
     tangent_weights: FloatArray  # (n,): see `VertexPolynomials`
 
     @property
@@ -105,13 +105,13 @@ class VertexSums(NamedTuple):
         """``(n, k)`` float64."""
         return (self.values[0] + self.origin).T
 
-    def normals(self, *, are_rounded: bool) -> NDArray:
+    def normals(self, *, are_rounded: bool) -> FloatArray:
         """``(n, 3)`` unit normals; zero where the surface has none."""
         extent = self.extent
         if are_rounded:
             # Refined control points are rounded before they are seen from the origin.
             extent = np.maximum(extent, LEAST_EXTENT[64] * np.abs(self.origin))
-        bound = np.broadcast_to(self.tangent_weights.astype(self.values.dtype), (2, len(self.vertex)))
+        bound = np.broadcast_to(self.tangent_weights, (2, len(self.vertex)))
         return unit_normals(self.values[1:3], bound, extent).T
 
 
@@ -122,6 +122,12 @@ def vertex_polynomials(
 
     ``uv`` are the samples ``(s, 2)`` of each class.
     """
+    # At low rates, patches of other classes may have all samples of a class.
+    used = np.flatnonzero(np.bincount(vertices.patch_class)).tolist()
+    number = np.zeros(len(classes), dtype=np.int32)
+    number[used] = np.arange(len(used))
+    classes, uv = [classes[index] for index in used], [uv[index] for index in used]
+    vertices = vertices._replace(patch_class=number[vertices.patch_class])
     known: Known = {}
     found = [
         sampled_polynomials(element_of(scheme, each.signature), own, known)
@@ -186,7 +192,7 @@ def _joined(
         patch.astype(np.int32),
         np.append(first, len(keys)),
         vertices.vertex[which],
-        sample[which],
+        sample[which].astype(np.int32),
         st,
     )
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
@@ -70,24 +70,22 @@ class VertexTable:
         """Points that `controls` are indices of, ``(n, k)``, from ``(control_count, k)`` of the cage."""
         return control_points if self.refinement is None else self.refinement @ control_points
 
-    def apply(self, control_points: FloatArray, dtype: DTypeLike = np.float64) -> tuple[NDArray, NDArray]:
+    def apply(self, control_points: FloatArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Evaluate every vertex.
 
         Parameters
         ----------
         control_points : (control_count, 3) float64
-        dtype : float64 or float32
-            Of the sums, which are relative to a control point of each patch, and of the result.
 
         Returns
         -------
-        positions, normals : (vertex_count, 3)
+        positions, normals : (vertex_count, 3) float64
             Normals are zero where the surface has none, see `SurfaceSamples`.
         """
-        positions, normals = (np.empty((self.vertex_count, 3), dtype=dtype) for _ in range(2))
+        positions, normals = (np.empty((self.vertex_count, 3)) for _ in range(2))
         points, are_rounded = self.refined(control_points), self.refinement is not None
         for part in self.polynomials:
-            for found in part.sums(self.controls, points, dtype):
+            for found in part.sums(self.controls, points):
                 positions[found.vertex] = found.points
                 normals[found.vertex] = found.normals(are_rounded=are_rounded)
         positions[self.copies[0]] = positions[self.copies[1]]
@@ -97,7 +95,7 @@ class VertexTable:
         """``(vertex_count, k)`` points of the surface that ``(control_count, k)`` values make, also of copies."""
         found, points = np.empty((self.vertex_count, values.shape[1])), self.refined(values)
         for part in self.polynomials:
-            for some in part.sums(self.controls, points, np.float64, 1):
+            for some in part.sums(self.controls, points, 1):
                 found[some.vertex] = some.points
         return found
 
