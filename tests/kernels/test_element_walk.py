@@ -59,9 +59,9 @@ def every_side(surface, rng):
     for side in range(domain.corner_count):
         edge = every
         for _ in range(side):
-            edge = t.following(edge)
+            edge = t.next[edge]
         # A polygon's corner has half of each of its two edges, and other corners beyond its other sides.
-        own = np.where(side == 0, every, t.preceding(every))
+        own = np.where(side == 0, every, t.prev[every])
         has_neighbour = np.where(is_whole, t.twin[edge], np.where(side in (0, 3), t.twin[own], 0)) >= 0
         # Away from the middle, where polygons' corners meet.
         along = rng.uniform(0.05, 0.45, t.half_edge_count) + 0.5 * rng.integers(0, 2, t.half_edge_count)

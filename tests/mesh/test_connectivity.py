@@ -40,7 +40,7 @@ def test_neighbours_are_those_of_the_tables(any_cage, as_arrays):
 def test_walks_go_on_from_where_they_arrived():
     for t in (torus(5, 4).topology, mesh_of(4, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])):
         assert t.turn_back(t.turn_back(t.turn(t.turn(0)))) == 0
-        assert t.preceding(t.preceding(t.following(t.following(0)))) == 0
+        assert t.prev[t.prev[t.next[t.next[0]]]] == 0
 
 
 def test_vertices_of_any_integer_type_are_the_same_cage():

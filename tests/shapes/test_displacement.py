@@ -657,8 +657,8 @@ def test_normals_at_extraordinary_vertices_go_with_those_around_them(valence):
     t = truth.surface.patches.elements
     turns = [corner[at]]
     for _ in range(valence - 1):
-        turns.append(t.twin[t.preceding(turns[-1])])
-    of_valence = (t.twin[t.preceding(turns[-1])] == turns[0]) & np.all([turn != turns[0] for turn in turns[1:]], axis=0)
+        turns.append(t.twin[t.prev[turns[-1]]])
+    of_valence = (t.twin[t.prev[turns[-1]]] == turns[0]) & np.all([turn != turns[0] for turn in turns[1:]], axis=0)
     around = sum(truth.normals(turn[of_valence], np.full((of_valence.sum(), 2), BESIDE)) for turn in turns)
     around /= np.linalg.norm(around, axis=1, keepdims=True)
     assert of_valence.any()

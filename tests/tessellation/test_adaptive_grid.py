@@ -193,10 +193,10 @@ def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(see
     frames, t = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex), surface.patches.elements
     connections, of_face = defaultdict(set), defaultdict(set)
     for half_edge, face in enumerate(t.face_of(np.arange(t.half_edge_count))):
-        following = t.following(half_edge)
+        following = t.next[half_edge]
         ways = [(("edge", t.edge[half_edge]), following)]
         if t.face_sizes[face] == 4:
-            opposite = t.following(following)
+            opposite = t.next[following]
             ways.append((("diagonal", min(half_edge, opposite)), opposite))
         for way, end in ways:
             ends = frozenset(t.face_vertices[[half_edge, end]])

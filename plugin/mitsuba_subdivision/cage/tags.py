@@ -145,7 +145,7 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
         return np.zeros(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
-    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.following(half_edges)]
+    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
     keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
     # Of several edges between the same vertices, the first is taken.
     order = np.argsort(keys, kind="stable")

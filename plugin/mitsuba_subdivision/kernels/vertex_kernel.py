@@ -61,10 +61,7 @@ class VertexKernel:
             Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
             Differentiable with respect to the control points, forward and backward.
         """
-        found = self.evaluated(dr.detach(control_points))
-        if dr.grad_enabled(control_points):
-            return found.attached(control_points)
-        return self.welded(found.positions), found.normals
+        return self.evaluated(dr.detach(control_points)).attached(control_points)
 
     def evaluated(self, control_points: FloatBuffer) -> EvaluatedVertices:
         """Evaluate every vertex, from detached control points.
@@ -236,7 +233,7 @@ class EvaluatedVertices:
     normals: FloatBuffer
 
     def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Positions and normals attached to control points, without evaluating them.
+        """Positions and normals attached to control points if these have derivatives, without evaluating them.
 
         Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
 
@@ -244,7 +241,9 @@ class EvaluatedVertices:
         -------
         positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
         """
-        positions, normals = dr.custom(_Evaluation, self, control_points)
+        positions, normals = self.positions, self.normals
+        if dr.grad_enabled(control_points):
+            positions, normals = dr.custom(_Evaluation, self, control_points)
         return self.kernel.welded(positions), normals
 
 

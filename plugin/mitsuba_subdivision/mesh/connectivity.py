@@ -174,12 +174,12 @@ class Topology:
         """``(n_v,)`` half-edge on the border that ends at each border vertex; -1 inside."""
         end = np.full(self.vertex_count, -1, dtype=np.int32)
         open_edges = np.flatnonzero(self.twin < 0)
-        end[self.face_vertices[self.following(open_edges)]] = open_edges
+        end[self.face_vertices[self.next[open_edges]]] = open_edges
         return end
 
     def border_neighbours(self, vertices: IntArray) -> tuple[IndexArray, IndexArray]:
         """Neighbours along the border of vertices there: beside the most clockwise face, and beside the last one."""
-        first = self.following(self.open_fan_start[vertices])
+        first = self.next[self.open_fan_start[vertices]]
         return self.face_vertices[first], self.face_vertices[self.open_fan_end[vertices]]
 
     @cached_property
@@ -202,7 +202,7 @@ class Topology:
         found = np.zeros(self.vertex_count, dtype=bool)
         half_edges = np.flatnonzero(is_chosen)
         found[self.face_vertices[half_edges]] = True
-        found[self.face_vertices[self.following(half_edges)]] = True
+        found[self.face_vertices[self.next[half_edges]]] = True
         return found
 
     @cached_property
@@ -251,22 +251,6 @@ class Topology:
         """`face` of some half-edges."""
         return half_edges // self.common_size if self.common_size else self.face[half_edges]
 
-    @overload
-    def following(self, half_edges: np.integer | int) -> np.integer | int: ...
-    @overload
-    def following(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
-    def following(self, half_edges: HalfEdges) -> HalfEdges:
-        """`next` of some half-edges."""
-        return self.next[half_edges]
-
-    @overload
-    def preceding(self, half_edges: np.integer | int) -> np.integer | int: ...
-    @overload
-    def preceding(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
-    def preceding(self, half_edges: HalfEdges) -> HalfEdges:
-        """`prev` of some half-edges."""
-        return self.prev[half_edges]
-
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
         return self._turned[half_edge]
@@ -280,7 +264,7 @@ class Topology:
         """Outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
         beyond = self.twin[half_edge]
         # Indexing by () turns the zero-dimensional result for one half-edge into a number.
-        return np.where(beyond < 0, -1, self.following(beyond))[()]
+        return np.where(beyond < 0, -1, self.next[beyond])[()]
 
 
 def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:

@@ -116,7 +116,7 @@ def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDAr
     current, number = copied, t.vertex_count + np.arange(len(copied))
     while len(current):
         face_vertices[current] = number
-        continues = ~is_border[t.preceding(current)]
+        continues = ~is_border[t.prev[current]]
         current, number = t.turn(current[continues]).astype(np.int64), number[continues]
         is_new = face_vertices[current] != number
         current, number = current[is_new], number[is_new]

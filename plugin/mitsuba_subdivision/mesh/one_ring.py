@@ -124,13 +124,13 @@ class OneRing:
                         current = walk(current)
                     if (corner, step * turned) in wanted:
                         arrived[wanted[corner, step * turned]] = current
-            start = topology.following(start)
+            start = topology.next[start]
         for slots in _slots_by_face(self.slots):
             current = arrived[self.slots[slots[0]][0]]
             steps = 0
             for slot in slots:
                 while steps < self.slots[slot][1]:
-                    current = topology.following(current)
+                    current = topology.next[current]
                     steps += 1
                 topology.face_vertices.take(current, out=columns[slot], mode="clip")
 

@@ -20,7 +20,7 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
     inside = np.flatnonzero(t.twin >= 0)
     twin = t.twin[inside]
     found = np.zeros(t.half_edge_count, dtype=bool)
-    found[inside] = (indices[inside] != indices[t.following(twin)]) | (indices[t.following(inside)] != indices[twin])
+    found[inside] = (indices[inside] != indices[t.next[twin]]) | (indices[t.next[inside]] != indices[twin])
     return found
 
 
@@ -126,7 +126,7 @@ def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -
         return found
 
     sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
-    start, end = sides, t.following(sides)
+    start, end = sides, t.next[sides]
     # The ends of an edge: first the one with the lower vertex, then the other one.
     is_down = t.face_vertices[start] > t.face_vertices[end]
     edge_end = 2 * non_manifold.edge[sides].astype(np.int64)

@@ -54,7 +54,7 @@ class Sharpness:
         """Rows (vertex, vertex, sharpness), one for each sharp edge."""
         t = topology
         sharp = t.edge_half_edge[self.edges[t.edge_half_edge] > 0]
-        return np.stack([t.face_vertices[sharp], t.face_vertices[t.following(sharp)], self.edges[sharp]], axis=1)
+        return np.stack([t.face_vertices[sharp], t.face_vertices[t.next[sharp]], self.edges[sharp]], axis=1)
 
     def corners(self) -> FloatArray:
         """Rows (vertex, sharpness), one for each sharp vertex."""

@@ -183,7 +183,7 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
     """Half-edges of the fan at each corner of the element that a half-edge names."""
     corners = [half_edge]
     if kind == "face":
-        while (corner := int(topology.following(corners[-1]))) != half_edge:
+        while (corner := int(topology.next[corners[-1]])) != half_edge:
             corners.append(corner)
     return [_fan_half_edges(topology, corner) for corner in corners]
 

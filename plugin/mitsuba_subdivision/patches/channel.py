@@ -202,9 +202,9 @@ class LinearChannel(_OfLayout):
         t, corner_count = self.patches.topology, self.patches.scheme.domain.corner_count
         corners = [self.patches.half_edge_of_corner[half_edge]]
         for _ in range(corner_count - 2):
-            corners.append(t.following(corners[-1]))
+            corners.append(t.next[corners[-1]])
         face = t.face_of(corners[0])
-        return [*corners, t.preceding(corners[0])], face, t.face_sizes[face] != corner_count
+        return [*corners, t.prev[corners[0]]], face, t.face_sizes[face] != corner_count
 
     @property
     def with_centres(self) -> sparse.csr_array:

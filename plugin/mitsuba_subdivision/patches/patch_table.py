@@ -79,7 +79,7 @@ class PatchTable:
             return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
         offsets, half_edges = t.vertex_fans
         # A dual edge crosses the cage's edge that two successive faces about a vertex share.
-        return Topology(t.face_count, np.diff(offsets), t.face_of(half_edges), t.edge[t.preceding(half_edges)])
+        return Topology(t.face_count, np.diff(offsets), t.face_of(half_edges), t.edge[t.prev[half_edges]])
 
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:
@@ -225,7 +225,7 @@ class PatchTable:
             whole = self.is_whole[t.face_of(corners[0])]
             for turn in range(self.scheme.domain.corner_count if whole else 1):
                 class_index[corners], patch[corners], patch_corner[corners] = index, np.arange(len(corners)), turn
-                corners = t.following(corners)
+                corners = t.next[corners]
         return class_index, patch, patch_corner
 
     @cached_property
@@ -265,7 +265,7 @@ class PatchTable:
         columns = []
         for _ in range(corner_count):
             columns.append(fans[corners])
-            corners = self.elements.following(corners)
+            corners = self.elements.next[corners]
         return columns
 
     def _turned_to_least(self, fans: IntArray, corners: IndexArray) -> tuple[IndexArray, IntArray]:

@@ -170,7 +170,7 @@ class PieceTable:
         is_whole = patches.is_whole[face]
         found = np.empty((len(every), 4), dtype=np.uint32)
         found[:, TWIN] = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
-        found[:, FOLLOWING], found[:, PRECEDING] = t.following(every), t.preceding(every)
+        found[:, FOLLOWING], found[:, PRECEDING] = t.next[every], t.prev[every]
         corner = np.where(is_whole, every - t.face_offsets[face], 0)
         patch = first_patch[class_index] + patch
         found[:, CODE] = PATCH * patch + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner

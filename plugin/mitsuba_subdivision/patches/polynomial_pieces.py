@@ -351,7 +351,7 @@ def _seen(
         turn = int(np.argmin(extents))
         domain = shape.rotation(turn).inverse() @ domain
         for _ in range(turn):
-            half_edge = patches.elements.following(half_edge)
+            half_edge = patches.elements.next[half_edge]
     return half_edge.astype(np.int64), scale[:, None, None] * domain.matrix, scale[:, None] * domain.offset
 
 

@@ -169,6 +169,6 @@ def _in_refined(
         at = whole[number == corner]
         uv[at] = domain.rotation(corner).inverse()(in_child.T[number == corner])
         later = whole[number > corner]
-        half_edge[later] = t.following(half_edge[later])
+        half_edge[later] = t.next[half_edge[later]]
     # Face h of the refined cage lies at half-edge h of the cage, and begins there.
     return refined.table.topology.face_offsets[half_edge], uv

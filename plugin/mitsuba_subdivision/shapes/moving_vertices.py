@@ -55,8 +55,6 @@ class MovingVertices:
         self._shading, self._displacement = shading, displacement
         self.are_differentiable = vertices.are_differentiable
         self._computed: set[int] = set()
-        # In object space, where something has derivatives.
-        self._found: tuple[FloatBuffer, FloatBuffer] | None = None
 
     def evaluated(
         self, control_points: FloatBuffer, placement: Placement, on_backward: Callable, *, moves_points: bool
@@ -81,13 +79,8 @@ class MovingVertices:
             kernel.attach(points)
         sources = (control_points, placement.matrix, *self._others())
         moves = self.are_differentiable and dr.grad_enabled(*sources)
-        # Free the last evaluation before the next one allocates memory.
-        self._found = None
         self._computed = computed_ones(*sources) if moves else set()
-        found = self._vertices(points)
-        if moves:
-            self._found = dr.detach(found[0]), dr.detach(found[1])
-        return self._placed(*found, placement, on_backward)
+        return self._placed(*self._vertices(points, keep=moves), placement, on_backward)
 
     def attached(
         self, control_points: FloatBuffer, placement: Placement, on_backward: Callable
@@ -96,10 +89,7 @@ class MovingVertices:
         points = self._points(control_points)
         if self._kernel is not None and dr.grad_enabled(points):
             self._kernel.attach(points)
-        found = self._found
-        if found is None or dr.grad_enabled(points, *self._others()):
-            found = self._vertices.attached(points)
-        return self._placed(*found, placement, on_backward)
+        return self._placed(*self._vertices.attached(points), placement, on_backward)
 
     def warn_of_lost(
         self, gradients: dict[str, FloatBuffer | Matrix4], control_points: FloatBuffer, placement: Placement

@@ -25,8 +25,7 @@ from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .triangles import Triangles
-from .vertex_choice import vertices_of
-from .vertices import require_control_points
+from .vertices import require_control_points, vertices_of
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement

@@ -3,90 +3,90 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import take_over
+from ..device_arrays import mapped, take_over
 from ..kernels.types import FloatBuffer, IndexBuffer
 from ..mesh.connectivity import IntArray
+from ..mesh.shared import Shared
+from ..surface import LimitSurface
 from .device_state import is_recording
 
 if TYPE_CHECKING:
-    from ..kernels import EvaluatedVertices
+    from ..kernels import EvaluatedVertices, VertexKernel
     from ..tessellation import AttributeTable, VertexTable
     from .displaced_vertices import DeviceDisplacement, HostDisplacement
+    from .displacement import ShapeDisplacement
+    from .parameters import Parameters
+
+
+class ConstantVertices(NamedTuple):
+    """Vertices without derivatives by the control points, with the interface of `EvaluatedVertices`."""
+
+    positions: FloatBuffer
+    normals: FloatBuffer
+
+    def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:  # noqa: ARG002
+        """The vertices."""
+        return self.positions, self.normals
+
+
+# From flat control points without derivatives, relative to the centre of those that were loaded (`RecentredPoints`).
+Evaluate = Callable[[FloatBuffer], "EvaluatedVertices | ConstantVertices"]
 
 
 class Vertices:
     """Evaluates the vertices of a tessellation, copies them along the seams of attributes, and displaces them.
 
+    Arrays are those of Dr.Jit, or of NumPy in scalar variants.
+
     Parameters
     ----------
-    evaluate : callable
-        Flat positions and unit normals of flat control points, both relative to the centre of the control points as
-        they were loaded (`RecentredPoints`): arrays of Dr.Jit, or of NumPy.
-    evaluate_tangents : callable, optional
-        The same with what derivatives by the control points need. Without it, there are no such derivatives.
+    are_differentiable : bool
+        Whether vertices have derivatives.
     copied : (n,) int, optional
-        The vertex that `evaluate` returns for each vertex of the shape, where seams have several copies of one.
+        The vertex that ``evaluate`` returns for each vertex of the shape, where seams have several copies of one.
     displacement : DeviceDisplacement or HostDisplacement, optional
         Of the copied vertices.
     kept : (m,) int, optional
         Displaced vertices that the shape has. Exact shading needs one copy of each.
     float_type : type, optional
         Flat Dr.Jit array of JIT variants.
-
-    Attributes
-    ----------
-    are_differentiable : bool
-        Whether they have derivatives.
     """
 
     def __init__(
         self,
-        evaluate: Callable[[FloatBuffer], tuple[FloatBuffer, FloatBuffer]],
-        evaluate_tangents: Callable[[FloatBuffer], EvaluatedVertices] | None = None,
+        evaluate: Evaluate,
+        are_differentiable: bool,
         *,
         copied: IntArray | None = None,
         displacement: DeviceDisplacement | HostDisplacement | None = None,
         kept: IntArray | None = None,
         float_type: type | None = None,
     ) -> None:
-        self._evaluate, self._evaluate_tangents = evaluate, evaluate_tangents
-        self._copies, self._displacement, self._kept = (
-            _Selection(copied, float_type),
-            displacement,
-            _Selection(kept, float_type),
-        )
-        self.are_differentiable = evaluate_tangents is not None
-        if displacement is not None:
-            self.are_differentiable = displacement.is_differentiable
-        self._evaluated: EvaluatedVertices | None = None
-        # Undisplaced, detached.
-        self._found: tuple[FloatBuffer, FloatBuffer] | None = None
+        self._evaluate, self._displacement, self.are_differentiable = evaluate, displacement, are_differentiable
+        self._copies, self._kept = _Selection(copied, float_type), _Selection(kept, float_type)
+        self._evaluated: EvaluatedVertices | ConstantVertices | None = None
 
-    def __call__(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Positions and normals, flat."""
+    def __call__(self, points: FloatBuffer, *, keep: bool) -> tuple[FloatBuffer, FloatBuffer]:
+        """Evaluate flat positions and normals, and maybe keep what `attached` needs."""
         # Free the last evaluation before the next one allocates memory.
-        self._evaluated = self._found = None
-        if self._evaluate_tangents is not None and dr.grad_enabled(points):
-            self._evaluated = self._evaluate_tangents(dr.detach(points))
-            return self.attached(points)
-        found = self._evaluate(points)
-        if self._displacement is not None:
-            self._found = dr.detach(found[0]), dr.detach(found[1])
-        return self._displaced(*found, points)
+        self._evaluated = None
+        evaluated = self._evaluate(dr.detach(points))
+        # Heights may get derivatives later.
+        self._evaluated = evaluated if keep or self._displacement is not None else None
+        return self._displaced(*evaluated.attached(points), points)
 
     def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """The vertices of the last call, attached to the control points and the displacement again."""
-        if self._evaluated is not None:
-            return self._displaced(*self._evaluated.attached(points), points)
-        if self._found is None or (self._evaluate_tangents is not None and dr.grad_enabled(points)):
-            raise RuntimeError("vertices were not evaluated with derivatives; expected a call with some before")
-        return self._displaced(*self._found, points)
+        if self._evaluated is None:
+            raise RuntimeError("vertices were not kept; expected a call that keeps them before")
+        return self._displaced(*self._evaluated.attached(points), points)
 
     def _displaced(
         self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer
@@ -115,6 +115,99 @@ class _Selection:
         if isinstance(self._index, np.ndarray):
             return np.reshape(flat, (-1, 3))[self._index].ravel()
         return self._types.gathered(flat, self._index)
+
+
+def vertices_of(
+    table: VertexTable,
+    attributes: AttributeTable,
+    parameters: Parameters,
+    displacement: ShapeDisplacement | None,
+    float_type: type | None,
+    *,
+    is_exact: bool,
+) -> Vertices:
+    """Choose the evaluator of the shape's vertices.
+
+    Parameters
+    ----------
+    float_type : type or None
+        Flat Dr.Jit array of a JIT variant; None in scalar variants.
+    is_exact : bool
+        Whether shading is exact.
+    """
+    split = attributes
+    if displacement is not None:
+        # Copies along seams: their displacements differ, and are averaged.
+        split = parameters.surface.attribute_table(table)
+    evaluate, is_differentiable = _evaluator(table, parameters, float_type)
+    if displacement is None:
+        return Vertices(evaluate, is_differentiable, copied=split.surface_vertex, float_type=float_type)
+    from .displaced_vertices import DeviceDisplacement, HostDisplacement, VertexLocations
+
+    found = split_weld_targets(table, split)
+    weld_target = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
+    locations = VertexLocations(*(split.locate or table.locations)(), weld_target)
+    slopes = locations.follow_slopes(parameters.surface, displacement.channel)
+    has_normals = not (is_exact or parameters.face_normals)
+    displaced: DeviceDisplacement | HostDisplacement
+    if displacement.kernel is not None and float_type is not None:
+        displaced = DeviceDisplacement(locations, slopes, displacement.kernel, float_type, has_normals=has_normals)
+    else:
+        displaced = HostDisplacement(locations, slopes, parameters.surface, displacement, has_normals=has_normals)
+    kept = None
+    if attributes.surface_vertex is None and split.surface_vertex is not None:
+        _, kept = np.unique(split.surface_vertex, return_index=True)
+    return Vertices(
+        evaluate,
+        displaced.is_differentiable,
+        copied=split.surface_vertex,
+        displacement=displaced,
+        kept=kept,
+        float_type=float_type,
+    )
+
+
+def _evaluator(table: VertexTable, parameters: Parameters, float_type: type | None) -> tuple[Evaluate, bool]:
+    """What evaluates the tessellation's vertices, and whether with derivatives."""
+    if parameters.evaluator != "stabilized" or parameters.sample_offset:
+        return partial(_sampled, table, parameters, float_type), False
+    if float_type is None:
+        return partial(_in_numpy, table), False
+    from ..kernels import VertexKernel
+
+    kernel = _KERNELS.get((table, float_type), lambda: VertexKernel(table, float_type))
+    return kernel.evaluated, dr.is_diff_v(float_type)
+
+
+def _in_numpy(table: VertexTable, points: FloatBuffer) -> ConstantVertices:
+    positions, normals = table.apply(_rows(points, table.control_count))
+    return ConstantVertices(positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel())
+
+
+def _sampled(
+    table: VertexTable, parameters: Parameters, float_type: type | None, points: FloatBuffer
+) -> ConstantVertices:
+    """Vertices sample by sample in float32, by another evaluator, for comparison."""
+    cage = parameters.surface.cage
+    surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), parameters.surface.scheme)
+    positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
+    # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
+    found = positions.ravel(), np.nan_to_num(normals).ravel()
+    return ConstantVertices(*(found if float_type is None else (mapped(float_type, each) for each in found)))
+
+
+def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
+    """Flat control points as ``(count, 3)``. Raises ValueError if their number is not `count`."""
+    found = np.array(points, dtype=np.float64)
+    if found.size != 3 * count:
+        from ..kernels.vertex_kernel import coordinates_expected
+
+        raise ValueError(coordinates_expected(found.size, count))
+    return found.reshape(-1, 3)
+
+
+# Kernels, shared by shapes of one table.
+_KERNELS: Shared[VertexKernel] = Shared()
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:

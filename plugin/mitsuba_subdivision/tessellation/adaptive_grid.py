@@ -213,7 +213,7 @@ class AdaptiveGrid:
         turn = np.where(is_whole, np.argmin(far, axis=0), 0)
         corner = self.tiles.corner[tile]
         for step in range(1, domain.corner_count):
-            corner = np.where(turn >= step, t.following(corner), corner)
+            corner = np.where(turn >= step, t.next[corner], corner)
         return turn, corner
 
     @property

@@ -42,7 +42,7 @@ class PatchFrames:
         corners = t.face_offsets[whole] + np.arange(m, dtype=np.int32)[:, None]
         # An edge once, as one of its half-edges.
         edges = corners[t.edge_half_edge[t.edge[corners]] == corners]
-        one, other, twin = edges, t.following(edges), t.twin[edges]
+        one, other, twin = edges, t.next[edges], t.twin[edges]
         if m == 4:
             one, other = np.concatenate([one, *corners[:2]]), np.concatenate([other, *corners[2:]])
             twin = np.concatenate([twin, *corners[:2]])
@@ -75,7 +75,7 @@ class PatchFrames:
         start, border = t.face_vertices, np.flatnonzero(t.twin < 0)
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             start = control_of_vertex.astype(np.int32)[start]
-        one, other = start[border].astype(np.int64), start[t.following(border)]
+        one, other = start[border].astype(np.int64), start[t.next[border]]
         ends = np.minimum(one, other) * (int(control_of_vertex.max()) + 1) + np.maximum(one, other)
         _, first, same = np.unique(ends, return_index=True, return_inverse=True)
         edge[border] = border[first[same]]

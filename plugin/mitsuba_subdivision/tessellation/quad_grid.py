@@ -84,10 +84,10 @@ class QuadGrid(UniformGrid):
             numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
             # Two corners share a spoke.
             numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
-            numbers[:, -1, 1:-1] = self._spoke_start(t.preceding(corners))[:, None] + np.arange(h - 1)
+            numbers[:, -1, 1:-1] = self._spoke_start(t.prev[corners])[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
         numbers[:, 0, :] = self.along(corners, steps)
-        numbers[:, :, 0] = self.along(t.preceding(corners), self.rate - steps)
+        numbers[:, :, 0] = self.along(t.prev[corners], self.rate - steps)
         return numbers
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
@@ -158,7 +158,7 @@ class QuadGrid(UniformGrid):
         found = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
         if self.is_odd:
             # The next corner's grid meets this one's across the middle of their common edge.
-            following = self.corner_vertices(self.topology.following(corners))[:, -1, :]
+            following = self.corner_vertices(self.topology.next[corners])[:, -1, :]
             strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
             centre = self.centre_vertices(corners).astype(np.uint32)
             found.append(strip[:, _cut_cells(count, 2)])
@@ -202,7 +202,7 @@ class QuadGrid(UniformGrid):
         A patch reaches half way along its corner's two edges, and to the element's centre, which is (1, 1).
         """
         t, count = self.topology, self.half + 1
-        previous = t.preceding(corners)
+        previous = t.prev[corners]
         is_quad = t.face_sizes[t.face_of(corners[0])] == 4
         owns_edge = np.flatnonzero(self.owns_edge[corners])
         owns_previous = np.flatnonzero(self.owns_edge[previous])

@@ -332,8 +332,8 @@ def sides_on(edges: NDArray[np.bool_], frames: PatchFrames, corners: IntArray) -
     half_edge = corners
     for side in range(m):
         found[:, side] = is_whole & edges[half_edge]
-        half_edge = t.following(half_edge)
+        half_edge = t.next[half_edge]
     # Patches at corners have half an edge on their first and their last side.
     found[:, 0] |= edges[corners]
-    found[:, -1] |= ~is_whole & edges[t.preceding(corners)]
+    found[:, -1] |= ~is_whole & edges[t.prev[corners]]
     return found

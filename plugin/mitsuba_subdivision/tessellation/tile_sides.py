@@ -41,7 +41,7 @@ def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) ->
         near = np.flatnonzero(marked[half_edge] & (is_whole | (number == 0)))
         u, v = tile_corners(tiles[near], domain)
         found[near] |= (u == corner[0]) & (v == corner[1])
-        half_edge = t.following(half_edge)
+        half_edge = t.next[half_edge]
     return found
 
 
@@ -70,7 +70,7 @@ def points_on_sides(frames: PatchFrames, corner: IntArray, points: IndexArray) -
         on = np.flatnonzero(distance == 0).astype(np.int32)
         whole, other = on[is_whole[on]], on[~is_whole[on]]
         found.append(SidePoints(whole, edge[whole], 2 * along[whole], is_spoke=False))
-        edge = t.following(edge)
+        edge = t.next[edge]
         if len(other):
             half_edge, at, is_spoke = _of_patch_at_corner(t, number, corner[other], along[other])
             found.append(SidePoints(other, half_edge, at, is_spoke))
@@ -82,7 +82,7 @@ def _of_patch_at_corner(t: Topology, side: int, corner: IntArray, along: IntArra
 
     The sides are half an edge, two spokes that join the middles of edges to the centre, and half an edge.
     """
-    half_edge = corner if side < 2 else t.preceding(corner)
+    half_edge = corner if side < 2 else t.prev[corner]
     return half_edge, (along, along, UNIT - along, UNIT + along)[side], side in (1, 2)
 
 
@@ -149,5 +149,5 @@ def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
                 low[at, side] = np.where(backward, EDGE - begin - own_length, begin)
                 is_backward[at, side] = backward
         halvings[whole, side] -= 1
-        edge = t.following(edge)
+        edge = t.next[edge]
     return SideLines(line.ravel(), low.ravel(), halvings.ravel(), is_backward.ravel(), half_edge.ravel())

@@ -162,7 +162,7 @@ def _copies_inside_edges(grid: UniformGrid, border: IntArray, control_of_vertex:
     has two sides, too, though its ends have no copies.
     """
     t = grid.topology
-    start, end = control_of_vertex[t.face_vertices[border]], control_of_vertex[t.face_vertices[t.following(border)]]
+    start, end = control_of_vertex[t.face_vertices[border]], control_of_vertex[t.face_vertices[t.next[border]]]
     keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
     order = np.argsort(keys, kind="stable")
     begins = np.flatnonzero(np.diff(keys[order], prepend=-1))

@@ -187,7 +187,7 @@ class UniformGrid(ABC):
         for place in np.flatnonzero(steps == 0):
             numbers[place] = self._at_corners(corners)
         for place in np.flatnonzero(steps == self.rate):
-            numbers[place] = self._at_corners(self.topology.following(corners))
+            numbers[place] = self._at_corners(self.topology.next[corners])
         return np.moveaxis(numbers, 0, -1)
 
     @cached_property
@@ -234,7 +234,7 @@ class UniformGrid(ABC):
             parts.append(self.edge_part(owners, corners[owners], side[1:-1], uv[1:-1]))
             owners = np.flatnonzero(self.owns_vertex[corners])
             parts.append(self.vertex_part(owners, corners[owners], side[:1]))
-            corners = self.topology.following(corners)
+            corners = self.topology.next[corners]
         return parts
 
 
