@@ -37,12 +37,15 @@ def test_every_vertex_lies_on_one_polynomial(scheme, name, rate):
 
 def assert_every_vertex_lies_on_one_polynomial(table):
     parts = table.polynomials
-    vertices = np.concatenate([part.vertex for part in parts])
-    np.testing.assert_array_equal(np.sort(vertices), np.arange(table.vertex_count))
+    vertices = []
     for part in parts:
         assert (part.patch < part.blocks[part.block, 1]).all()
-        assert (np.diff(part.first_vertex) > 0).all()
-        assert part.first_vertex[-1] == len(part.vertex) == len(part.sample)
+        assert (np.diff(part.first_run) > 0).all()
+        assert (np.diff(part.first_entry) > 0).all()
+        assert part.first_run[-1] == len(part.kind) == len(part.first_vertex)
+        for kind, first in zip(part.kind.tolist(), part.first_vertex.tolist(), strict=True):
+            vertices.append(first + part.offset[part.first_entry[kind] : part.first_entry[kind + 1]])
+    np.testing.assert_array_equal(np.sort(np.concatenate(vertices)), np.arange(table.vertex_count))
 
 
 @EVERY_SURFACE

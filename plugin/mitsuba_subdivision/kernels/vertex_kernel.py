@@ -126,8 +126,8 @@ class _Part:
             TANGENT_ROUNDING[precision] * part.tangent_weights,
             LEAST_EXTENT[precision] if are_rounded else 0,
         )
-        self._first_vertex, self._vertex, self._sample = map(
-            types.indices, (part.first_vertex, part.vertex, part.sample)
+        self._first_run, self._kind, self._first_vertex, self._first_entry, self._offset = map(
+            types.indices, (part.first_run, part.kind, part.first_vertex, part.first_entry, part.offset)
         )
         self._st = types.floats(part.st)
 
@@ -210,15 +210,26 @@ class _Part:
     def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
         """Loop over the vertices of each lane's polynomial, of which the numbers and parameters are given."""
         types = self._types
-        lane: Index = dr.arange(types.index, self._count)
-        first, last = (types.fetch(types.index, self._first_vertex, lane + i) for i in (0, 1))
 
-        def body(at: Index, *state) -> tuple:
-            vertex, sample = (types.fetch(types.index, each, at) for each in (self._vertex, self._sample))
-            s, t = types.fetch(types.vector2, self._st, sample)
-            return at + 1, *add(vertex, s, t, *state)
+        def ends(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
+            return types.fetch(types.index, table, index), types.fetch(types.index, table, index + 1)
 
-        _, *found = dr.while_loop((first, *start), lambda at, *_: at < last, body, label=label)
+        def over_runs(run: Index, *state) -> tuple:
+            kind, first_vertex = (types.fetch(types.index, each, run) for each in (self._kind, self._first_vertex))
+            first_entry, last_entry = ends(self._first_entry, kind)
+
+            def over_entries(entry: Index, *state) -> tuple:
+                vertex = first_vertex + types.fetch(types.index, self._offset, entry)
+                s, t = types.fetch(types.vector2, self._st, entry)
+                return entry + 1, *add(vertex, s, t, *state)
+
+            entries = dr.while_loop(
+                (first_entry, *state), lambda entry, *_: entry < last_entry, over_entries, label=f"{label}_of_run"
+            )
+            return run + 1, *entries[1:]
+
+        first_run, last_run = ends(self._first_run, dr.arange(types.index, self._count))
+        _, *found = dr.while_loop((first_run, *start), lambda run, *_: run < last_run, over_runs, label=label)
         return tuple(found)
 
 

@@ -15,7 +15,7 @@ from .patch_frames import PatchFrames
 from .tile_choice import choose_tiles
 from .tiles import UNIT
 from .uniform import checked_rate
-from .vertex_polynomials import PatchVertices, VertexPolynomials, vertex_polynomials
+from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
 from .vertex_table import VertexTable
 
 
@@ -73,8 +73,9 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     is_new[1:] = (np.diff(uv[:, order]) != 0).any(axis=0) | (np.diff(patch_class[order]) != 0)
     different = order[is_new]
     counts = np.bincount(patch_class[different], minlength=len(table.classes))
-    sample = np.empty(len(order), dtype=np.int32)
-    sample[order] = ragged.index_in_row(counts)[np.cumsum(is_new) - 1]
     own_uv = np.split(np.ascontiguousarray(uv[:, different].T), np.cumsum(counts)[:-1])
-    vertices = PatchVertices(patch_class, patch, sample, np.arange(len(order), dtype=np.uint32))
-    return vertex_polynomials(table.scheme, table.classes, own_uv, vertices)
+    # Runs of one vertex each.
+    kind = np.cumsum(is_new) - 1
+    samples, ones = ragged.index_in_row(counts), np.ones_like(different)
+    runs = VertexRuns(patch_class[different], ones, samples, kind, patch[order], order)
+    return vertex_polynomials(table.scheme, table.classes, own_uv, runs)

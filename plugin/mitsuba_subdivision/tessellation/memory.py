@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 # What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
 # for each weight of a point and two tangents; and how many copies of the largest class's weights there are while these
 # are made.
-VERTEX_BYTES = 100
+VERTEX_BYTES = 90
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
 # Bytes for each triangle of an adaptive tessellation, with its vertices and their weights, during its construction.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ..schemes.domain import FloatArray
 from .memory import require_memory
 from .quad_grid import QuadGrid
 from .uniform_grid import GridPart, UniformGrid
-from .vertex_polynomials import PatchVertices, VertexPolynomials, vertex_polynomials
+from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
 from .vertex_table import VertexTable
 
 # Buffers have sizes of 32 bits; to each vertex belong two triangles, of three numbers each.
@@ -90,28 +91,28 @@ def _polynomials(patches: PatchTable, grid: UniformGrid) -> tuple[VertexPolynomi
     """What the vertices lie on, class by class and part by part of the grid."""
     classes: list[PatchClass] = []
     uv: list[FloatArray] = []
-    found: list[PatchVertices] = []
+    # Of each kind: its class, samples, patches and first vertices.
+    kinds: list[tuple[int, IntArray, IntArray, IntArray]] = []
     for own_classes, samples, parts in _layouts(patches, grid):
         bounds = ragged.offsets([len(patch_class.corners) for patch_class in own_classes])
         for part in parts:
-            count = len(part.samples)
-            of_class = np.searchsorted(bounds, part.patches, side="right") - 1
-            patch = (part.patches - bounds[of_class]).astype(np.int32)
-            of_class = (len(classes) + of_class).astype(np.int32)
-            found.append(
-                PatchVertices(
-                    np.repeat(of_class, count),
-                    np.repeat(patch, count),
-                    np.tile(part.samples.astype(np.int32), len(patch)),
-                    part.vertices.ravel().astype(np.uint32),
-                )
-            )
+            ends = np.searchsorted(part.patches, bounds).tolist()
+            for index, (begin, end) in enumerate(pairwise(ends)):
+                if begin < end and len(part.samples):
+                    patch = part.patches[begin:end] - bounds[index]
+                    kinds.append((len(classes) + index, part.samples, patch, part.first_vertex[begin:end]))
         classes += own_classes
         uv += [samples] * len(own_classes)
-    vertices = PatchVertices(*map(np.concatenate, zip(*found, strict=True)))
-    # The largest arrays.
-    del found
-    return vertex_polynomials(patches.scheme, classes, uv, vertices)
+    of_class, samples_of_kind, patch_of_run, first_vertex = zip(*kinds, strict=True)
+    runs = VertexRuns(
+        np.array(of_class),
+        np.array([len(own) for own in samples_of_kind]),
+        np.concatenate(samples_of_kind),
+        np.repeat(np.arange(len(kinds)), [len(own) for own in patch_of_run]),
+        np.concatenate(patch_of_run),
+        np.concatenate(first_vertex),
+    )
+    return vertex_polynomials(patches.scheme, classes, uv, runs)
 
 
 def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:

@@ -25,13 +25,19 @@ from ..schemes.scheme import Scheme
 WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 17, 1 << 18
 
 
-class PatchVertices(NamedTuple):
-    """Vertices of a tessellation as samples of patches, in any order."""
+class VertexRuns(NamedTuple):
+    """The vertices of a tessellation, in runs of successive ones.
 
-    patch_class: IntArray  # (n,): index of the class of each vertex's patch
-    patch: IntArray  # (n,): the patch, counted from the first of the class
-    sample: IntArray  # (n,): which of the class's samples it is
-    vertex: NDArray[np.uint32]  # (n,) uint32: its number
+    The vertices of a run are some samples of one patch. All runs of a kind have the same samples, on different patches
+    of one class.
+    """
+
+    patch_class: IntArray  # (k,): index of the class of each kind
+    counts: IntArray  # (k,): number of samples of each kind
+    samples: IntArray  # (n,): numbers of the samples in their class, for all kinds, one after the other
+    kind: IntArray  # (r,): of each run
+    patch: IntArray  # (r,): of each run, counted from the first of the class
+    first_vertex: IntArray  # (r,): of each run
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +58,13 @@ class VertexPolynomials:
     tangent_weights: FloatArray
     block: IndexArray  # (p,) int32: of each polynomial; ascending
     patch: IndexArray  # (p,) int32: of each polynomial, counted from the first of its class
-    first_vertex: IntArray  # (p + 1,) int64: index below of the first vertex of each polynomial; then their number
-    vertex: NDArray[np.uint32]  # (n,) uint32
-    sample: IndexArray  # (n,) int32: row of ``st`` of each vertex
-    st: FloatArray  # (s, 2) float64: parameters from the middle of the domain
+    # A run has vertices of one polynomial, and runs of a kind have them at the same parameters. Where these are:
+    first_run: IntArray  # (p + 1,) int64: the first run of each polynomial; then the number of runs
+    kind: IndexArray  # (r,) int32: of each run
+    first_vertex: NDArray[np.uint32]  # (r,) uint32: of each run
+    first_entry: IntArray  # (k + 1,) int64: the first entry of each kind below; then the number of entries
+    offset: IndexArray  # (e,) int32: of a vertex from the first of its run
+    st: FloatArray  # (e, 2) float64: its parameters from the middle of the domain
 
     def sums(self, controls: NDArray[np.uint32], points: FloatArray, row_count: int = 3) -> Iterator[VertexSums]:
         """Points, or with three rows points and tangents, of all vertices, some at a time.
@@ -68,33 +77,42 @@ class VertexPolynomials:
             begin, end = np.searchsorted(self.block, [first_block, first_block + len(weights)]).tolist()
             step = max(1, WEIGHTS_AT_ONCE // weights[0].size)
             for first in range(begin, end, step):
-                lanes = slice(first, min(first + step, end))
-                block = self.block[lanes]
+                polynomials = slice(first, min(first + step, end))
+                block = self.block[polynomials]
                 first_control, patch_count, control_count = self.blocks[block].T
-                at = first_control + self.patch[lanes] + patch_count * np.arange(control_count[0])[:, None]
+                at = first_control + self.patch[polynomials] + patch_count * np.arange(control_count[0])[:, None]
                 own = points[controls[at]]
                 origin = own[0]
                 relative = own - origin
                 extent = np.abs(relative).max(axis=0)
                 relative = np.ascontiguousarray(relative.swapaxes(0, 1))
                 coefficients = (weights[block - first_block] @ relative).transpose(1, 2, 0)
-                of_lanes = origin.T, extent.T, self.tangent_weights[block]
-                ends = self.first_vertex[lanes.start : lanes.stop + 1]
-                lane = np.repeat(np.arange(len(block)), np.diff(ends))
+                of_polynomials = origin.T, extent.T, self.tangent_weights[block]
+                polynomial, vertex, entry = self._vertices(polynomials)
                 run = max(1, COEFFICIENTS_AT_ONCE // coefficients[:, :, 0].size)
-                for start in range(0, len(lane), run):
-                    some = lane[start : start + run]
-                    vertices = slice(int(ends[0]) + start, int(ends[0]) + start + len(some))
-                    factors = monomials.take(self.sample[vertices], axis=2)
-                    values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(some, axis=2))
-                    yield VertexSums(self.vertex[vertices], values, *(each[..., some] for each in of_lanes))
+                for some in (slice(start, start + run) for start in range(0, len(vertex), run)):
+                    which = polynomial[some]
+                    factors = monomials.take(entry[some], axis=2)
+                    values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(which, axis=2))
+                    yield VertexSums(vertex[some], values, *(each[..., which] for each in of_polynomials))
             first_block += len(weights)
+
+    def _vertices(self, polynomials: slice) -> tuple[IntArray, IntArray, IntArray]:
+        """Of the vertices of some polynomials: the polynomial, counted from the first of these; number; entry."""
+        first_run = self.first_run[polynomials.start : polynomials.stop + 1]
+        runs = slice(int(first_run[0]), int(first_run[-1]))
+        kind = self.kind[runs]
+        counts = np.diff(self.first_entry)[kind]
+        polynomial = np.repeat(np.arange(len(first_run) - 1), np.diff(first_run))
+        entry = ragged.ranges(self.first_entry[kind], counts)
+        vertex = np.repeat(self.first_vertex[runs].astype(np.int64), counts) + self.offset[entry]
+        return np.repeat(polynomial, counts), vertex, entry
 
 
 class VertexSums(NamedTuple):
     """Some vertices."""
 
-    vertex: NDArray[np.uint32]  # (n,)
+    vertex: IntArray  # (n,)
     values: FloatArray  # (d, k, n) float64: relative to ``origin``
     origin: FloatArray  # (k, n) float64: a control point of the patch
     extent: FloatArray  # (k, n) float64: how far the others are from it along each axis
@@ -116,28 +134,24 @@ class VertexSums(NamedTuple):
 
 
 def vertex_polynomials(
-    scheme: Scheme, classes: Sequence[PatchClass], uv: Sequence[FloatArray], vertices: PatchVertices
+    scheme: Scheme, classes: Sequence[PatchClass], uv: Sequence[FloatArray], runs: VertexRuns
 ) -> tuple[VertexPolynomials, ...]:
     """Find the polynomials that vertices lie on: planes, and those of the scheme's basis; only what there is.
 
     ``uv`` are the samples ``(s, 2)`` of each class.
     """
     # At low rates, patches of other classes may have all samples of a class.
-    used = np.flatnonzero(np.bincount(vertices.patch_class)).tolist()
-    number = np.zeros(len(classes), dtype=np.int32)
-    number[used] = np.arange(len(used))
-    classes, uv = [classes[index] for index in used], [uv[index] for index in used]
-    vertices = vertices._replace(patch_class=number[vertices.patch_class])
+    used = np.unique(runs.patch_class)
+    classes, uv = [classes[index] for index in used.tolist()], [uv[index] for index in used.tolist()]
+    runs = runs._replace(patch_class=np.searchsorted(used, runs.patch_class))
     known: Known = {}
     found = [
         sampled_polynomials(element_of(scheme, each.signature), own, known)
         for each, own in counted(list(zip(classes, uv, strict=True)), "Polynomials of patch classes")
     ]
-    sample = ragged.starts(np.array([len(own) for own in uv])).astype(np.int32)[vertices.patch_class]
-    sample += vertices.sample
-    counts = [len(own) for own in uv]
+    counts = np.array([len(own) for own in uv])
     forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), zip(*found, strict=True), strict=True)
-    built = [_joined(powers, classes, parts, counts, vertices, sample) for powers, parts in forms]
+    built = [_joined(powers, classes, parts, counts, runs) for powers, parts in forms]
     return tuple(each for each in built if each is not None)
 
 
@@ -145,9 +159,8 @@ def _joined(
     powers: IntArray,
     classes: Sequence[PatchClass],
     parts: Sequence[Polynomials],
-    sample_counts: Sequence[int],
-    vertices: PatchVertices,
-    sample: IntArray,
+    sample_counts: IntArray,
+    runs: VertexRuns,
 ) -> VertexPolynomials | None:
     """Polynomials of one form of all classes."""
     used = [index for index, part in enumerate(parts) if len(part.rows)]
@@ -158,10 +171,11 @@ def _joined(
     sizes = np.array([classes[index].controls.shape[1] for index in used])
     first_block = np.zeros(len(classes), dtype=np.int64)
     first_block[used] = ragged.starts(np.array([len(parts[index].rows) for index in used]))
-    block_of_sample, st = np.full(sum(sample_counts), -1), np.zeros((sum(sample_counts), 2))
-    for index, start in zip(range(len(classes)), ragged.starts(np.array(sample_counts)).tolist(), strict=True):
-        block_of_sample[start + parts[index].sample] = first_block[index] + parts[index].polynomial
-        st[start + parts[index].sample] = parts[index].st
+    first_sample = ragged.starts(sample_counts)
+    block_of_sample, st = np.full(int(sample_counts.sum()), -1), np.zeros((int(sample_counts.sum()), 2))
+    for part, block, start in zip(parts, first_block.tolist(), first_sample.tolist(), strict=True):
+        block_of_sample[start + part.sample] = block + part.polynomial
+        st[start + part.sample] = part.st
     weights = tuple(
         np.concatenate([parts[index].rows for index, own in zip(used, sizes, strict=True) if own == size])
         for size in np.unique(sizes)
@@ -169,31 +183,41 @@ def _joined(
     blocks = np.concatenate(
         [np.tile([classes[i].first_control, *classes[i].controls.shape], (len(parts[i].rows), 1)) for i in used]
     )
+    # Each kind is divided into those of its samples that lie in the same block.
+    sample = np.repeat(first_sample[runs.patch_class], runs.counts) + runs.samples
+    kind, offset = np.repeat(np.arange(len(runs.counts)), runs.counts), ragged.index_in_row(runs.counts)
+    block = block_of_sample[sample]
+    order = np.lexsort((block, kind))
+    order = order[block[order] >= 0]
+    sample, kind, offset, block = sample[order], kind[order], offset[order], block[order]
+    first_entry = np.flatnonzero((np.diff(kind, prepend=-1) != 0) | (np.diff(block, prepend=-1) != 0))
+    part_counts = np.bincount(kind[first_entry], minlength=len(runs.counts))
+    run = np.repeat(np.arange(len(runs.kind)), part_counts[runs.kind])
+    own_kind = ragged.ranges(ragged.starts(part_counts)[runs.kind], part_counts[runs.kind])
     patch_count = int(blocks[:, 1].max())
-    block_of_vertex = block_of_sample[sample]
-    which = np.flatnonzero(block_of_vertex >= 0)
-    keys = block_of_vertex[which] * patch_count + vertices.patch[which]
-    # Stable: this is fast where keys are sorted in large parts, as those of a uniform grid are.
-    order = np.argsort(keys, kind="stable")
-    keys, which = keys[order], which[order]
-    first = np.flatnonzero(np.diff(keys, prepend=-1))
-    block, patch = np.divmod(keys[first], patch_count)
-    held = np.flatnonzero(block_of_sample >= 0)
-    magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])[block_of_sample[held]]
+    keys = block[first_entry][own_kind] * patch_count + runs.patch[run]
+    # Stable: fast where keys are sorted in large parts, as those of a uniform grid are.
+    of_polynomial = np.argsort(keys, kind="stable")
+    keys, run = keys[of_polynomial], run[of_polynomial]
+    first_run = np.flatnonzero(np.diff(keys, prepend=-1))
+    run_block, patch = np.divmod(keys[first_run], patch_count)
+    magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])[block]
     tangent_weights = np.zeros(len(blocks))
-    slopes = (np.abs(_monomials(powers, st[held])[1:]) * magnitude.T).sum(axis=1).max(axis=0)
-    np.maximum.at(tangent_weights, block_of_sample[held], slopes)
+    slopes = (np.abs(_monomials(powers, st[sample])[1:]) * magnitude.T).sum(axis=1).max(axis=0)
+    np.maximum.at(tangent_weights, block, slopes)
     return VertexPolynomials(
         powers,
         weights,
         blocks,
         tangent_weights,
-        block.astype(np.int32),
+        run_block.astype(np.int32),
         patch.astype(np.int32),
-        np.append(first, len(keys)),
-        vertices.vertex[which],
-        sample[which].astype(np.int32),
-        st,
+        np.append(first_run, len(keys)),
+        own_kind[of_polynomial].astype(np.int32),
+        runs.first_vertex[run].astype(np.uint32),
+        np.append(first_entry, len(sample)),
+        offset.astype(np.int32),
+        st[sample],
     )
 
 
