@@ -8,6 +8,7 @@ points, and near them beyond the levels that are pieces.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ from .polynomial_basis import polynomial_basis
 FEW_SAMPLES = 4
 # Exponents of the monomials of a plane.
 PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
+# Polynomials of a piece are kept for no more samples. Those of 512 pieces of ordinary valences then take 32 MB.
+MOST_KEPT = 100
 # A sum of weights that is smaller than this part of its absolute terms is rounding, as on the fold between two faces
 # back to back.
 CANCELLED = 2.0**-48
@@ -57,15 +60,27 @@ def sampled_polynomials(element: DividedElement, uv: FloatArray, known: Known, d
     """
     if depth > MOST_DEPTH:
         raise not_isolated(element.scheme, element.signature, depth)
+    if element.piece is not None and len(uv) <= MOST_KEPT:
+        return _kept(element.piece, element.scheme, uv.tobytes())
     key = element, uv.tobytes()
     if key not in known:
         if element.piece is None:
             known[key] = _of_children(element, uv, known, depth)
-        elif element.piece.patch is None:
-            known[key] = _of_regular(element.scheme, element.piece, uv)
         else:
-            known[key] = _of_tip(element.scheme, element.piece, element.piece.patch, uv)
+            known[key] = _of_piece(element.piece, element.scheme, uv)
     return known[key]
+
+
+@lru_cache(maxsize=512)
+def _kept(piece: Piece, scheme: Scheme, uv: bytes) -> Sampled:
+    """Polynomials that are kept, because many shapes have the same pieces with the same samples."""
+    return _of_piece(piece, scheme, np.frombuffer(uv).reshape(-1, 2))
+
+
+def _of_piece(piece: Piece, scheme: Scheme, uv: FloatArray) -> Sampled:
+    if piece.patch is None:
+        return _of_regular(scheme, piece, uv)
+    return _of_tip(scheme, piece, piece.patch, uv)
 
 
 def _of_children(element: DividedElement, uv: FloatArray, known: Known, depth: int) -> Sampled:
