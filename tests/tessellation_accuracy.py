@@ -90,7 +90,7 @@ def chord_error(surface: LimitSurface, table: VertexTable) -> float:
     inside = (i + j <= STEPS) & (np.max([i, j, STEPS - i - j], axis=0) < STEPS)
     weights = np.stack([i, j, STEPS - i - j], axis=1)[inside] / STEPS
     kernel = surface.on_device("llvm_ad_rgb_double")
-    element = surface.patches.elements.face_of(corner)
+    element = surface.patches.elements.face[corner]
     first = surface.patches.elements.face_offsets[element]
     found = 0.0
     for begin in range(0, len(corner), TRIANGLES_AT_ONCE):

@@ -444,7 +444,7 @@ def met_past_a_border(kernel, surface, beyond, turns=0):
     """Points beside a border, and what is met of lines across them; from locations seen from the next corners."""
     types, elements = kernel.types, surface.patches.elements
     edges = np.flatnonzero(elements.twin < 0)
-    element = elements.face_of(edges).astype(int)
+    element = elements.face[edges].astype(int)
     corner = edges - elements.face_offsets[element]
     uv = np.stack([np.full(len(edges), 0.4), np.zeros(len(edges))], axis=1)
     border = surface.evaluate(element, uv, corner)
@@ -581,7 +581,7 @@ def test_rays_beside_an_extraordinary_vertex_meet_the_surface_there(cage, scheme
     kernel, t = surface.on_device(SINGLE), surface.patches.elements
     beside = np.flatnonzero(np.bincount(cage.face_vertices)[cage.face_vertices] == 3)
     half_edge = np_rng.choice(beside, 500)
-    element = t.face_of(half_edge).astype(np.int64)
+    element = t.face[half_edge].astype(np.int64)
     corner = half_edge - t.face_offsets[element]
     for level in (6, 10, 14):
         uv = np_rng.random((500, 2)) * 2.0 ** -(level + 1)

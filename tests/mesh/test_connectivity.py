@@ -25,9 +25,6 @@ def test_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
     beyond = t.twin < 0
     expected = {
-        "following": t.next,
-        "preceding": t.prev,
-        "face_of": t.face,
         "turn": t.twin[t.prev],
         "turn_back": np.where(beyond, -1, t.next[t.twin]),
     }

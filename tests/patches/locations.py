@@ -12,6 +12,6 @@ def grid_locations(surface, segments):
     inside = i + j <= segments if domain.corner_count == 3 else np.full(len(i), True)
     uv = np.stack([i, j], axis=1)[inside] / segments
     corner = np.arange(elements.half_edge_count)
-    is_first = corner == elements.face_offsets[elements.face_of(corner)]
-    starts = corner[is_first | ~surface.patches.is_whole[elements.face_of(corner)]]
+    is_first = corner == elements.face_offsets[elements.face[corner]]
+    starts = corner[is_first | ~surface.patches.is_whole[elements.face[corner]]]
     return np.repeat(starts, len(uv)), np.tile(uv, (len(starts), 1))

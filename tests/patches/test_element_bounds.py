@@ -81,7 +81,7 @@ def assert_tight(surface):
     start, uv = grid_locations(surface, GRID)
     points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
     lower, upper = np.full((2, len(surface.patches.elements.face_sizes), 3), np.inf)
-    element = surface.patches.elements.face_of(start)
+    element = surface.patches.elements.face[start]
     np.minimum.at(lower, element, points)
     np.minimum.at(upper, element, -points)
     tight = np.linalg.norm(upper + lower, axis=1)[bounds.element]

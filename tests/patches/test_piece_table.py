@@ -54,7 +54,7 @@ def test_half_edges_lead_to_their_neighbours(surface):
     twin, following, preceding, _ = table.half_edges.T.astype(np.int64)
     every = np.arange(t.half_edge_count)
     np.testing.assert_array_equal(following[preceding], every)
-    np.testing.assert_array_equal(t.face_of(following), t.face)
+    np.testing.assert_array_equal(t.face[following], t.face)
     has_twin = twin != NOTHING
     np.testing.assert_array_equal(has_twin, t.twin >= 0)
     np.testing.assert_array_equal(twin[twin[has_twin]], every[has_twin])

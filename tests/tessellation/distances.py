@@ -21,7 +21,7 @@ def distances(surface, table, most_triangles=6000, most_points=120, seed=0):
     own = random.permutation(len(corners))[:most_triangles]
     on_triangles = (PLACES @ corners[own]).reshape(-1, 3)
     elements = surface.patches.elements
-    element = elements.face_of(half_edge[own]).astype(np.int64)
+    element = elements.face[half_edge[own]].astype(np.int64)
     corner = half_edge[own] - elements.face_offsets[element]
     element, corner = (np.repeat(each, len(PLACES)) for each in (element, corner))
     on_surface = surface.evaluate(element, np.clip((PLACES @ uv[own]).reshape(-1, 2), 0, 1), corner).p

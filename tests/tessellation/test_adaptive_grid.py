@@ -61,7 +61,7 @@ def assert_each_edge_inside_has_its_twin(surface, table):
     corner, uv = table.locations()
     lonely = np.unique(edges[~np.isin(twins, keys)])
     t, domain = surface.patches.elements, surface.scheme.domain
-    whole = surface.patches.is_whole[t.face_of(corner[lonely])]
+    whole = surface.patches.is_whole[t.face[corner[lonely]]]
     on_side = domain.inside(uv[lonely]) <= ROUNDING
     assert on_side.all()
     if (t.twin >= 0).all():
@@ -80,7 +80,7 @@ def assert_elements_are_covered(surface, table):
     expected = np.where(whole, of_domain, t.face_sizes) * (t.face_sizes > 0)
     found = np.bincount(table.element, areas, minlength=t.face_count)
     np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING * np.maximum(expected, 1).max())
-    np.testing.assert_array_equal(t.face_of(corner), table.element)
+    np.testing.assert_array_equal(t.face[corner], table.element)
     assert (np.diff(table.element.astype(np.int64)) >= 0).all()
 
 
@@ -192,7 +192,7 @@ def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(see
         surface = LimitSurface(*random_cage(np.random.default_rng(seed)))
     frames, t = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex), surface.patches.elements
     connections, of_face = defaultdict(set), defaultdict(set)
-    for half_edge, face in enumerate(t.face_of(np.arange(t.half_edge_count))):
+    for half_edge, face in enumerate(t.face[np.arange(t.half_edge_count)]):
         following = t.next[half_edge]
         ways = [(("edge", t.edge[half_edge]), following)]
         if t.face_sizes[face] == 4:

@@ -33,5 +33,5 @@ def boundary_holes(rule: str, t: Topology, is_boundary: NDArray[np.bool_]) -> ND
     """
     found = np.zeros(t.face_count, dtype=bool)
     if rule == "none":
-        found[t.face_of(np.flatnonzero(t.ends_of(is_boundary)[t.face_vertices]))] = True
+        found[t.face[np.flatnonzero(t.ends_of(is_boundary)[t.face_vertices])]] = True
     return found

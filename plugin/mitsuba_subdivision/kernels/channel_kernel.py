@@ -102,7 +102,7 @@ class LinearChannelKernel:
         rows, weights = channel.value_index[half_edges], None
         if self._has_polygons:
             # Centre values follow all others, and their rows follow those of the half-edges.
-            rows, weights = np.stack([rows, len(channel.values) + t.face_of(half_edges)], axis=1), channel.with_centres
+            rows, weights = np.stack([rows, len(channel.values) + t.face[half_edges]], axis=1), channel.with_centres
         size = channel.values.shape[1]
         make = None if weights is None else partial(WeightedValues(weights, float_type), size=size)
         self.values = ControlValues(channel.values, self._types, make)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from enum import IntEnum
 from functools import cached_property
-from typing import TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,6 @@ IntArray = NDArray[np.integer]
 IndexArray = NDArray[np.int32]
 # Half-edges: many, or one.
 HalfEdges = NDArray[np.integer] | np.integer | int
-HalfEdgeArray = TypeVar("HalfEdgeArray", bound=NDArray[np.integer])
 
 
 class VertexRule(IntEnum):
@@ -242,14 +240,6 @@ class Topology:
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
         """Half-edges of some faces in ascending order; ``is_chosen`` selects faces."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
-
-    @overload
-    def face_of(self, half_edges: np.integer | int) -> np.integer | int: ...
-    @overload
-    def face_of(self, half_edges: HalfEdgeArray) -> HalfEdgeArray: ...
-    def face_of(self, half_edges: HalfEdges) -> HalfEdges:
-        """`face` of some half-edges."""
-        return half_edges // self.common_size if self.common_size else self.face[half_edges]
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
         """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""

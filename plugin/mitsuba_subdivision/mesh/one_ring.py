@@ -100,7 +100,7 @@ class OneRing:
         begins = ragged.starts(np.array([len(behind) + len(ahead) for behind, ahead in fans]))
         unturned = begins + [len(behind) for behind, _ in fans]
         half_edges = half_edges_around(fans)[unturned[corners] + turns]
-        faces = topology.face_of(half_edges)
+        faces = topology.face[half_edges]
         first = topology.face_offsets[faces]
         return topology.face_vertices[first + (half_edges - first + steps) % topology.face_sizes[faces]]
 

@@ -217,7 +217,7 @@ def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
     def sizes(half_edges: list[int]) -> tuple[int, ...]:
         if topology.common_size:
             return (topology.common_size,) * len(half_edges)
-        return tuple(topology.face_sizes[topology.face_of(np.array(half_edges, dtype=np.int32))].tolist())
+        return tuple(topology.face_sizes[topology.face[np.array(half_edges, dtype=np.int32)]].tolist())
 
     rule = VertexRule(int(topology.vertex_rules[topology.face_vertices[ahead[0]]]))
     is_closed = int(topology.turn(ahead[-1])) >= 0

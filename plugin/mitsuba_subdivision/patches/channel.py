@@ -203,7 +203,7 @@ class LinearChannel(_OfLayout):
         corners = [self.patches.half_edge_of_corner[half_edge]]
         for _ in range(corner_count - 2):
             corners.append(t.next[corners[-1]])
-        face = t.face_of(corners[0])
+        face = t.face[corners[0]]
         return [*corners, t.prev[corners[0]]], face, t.face_sizes[face] != corner_count
 
     @property

@@ -79,7 +79,7 @@ class PatchTable:
             return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
         offsets, half_edges = t.vertex_fans
         # A dual edge crosses the cage's edge that two successive faces about a vertex share.
-        return Topology(t.face_count, np.diff(offsets), t.face_of(half_edges), t.edge[t.prev[half_edges]])
+        return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
 
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:
@@ -222,7 +222,7 @@ class PatchTable:
         class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=each) for each in types)
         for index, patch_class in enumerate(self.classes):
             corners = patch_class.corners
-            whole = self.is_whole[t.face_of(corners[0])]
+            whole = self.is_whole[t.face[corners[0]]]
             for turn in range(self.scheme.domain.corner_count if whole else 1):
                 class_index[corners], patch[corners], patch_corner[corners] = index, np.arange(len(corners)), turn
                 corners = t.next[corners]
@@ -242,7 +242,7 @@ class PatchTable:
         corners: list[IntArray] = [begins]
         codes = [whole_codes]
         partial = t.half_edges_of(~self.is_whole)
-        sizes = t.face_sizes[t.face_of(partial)]
+        sizes = t.face_sizes[t.face[partial]]
         for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
             unused = 1 + max(int(found.max(initial=0)) for found in codes)
@@ -327,4 +327,4 @@ class RefinedPatches:
         """``(p,)`` the corner of an element of the cage that each patch covers, a half-edge of its `elements`."""
         # By `splits_corners` of the scheme, face h of the refined cage lies at half-edge h of the cage, and
         # begins there.
-        return self.table.topology.face_of(patch_class.corners)
+        return self.table.topology.face[patch_class.corners]

@@ -166,7 +166,7 @@ class PieceTable:
         own = every if refined is None else table.topology.face_offsets[:-1]
         class_index, patch, patch_corner = table.patch_at(own)
         first_patch = ragged.starts(np.array([len(each.corners) for each in table.classes]))
-        face = t.face_of(every)
+        face = t.face[every]
         is_whole = patches.is_whole[face]
         found = np.empty((len(every), 4), dtype=np.uint32)
         found[:, TWIN] = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))

@@ -267,7 +267,7 @@ class SurfacePieces:
         for patch_class, whole in counted(list(pairs), "Pieces of patch classes"):
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
-            np.maximum.at(sizes, patches.elements.face_of(corners), np.abs(controls).max(axis=1))
+            np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
             seen = partial(_seen, patches, corners)
             waiting = [(whole, IDENTITY, controls, 0)]
             while waiting:
@@ -343,7 +343,7 @@ def _seen(
         Parameters of the patch to which the corner shall be near.
     """
     half_edge, shape = corners, patches.scheme.domain
-    is_whole = patches.is_whole[patches.elements.face_of(corners)]
+    is_whole = patches.is_whole[patches.elements.face[corners]]
     # A patch of the refined cage is a quarter of a whole element of the cage.
     scale = np.where(is_whole, 0.5, 1.0) if patches.refined is not None else np.ones(len(corners))
     if patches.refined is None and is_whole.all():
@@ -383,7 +383,7 @@ def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArra
     lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
 
     def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:
-        element = elements.face_of(half_edge)
+        element = elements.face[half_edge]
         np.minimum.at(lower, element, low)
         np.maximum.at(upper, element, high)
 

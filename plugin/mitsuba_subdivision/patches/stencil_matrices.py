@@ -163,7 +163,7 @@ def _in_refined(
     t, domain = patches.elements, patches.scheme.domain
     half_edge, uv = half_edge.copy(), uv.copy()
     # Any other element has parameters for each of its corners already.
-    whole = np.flatnonzero(patches.is_whole[t.face_of(half_edge)])
+    whole = np.flatnonzero(patches.is_whole[t.face[half_edge]])
     number, in_child = domain.first_child(uv[whole].T)
     for corner in range(domain.corner_count):
         at = whole[number == corner]

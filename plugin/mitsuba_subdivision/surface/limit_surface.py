@@ -432,7 +432,7 @@ class LimitSurface:
 
     def _element_and_corner(self, half_edge: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Of half-edges of `PatchTable.elements`."""
-        element = self.patches.elements.face_of(half_edge).astype(np.int64)
+        element = self.patches.elements.face[half_edge].astype(np.int64)
         return element, half_edge - self.patches.elements.face_offsets[element]
 
     def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:

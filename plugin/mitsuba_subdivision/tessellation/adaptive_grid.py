@@ -36,7 +36,7 @@ class AdaptiveGrid:
         # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and both
         # would have the same triangle.
         keeps = at_vertices(is_pair[t.face_vertices], tiles, frames) if is_pair.any() else None
-        has_more = (tiles.depth == 0) & frames.meets_twice[t.face_of(tiles.corner)]
+        has_more = (tiles.depth == 0) & frames.meets_twice[t.face[tiles.corner]]
         if keeps is not None:
             has_more |= keeps.any(axis=1)
         if has_more.any():
@@ -119,7 +119,7 @@ class AdaptiveGrid:
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` element of each triangle."""
-        return self.frames.topology.face_of(self.tiles.corner)[self._tile()].astype(np.uint32)
+        return self.frames.topology.face[self.tiles.corner][self._tile()].astype(np.uint32)
 
     def _triangle_counts(self) -> IntArray:
         """``(t,)`` triangles of each tile, by Euler's formula."""
@@ -202,12 +202,12 @@ class AdaptiveGrid:
             at = np.flatnonzero(turn == corner)
             if len(at):
                 uv[at] = domain.rotation(corner).inverse()(uv[at])
-        return uv * self.frames.scale[self.frames.topology.face_of(self.tiles.corner[tile])][:, None]
+        return uv * self.frames.scale[self.frames.topology.face[self.tiles.corner[tile]]][:, None]
 
     def _nearest_corner(self, tile: IntArray, parameters: FloatArray) -> tuple[IntArray, IntArray]:
         """The turn to the nearest corner of each patch, and the half-edge that begins there."""
         t, domain = self.frames.topology, self.frames.domain
-        is_whole = self.frames.is_whole[t.face_of(self.tiles.corner[tile])]
+        is_whole = self.frames.is_whole[t.face[self.tiles.corner[tile]]]
         corners = domain.corners * UNIT
         far = [np.maximum(*np.abs(parameters - corner[:, None])) for corner in corners]
         turn = np.where(is_whole, np.argmin(far, axis=0), 0)

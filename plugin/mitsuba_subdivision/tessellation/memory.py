@@ -34,7 +34,7 @@ def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
     at_corner = (rate // 2 + 1) ** 2
     weights = [0]
     for patch_class in (patches if refined is None else refined.table).classes:
-        is_whole = refined is None and patches.is_whole[patches.elements.face_of(patch_class.corners[:1])][0]
+        is_whole = refined is None and patches.is_whole[patches.elements.face[patch_class.corners[:1]]][0]
         weights.append(WEIGHT_BYTES * patch_class.controls.shape[1] * (in_whole if is_whole else at_corner))
     return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
 

@@ -51,8 +51,8 @@ class PatchFrames:
         in_order = np.sort(pairs)
         again = in_order[1:][in_order[1:] == in_order[:-1]]
         is_again = np.flatnonzero(np.isin(pairs, again) | (start == end))
-        found[t.face_of(one[is_again])] = True
-        found[t.face_of(twin[is_again][twin[is_again] >= 0])] = True
+        found[t.face[one[is_again]]] = True
+        found[t.face[twin[is_again][twin[is_again] >= 0]]] = True
         return found & self.is_whole
 
     @classmethod

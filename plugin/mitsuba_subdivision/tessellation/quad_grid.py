@@ -92,17 +92,17 @@ class QuadGrid(UniformGrid):
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
         """Vertex at the centre of each corner's polygon: ``(e,)``."""
-        return self._inner_start(self.topology.face_of(corners))
+        return self._inner_start(self.topology.face[corners])
 
     def _corner_start(self, corners: IntArray) -> IntArray:
         """First vertex inside the grid of each polygon corner; the polygon's centre comes before all of these."""
         t, size = self.topology, self.half if self.is_odd else self.half - 1
-        return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face_of(corners)]) * size**2
+        return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face[corners]]) * size**2
 
     def _spoke_start(self, corners: IntArray) -> IntArray:
         """First vertex inside the spoke from the middle of the edge at each polygon corner, for an even rate."""
         t, inside = self.topology, self.half - 1
-        face = t.face_of(corners)
+        face = t.face[corners]
         # After the centre and all grids.
         return self._inner_start(face) + 1 + t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
 
@@ -133,7 +133,7 @@ class QuadGrid(UniformGrid):
             else:
                 found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
         for corners in slices_of(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):
-            face = t.face_of(corners)
+            face = t.face[corners]
             at = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
             found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
         return found
@@ -174,7 +174,7 @@ class QuadGrid(UniformGrid):
 
     def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
         """Grids of patches, see `UniformGrid.layout`: one for a quadrilateral, one at each corner of others."""
-        is_quad = self.topology.face_sizes[self.topology.face_of(corners[0])] == 4
+        is_quad = self.topology.face_sizes[self.topology.face[corners[0]]] == 4
         return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
 
     def _quad_layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
@@ -183,7 +183,7 @@ class QuadGrid(UniformGrid):
         uv = _lattice(count, 1, self.rate)
         inner = index[1:-1, 1:-1].ravel()
         parts = []
-        face = t.face_of(corners)
+        face = t.face[corners]
         turns = corners - t.face_offsets[face]
         # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
         for turn in range(4):
@@ -203,7 +203,7 @@ class QuadGrid(UniformGrid):
         """
         t, count = self.topology, self.half + 1
         previous = t.prev[corners]
-        is_quad = t.face_sizes[t.face_of(corners[0])] == 4
+        is_quad = t.face_sizes[t.face[corners[0]]] == 4
         owns_edge = np.flatnonzero(self.owns_edge[corners])
         owns_previous = np.flatnonzero(self.owns_edge[previous])
         owns_vertex = np.flatnonzero(self.owns_vertex[corners])
@@ -238,7 +238,7 @@ class QuadGrid(UniformGrid):
         t, count = self.topology, self.half + 1
         index = np.arange(count**2).reshape(count, count)
         every = np.arange(len(corners))
-        is_first = np.flatnonzero(t.face_offsets[t.face_of(corners)] == corners)
+        is_first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
         grid, spoke, centre = index[self._inside, self._inside].ravel(), index[self._inside, -1], np.array([count**2])
         parts = [
             GridPart.of(grid, every, self._corner_start(corners), corners, uv[grid]),
@@ -251,7 +251,7 @@ class QuadGrid(UniformGrid):
     def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
         """Parts inside quadrilaterals, of patches at their corners."""
         t, r = self.topology, self.rate
-        face = t.face_of(corners)
+        face = t.face[corners]
         turns = corners - t.face_offsets[face]
         index = np.arange((self.half + 1) ** 2).reshape(self.half + 1, self.half + 1)
         # A patch evaluates the samples that are nearer to its corner than to others and, for an even rate, those on its

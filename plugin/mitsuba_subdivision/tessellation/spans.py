@@ -139,7 +139,7 @@ class Spans:
             for border in borders:
                 if border.is_spoke:
                     is_centre = border.at == UNIT
-                    faces = t.face_of(border.edge)
+                    faces = t.face[border.edge]
                     name[border.on] = np.where(is_centre, at_centre + faces, on_spoke + border.edge)
                     x[border.on], y[border.on] = np.where(is_centre, 0, border.at), 0
             # The first point of a spoke is on an edge, as the first and the last one of an edge are vertices.

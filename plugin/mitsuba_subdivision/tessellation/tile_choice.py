@@ -97,7 +97,7 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
     most = of_edges.max()
     # Tiles halve their patches.
     rate = 1 << int(most - 1).bit_length()
-    count, total = len(np.unique(t.face_of(coarse.corner))), int(np.count_nonzero(t.face_sizes))
+    count, total = len(np.unique(t.face[coarse.corner])), int(np.count_nonzero(t.face_sizes))
     kind, larger = "faces" if patches.scheme.element == "face" else "vertices", "a larger error"
     warn(
         f"{cage_name}: with a max_rate of {max_rate}, the adaptive tessellation is coarser than asked for at "
@@ -318,7 +318,7 @@ def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
         y, z = (points[:, (axis + step) % 3].take(t.face_vertices) for step in (1, 2))
         found[axis] = np.bincount(t.face, y * z.take(t.next) - z * y.take(t.next), t.face_count)
     if patches.scheme.element == "vertex":
-        of_corner, t = found[:, t.face_of(patches.half_edge_of_corner)], patches.elements
+        of_corner, t = found[:, t.face[patches.half_edge_of_corner]], patches.elements
         found = np.stack([np.bincount(t.face, x, t.face_count) for x in of_corner])
     length: FloatArray = np.sqrt(dot(found, found))
     return found / np.where(length > 0, length, 1)
@@ -327,7 +327,7 @@ def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
 def sides_on(edges: NDArray[np.bool_], frames: PatchFrames, corners: IntArray) -> NDArray[np.bool_]:
     """``(p, m)`` which sides of the patches that begin at these corners lie on some edges, ``(n_h,)``."""
     t, m = frames.topology, frames.domain.corner_count
-    is_whole = frames.is_whole[t.face_of(corners)]
+    is_whole = frames.is_whole[t.face[corners]]
     found = np.zeros((len(corners), m), dtype=bool)
     half_edge = corners
     for side in range(m):

@@ -168,7 +168,7 @@ class TileRates:
         flipped, size = tiles.is_flipped, tiles.size / UNIT
         uv = [size * (origin + np.where(flipped, 1 - t, t)) for origin, t in zip(tiles.origin.T, (u, v), strict=True)]
         corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
-        scale = self.frames.scale[self.frames.topology.face_of(tiles.corner)]
+        scale = self.frames.scale[self.frames.topology.face[tiles.corner]]
         found = displacement.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
         return found.reshape(HEIGHT_SAMPLES, HEIGHT_SAMPLES, -1)
 

@@ -36,7 +36,7 @@ def at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) ->
     """``(t, m)`` whether corners of tiles lie at half-edges' beginnings that are marked, ``(n_h,)``: at vertices."""
     t, domain = frames.topology, frames.domain
     found = np.zeros((len(tiles), domain.corner_count), dtype=bool)
-    is_whole, half_edge = frames.is_whole[t.face_of(tiles.corner)], tiles.corner
+    is_whole, half_edge = frames.is_whole[t.face[tiles.corner]], tiles.corner
     for number, corner in enumerate(domain.corners.astype(np.int32) * UNIT):
         near = np.flatnonzero(marked[half_edge] & (is_whole | (number == 0)))
         u, v = tile_corners(tiles[near], domain)
@@ -59,7 +59,7 @@ def points_on_sides(frames: PatchFrames, corner: IntArray, points: IndexArray) -
     """Of points ``(2, n)`` of the patches that begin at corners, those that lie on the patches' sides, side by side."""
     t = frames.topology
     u, v = points
-    is_whole = frames.is_whole[t.face_of(corner)]
+    is_whole = frames.is_whole[t.face[corner]]
     # How far from each side, and how far along it.
     if frames.domain.corner_count == 3:
         sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
@@ -109,7 +109,7 @@ def side_lines(tiles: Tiles, frames: PatchFrames) -> SideLines:
     low, halvings = (np.empty(shape, dtype=np.int32) for _ in range(2))
     is_backward = np.empty(shape, dtype=bool)
     halvings[:] = tiles.depth[:, None] + 1
-    is_whole, edge = frames.is_whole[t.face_of(tiles.corner)], tiles.corner
+    is_whole, edge = frames.is_whole[t.face[tiles.corner]], tiles.corner
     borders: list[tuple[IntArray, IntArray, IntArray, IntArray, bool]]
     if m == 3:
         # At which level, from where on, how far from the patch's side, and how far along it.

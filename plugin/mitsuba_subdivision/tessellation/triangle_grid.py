@@ -66,7 +66,7 @@ class TriangleGrid(UniformGrid):
         uv = np.stack([u, v], axis=1) / self.rate
         u, v = u[self._inner], v[self._inner]
         w = self.rate - u - v
-        face = t.face_of(corners)
+        face = t.face[corners]
         turns = corners - t.face_offsets[face]
         parts = []
         # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.

@@ -126,7 +126,7 @@ def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[Patc
         corners = patch_class.corners if refined is None else refined.corners(patch_class)
         # The first patch stands for its class. In the cage refined once, too, all patches of a class lie in elements of
         # the same number of corners: it is the valence of the elements' centres.
-        element = patches.elements.face_of(corners[:1])
+        element = patches.elements.face[corners[:1]]
         of_kind[bool(patches.is_whole[element][0])].append((patch_class, corners))
     for found in filter(None, of_kind.values()):
         corners = np.concatenate([corners for _, corners in found])
