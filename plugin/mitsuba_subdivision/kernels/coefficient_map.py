@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -101,12 +102,12 @@ class _Steps:
         Map to the control points of the cage refined once.
     refined_count, point_count : int
         Of these control points, and of all together with those of parts.
-    parts : WeightRows or None
+    parts : _Packets or None
         Control points of parts.
     rings : tuple of three index arrays, or None
         Control points that are packets of the coefficients: their indices, those of what they are relative to or
         `NOTHING`, and the packets.
-    pieces : WeightRows or None
+    pieces : _Packets or None
         Coefficients of pieces.
     """
 
@@ -176,7 +177,7 @@ class _Blocks:
         row = self._weights[key][1]
         self.added.append((len(weights), count, first, control_count, row, to, apart, step))
 
-    def rows(self, types: ArrayTypes, controls: IndexBuffer) -> WeightRows:
+    def rows(self, types: ArrayTypes, controls: IndexBuffer) -> _Packets:
         """Upload the blocks."""
         weights = padded_rows([block for block, _ in self._weights.values()], types.numpy_float)
         added = np.array(self.added)
@@ -186,7 +187,39 @@ class _Blocks:
         columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
         block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
         packet = (to + index * apart)[block] + patch * step[block]
-        return WeightRows(types, self.width, columns, weights, controls, block, patch, packet)
+        return _Packets(
+            WeightRows(types, self.width, columns, weights, controls, block, patch), self.width, types, packet
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Packets:
+    """Blocks of weights whose vectors are written to packets."""
+
+    rows: WeightRows
+    width: int  # Number of vectors of a lane
+    types: ArrayTypes
+    packet: np.ndarray  # (n,) int: the first packet of each lane
+
+    @cached_property
+    def _at(self) -> IndexBuffer:
+        return self.types.indices(self.packet)
+
+    def write(self, padded: FloatBuffer, found: FloatBuffer) -> None:
+        """Scatter packets of all vectors, computed from the padded control points."""
+        vectors, _, _ = self.rows.vectors(padded)
+        numbers = [number for vector in vectors for number in vector]
+        numbers += [self.types.float(0)] * (-len(numbers) % PACKET)
+        for i in range(0, len(numbers), PACKET):
+            packet = self.types.vector4(*numbers[i : i + PACKET])
+            dr.scatter(found, packet, self._at + i // PACKET, mode=NO_CONFLICTS)
+
+    def add_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
+        """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
+        of_lane = piece_packets(self.width)
+        numbers = self.types.row(gradient, PACKET * of_lane, self._at // of_lane)
+        vectors = [self.types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self.width)]
+        self.rows.add_transposed(vectors, sums)
 
 
 class WeightRows:
@@ -203,14 +236,8 @@ class WeightRows:
         A row for each control point of a block, with a number for each vector that it makes.
     controls : index array
         Indices of control points.
-    block, patch, packet : (n,) int
-        Of each lane: its block, its patch, and where it writes to. Lanes of a block are consecutive, so that they read
-        the same weights.
-    extent_weights : (b,) float, optional
-        If given, another packet follows the vectors of each lane: this, times how far the control points of the patch
-        are from the first of them along each axis.
-    least_extent : float
-        That is taken to be at least this part of the distance from the origin.
+    block, patch : (n,) int
+        Of each lane. Lanes of a block are consecutive, so that they read the same weights.
     """
 
     def __init__(
@@ -222,54 +249,37 @@ class WeightRows:
         controls: IndexBuffer,
         block: np.ndarray,
         patch: np.ndarray,
-        packet: np.ndarray,
-        extent_weights: np.ndarray | None = None,
-        least_extent: float = 0,
     ) -> None:
         self._types, self._width, self._controls = types, width, controls
-        self._row_size, self._count = weights.shape[1], len(block)
-        self._lane = tuple(types.indices(each) for each in (block, patch, packet))
-        self._columns = types.indices(columns)
-        self._weights = types.floats(weights)
-        self._extent_weights = None if extent_weights is None else types.floats(extent_weights)
-        self._least_extent = least_extent
-        # Packets of a lane.
-        self.packet_count = piece_packets(width) + (extent_weights is not None)
+        self._row_size, self.count = weights.shape[1], len(block)
+        self._lane = types.indices(block), types.indices(patch)
+        self._columns, self._weights = types.indices(columns), types.floats(weights)
 
-    def write(self, padded: FloatBuffer, found: FloatBuffer) -> None:
-        """Scatter packets of all vectors, computed from the padded control points."""
+    def vectors(self, padded: FloatBuffer) -> tuple[list[Vector3], Vector3, Vector3]:
+        """Compute the vectors of each lane from the padded control points.
+
+        Also returns the first control point, which the others are relative to, and how far they are from it along each
+        axis.
+        """
         types = self._types
-        block, control, control_count, row, packet = self._lanes()
+        control, control_count, row = self._lanes()
         origin = types.packet(padded, control(types.index(0)))
-        has_extent = self._extent_weights is not None
 
-        def add(k, *sums):
+        def add(k, extent, *sums):
             relative = types.packet(padded, control(k)) - origin
-            weights = self._row(row + k)
-            added = [dr.fma(relative, weight, total) for weight, total in zip(weights, sums, strict=False)]
-            if has_extent:
-                added.append(dr.maximum(sums[-1], dr.abs(relative)))
-            return k + 1, *added
+            added = (dr.fma(relative, weight, total) for weight, total in zip(self._row(row + k), sums, strict=True))
+            return k + 1, dr.maximum(extent, dr.abs(relative)), *added
 
-        zero: Vector3 = dr.zeros(types.vector3, self._count)
-        start = (dr.full(types.index, 1, self._count), *(types.vector3(zero) for _ in range(self._width + has_extent)))
-        _, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
+        zero: Vector3 = dr.zeros(types.vector3, self.count)
+        start = (dr.full(types.index, 1, self.count), *(types.vector3(zero) for _ in range(self._width + 1)))
+        _, extent, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
         sums[0] = sums[0] + origin
-        numbers = [number for vector in sums[: self._width] for number in vector]
-        numbers += [types.float(0)] * (-len(numbers) % PACKET)
-        if has_extent:
-            extent = dr.maximum(sums[-1], dr.abs(origin) * self._least_extent)
-            extent *= types.fetch(types.float, self._extent_weights, block)
-            numbers += [*extent, types.float(0)]
-        for i in range(0, len(numbers), PACKET):
-            dr.scatter(found, types.vector4(*numbers[i : i + PACKET]), packet + i // PACKET, mode=NO_CONFLICTS)
+        return sums, origin, extent
 
-    def add_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
-        """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
-        types, of_lane = self._types, self.packet_count
-        _, control, control_count, row, packet = self._lanes()
-        numbers = types.row(gradient, PACKET * of_lane, packet // of_lane)
-        vectors = [types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self._width)]
+    def add_transposed(self, vectors: Sequence[Vector3], sums: FloatBuffer) -> None:
+        """Scatter-add vectors of each lane, times the weights, to the control points' packets."""
+        types = self._types
+        control, control_count, row = self._lanes()
 
         def add(k):
             total = vectors[0] * 0
@@ -278,21 +288,21 @@ class WeightRows:
             dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
             return (k + 1,)
 
-        start: tuple[Index] = (dr.zeros(types.index, self._count),)
+        start: tuple[Index] = (dr.zeros(types.index, self.count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
-    def _lanes(self) -> tuple[Index, Callable[[Index], Index], Index, Index, Index]:
-        """Per lane: its block; a function that finds its control points; their number, its first row and packet."""
+    def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index]:
+        """Per lane: a function that finds its control points; their number, and its first row of weights."""
         types = self._types
-        lane: Index = dr.arange(types.index, self._count)
-        block, patch, packet = (types.fetch(types.index, each, lane) for each in self._lane)
+        lane: Index = dr.arange(types.index, self.count)
+        block, patch = (types.fetch(types.index, each, lane) for each in self._lane)
         first_control, apart, control_count, row = types.fetch(types.index4, self._columns, block)
         at = first_control + patch
 
         def control(k: Index) -> Index:
             return types.fetch(types.index, self._controls, dr.fma(k, apart, at))
 
-        return block, control, control_count, row, packet
+        return control, control_count, row
 
     def _row(self, row: Index) -> list:
         """A row of weights, one for each vector."""

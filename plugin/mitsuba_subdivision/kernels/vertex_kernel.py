@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from ..mesh import ragged
-from ..patches.piece_table import PACKET, piece_packets
+from ..patches.piece_table import PACKET
 from .array_types import NO_CONFLICTS, ArrayTypes
 from .coefficient_map import WeightRows, padded_rows
 from .control_values import WeightedValues
@@ -42,7 +42,7 @@ class VertexKernel:
             self._refined_count = table.refinement.shape[0]
             self._refinement = WeightedValues.shared(table.refinement, float_type)
         controls, are_rounded = types.indices(table.controls), table.refinement is not None
-        self.parts = [_Part(types, each, controls, are_rounded) for each in table.polynomials]
+        self._parts = [_Part(types, each, controls, are_rounded) for each in table.polynomials]
         self._weld_target = types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
@@ -70,32 +70,32 @@ class VertexKernel:
         """
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
-        coefficients, found = self.coefficients(control_points), self._vectors()
-        for part, own in zip(self.parts, coefficients, strict=True):
-            part.evaluate(own, found)
-        return EvaluatedVertices(self, coefficients, *found)
+        padded, found = self._padded(control_points), self._vectors()
+        for part in self._parts:
+            part.evaluate(padded, found)
+        return EvaluatedVertices(self, control_points, *found)
 
-    def changes(self, coefficients: list[FloatBuffer], control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Changes of points and normals, where control points change by those given; flat, detached."""
-        found = self._vectors()
-        for part, own, change in zip(self.parts, coefficients, self.coefficients(control_points), strict=True):
-            part.evaluate(own, found, change)
+    def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Changes of points and normals, where control points change; flat, detached."""
+        padded, padded_change, found = self._padded(control_points), self._padded(change), self._vectors()
+        for part in self._parts:
+            part.evaluate(padded, found, padded_change)
         return found
 
-    def gradient(self, coefficients: list[FloatBuffer], positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
+    def gradient(self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from those by points and normals; flat, detached."""
         dr.eval(positions, normals)
+        padded = self._padded(control_points)
         sums: FloatBuffer = dr.zeros(self._types.float, PACKET * self._refined_count)
-        for part, own in zip(self.parts, coefficients, strict=True):
-            part.rows.add_transposed(part.transposed(own, positions, normals), sums)
+        for part in self._parts:
+            part.add_transposed(padded, positions, normals, sums)
         found = self._types.unpadded(sums, self._refined_count)
         return found if self._refinement is None else self._refinement.transposed(found)
 
-    def coefficients(self, control_points: FloatBuffer) -> list[FloatBuffer]:
-        """Coefficients of all polynomials, part by part."""
+    def _padded(self, control_points: FloatBuffer) -> FloatBuffer:
+        """Padded control points, refined if need be."""
         points = control_points if self._refinement is None else self._refinement.product(control_points)
-        padded = self._types.padded(points)
-        return [part.coefficients(padded) for part in self.parts]
+        return self._types.padded(points)
 
     def welded(self, positions: FloatBuffer) -> FloatBuffer:
         """The positions, with both sides of a crease equal bit by bit; see `VertexTable.weld_target`."""
@@ -109,52 +109,38 @@ class _Part:
     """Vertices on polynomials of the same monomials. A lane has a polynomial, and loops over its vertices."""
 
     def __init__(self, types: ArrayTypes, part: VertexPolynomials, controls: IndexBuffer, are_rounded: bool) -> None:
-        self._types = types
-        self._powers = part.powers.tolist()
-        self._monomials, self._count = Monomials(self._powers), len(part.block)
-        first_row = ragged.starts(part.blocks[:, 2])
-        precision = dr.type_v(types.float)
-        self.rows = WeightRows(
+        self._types, self._powers = types, part.powers.tolist()
+        self._monomials, precision = Monomials(self._powers), dr.type_v(types.float)
+        # Where rounding is all that is left of tangents; in parts of the extent, and of the origin.
+        self._rounding = types.floats((TANGENT_ROUNDING[precision] * part.tangent_weights)[part.block])
+        self._least_extent = LEAST_EXTENT[precision] if are_rounded else 0
+        self._rows = WeightRows(
             types,
             len(part.powers),
-            np.column_stack([part.blocks, first_row]),
+            np.column_stack([part.blocks, ragged.starts(part.blocks[:, 2])]),
             padded_rows(part.weights, types.numpy_float),
             controls,
             part.block,
             part.patch,
-            np.arange(self._count) * (piece_packets(len(part.powers)) + 1),
-            TANGENT_ROUNDING[precision] * part.tangent_weights,
-            LEAST_EXTENT[precision] if are_rounded else 0,
         )
         self._first_run, self._kind, self._first_vertex, self._first_entry, self._offset = map(
             types.indices, (part.first_run, part.kind, part.first_vertex, part.first_entry, part.offset)
         )
         self._st = types.floats(part.st)
 
-    @property
-    def _size(self) -> int:
-        """Numbers of a polynomial."""
-        return PACKET * self.rows.packet_count
-
-    def coefficients(self, padded: FloatBuffer) -> FloatBuffer:
-        """Coefficients, from padded control points."""
-        found: FloatBuffer = dr.empty(self._types.float, self._size * self._count)
-        self.rows.write(padded, found)
-        return found
-
     def evaluate(
-        self, coefficients: FloatBuffer, buffers: Sequence[FloatBuffer], change: FloatBuffer | None = None
+        self, padded: FloatBuffer, buffers: Sequence[FloatBuffer], padded_change: FloatBuffer | None = None
     ) -> None:
-        """Scatter points and normals, or how they change where coefficients do."""
-        numbers = self._numbers(coefficients)
-        changed, bound = None if change is None else self._numbers(change), self._bound(numbers)
+        """Scatter points and normals, or how they change where control points do."""
+        coefficients, bound = self._coefficients(padded)
+        change = None if padded_change is None else self._rows.vectors(padded_change)[0]
 
         def add(vertex: Index, s: Float, t: Float) -> tuple:
-            p, du, dv = self._values(numbers, s, t)
+            p, du, dv = self._monomials.values(coefficients, s, t)
             normal = UnitNormal(du, dv, bound)
             vectors = p, normal.value
-            if changed is not None:
-                p, change_u, change_v = self._values(changed, s, t)
+            if change is not None:
+                p, change_u, change_v = self._monomials.values(change, s, t)
                 vectors = p, normal.forward(change_u, change_v)
             for buffer, value in zip(buffers, vectors, strict=True):
                 dr.scatter(buffer, value, vertex, mode=NO_CONFLICTS)
@@ -162,50 +148,36 @@ class _Part:
 
         self._loop((), add, "vertices")
 
-    def transposed(self, coefficients: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
-        """Gradients by the coefficients, from those by points and normals."""
+    def add_transposed(
+        self, padded: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer, sums: FloatBuffer
+    ) -> None:
+        """Scatter-add gradients by padded control points, from those by points and normals."""
         types = self._types
-        numbers = self._numbers(coefficients)
-        bound = self._bound(numbers)
+        coefficients, bound = self._coefficients(padded)
 
-        def add(vertex: Index, s: Float, t: Float, *sums: Vector3) -> tuple:
-            _, du, dv = self._values(numbers, s, t)
+        def add(vertex: Index, s: Float, t: Float, *gradients: Vector3) -> tuple:
+            _, du, dv = self._monomials.values(coefficients, s, t)
             p: Vector3 = dr.gather(types.vector3, positions, vertex)
             normal: Vector3 = dr.gather(types.vector3, normals, vertex)
             by_u, by_v = UnitNormal(du, dv, bound).backward(normal)
             added = []
-            for (a, b), total in zip(self._powers, sums, strict=True):
+            for (a, b), gradient in zip(self._powers, gradients, strict=True):
                 one, of_s, of_t = _monomial(a, b, s, t)
-                own = dr.fma(p, one, total)
+                own = dr.fma(p, one, gradient)
                 own = own if of_s is None else dr.fma(by_u, of_s, own)
                 added.append(own if of_t is None else dr.fma(by_v, of_t, own))
             return tuple(added)
 
-        zero: Vector3 = dr.zeros(types.vector3, self._count)
-        sums = self._loop(tuple(types.vector3(zero) for _ in self._powers), add, "vertex_gradients")
-        found: FloatBuffer = dr.empty(types.float, self._size * self._count)
-        lane: Index = dr.arange(types.index, self._count)
-        flat = [number for vector in sums for number in vector]
-        flat += [types.float(0)] * (self._size - len(flat))
-        for i in range(0, len(flat), PACKET):
-            packet = dr.fma(lane, self.rows.packet_count, i // PACKET)
-            dr.scatter(found, types.vector4(*flat[i : i + PACKET]), packet, mode=NO_CONFLICTS)
-        return found
+        zero: Vector3 = dr.zeros(types.vector3, self._rows.count)
+        gradients = self._loop(tuple(types.vector3(zero) for _ in self._powers), add, "vertex_gradients")
+        self._rows.add_transposed(gradients, sums)
 
-    def _numbers(self, coefficients: FloatBuffer) -> list[Float]:
-        lane: Index = dr.arange(self._types.index, self._count)
-        return self._types.row(coefficients, self._size, lane)
-
-    def _bound(self, numbers: list[Float]) -> RoundingBound:
-        one = self._types.float(1)
-        return RoundingBound(one, one, self._types.vector3(*numbers[-4:-1]))
-
-    def _values(self, numbers: list[Float], s: Float, t: Float) -> tuple[Vector3, Vector3, Vector3]:
-        """The point and the two tangents."""
-        count = 3 * len(self._powers)
-        found = [self._monomials.values(numbers[i:count:3], s, t) for i in range(3)]
-        point, du, dv = (self._types.vector3(*each) for each in zip(*found, strict=True))
-        return point, du, dv
+    def _coefficients(self, padded: FloatBuffer) -> tuple[list[Vector3], RoundingBound]:
+        """The coefficients of each lane's polynomial, and the rounding bound of its tangents."""
+        types = self._types
+        coefficients, origin, extent = self._rows.vectors(padded)
+        rounding: Float = types.fetch(types.float, self._rounding, dr.arange(types.index, self._rows.count))
+        return coefficients, RoundingBound(rounding, rounding, dr.maximum(extent, dr.abs(origin) * self._least_extent))
 
     def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
         """Loop over the vertices of each lane's polynomial, of which the numbers and parameters are given."""
@@ -228,17 +200,17 @@ class _Part:
             )
             return run + 1, *entries[1:]
 
-        first_run, last_run = ends(self._first_run, dr.arange(types.index, self._count))
+        first_run, last_run = ends(self._first_run, dr.arange(types.index, self._rows.count))
         _, *found = dr.while_loop((first_run, *start), lambda run, *_: run < last_run, over_runs, label=label)
         return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedVertices:
-    """Vertices of a tessellation, with the coefficients that their derivatives by the control points need."""
+    """Vertices of a tessellation, with what their derivatives by the control points need."""
 
     kernel: VertexKernel
-    coefficients: list[FloatBuffer]  # Of each part
+    control_points: FloatBuffer  # That were evaluated, detached
     # flat Dr.Jit float arrays, (3 vertex_count): points and unit normals; detached
     positions: FloatBuffer
     normals: FloatBuffer
@@ -268,11 +240,11 @@ class _Evaluation(dr.CustomOp):
 
     def forward(self):
         vertices = self.vertices
-        self.set_grad_out(vertices.kernel.changes(vertices.coefficients, self.grad_in("control_points")))
+        self.set_grad_out(vertices.kernel.changes(vertices.control_points, self.grad_in("control_points")))
 
     def backward(self):
         vertices = self.vertices
-        self.set_grad_in("control_points", vertices.kernel.gradient(vertices.coefficients, *self.grad_out()))
+        self.set_grad_in("control_points", vertices.kernel.gradient(vertices.control_points, *self.grad_out()))
 
     def name(self):
         return "VertexKernel"
