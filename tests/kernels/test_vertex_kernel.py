@@ -107,8 +107,8 @@ def launched(kernel, points):
 def test_classes_share_kernels(surface, float_type):
     table = surface.sampling(4)
     kernel = VertexKernel(table, float_type)
-    # One packs the control points; one each for coefficients and vertices, on planes and on polynomials of the scheme.
-    expected = 1 + 2 * len(table.polynomials)
+    # One packs the control points; one each for vertices on planes and on polynomials of the scheme.
+    expected = 1 + len(table.polynomials)
     assert len(launched(kernel, upload(float_type, surface.cage.positions))) == expected
 
 

@@ -25,6 +25,10 @@ from ..schemes.scheme import Scheme
 WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 17, 1 << 18
 
 
+# Polynomials of so many patches follow each other.
+PATCHES_TOGETHER = 1 << 7
+
+
 class VertexRuns(NamedTuple):
     """The vertices of a tessellation, in runs of successive ones.
 
@@ -56,7 +60,7 @@ class VertexPolynomials:
     blocks: IntArray
     # (b,) float64: sum of the absolute weights in either tangent of a vertex, or more
     tangent_weights: FloatArray
-    block: IndexArray  # (p,) int32: of each polynomial; ascending
+    block: IndexArray  # (p,) int32: of each polynomial; blocks of one size of one-rings together
     patch: IndexArray  # (p,) int32: of each polynomial, counted from the first of its class
     # A run has vertices of one polynomial, and runs of a kind have them at the same parameters. Where these are:
     first_run: IntArray  # (p + 1,) int64: the first run of each polynomial; then the number of runs
@@ -72,9 +76,12 @@ class VertexPolynomials:
         Coefficients are relative to a control point of each patch.
         """
         monomials = _monomials(self.powers, self.st)[:row_count]
+        # Blocks of one size follow each other, and so do their polynomials.
+        ends = np.cumsum([len(weights) for weights in self.weights])
+        size = np.searchsorted(ends, self.block, side="right")
         first_block = 0
-        for weights in self.weights:
-            begin, end = np.searchsorted(self.block, [first_block, first_block + len(weights)]).tolist()
+        for number, weights in enumerate(self.weights):
+            begin, end = np.searchsorted(size, [number, number + 1]).tolist()
             step = max(1, WEIGHTS_AT_ONCE // weights[0].size)
             for first in range(begin, end, step):
                 polynomials = slice(first, min(first + step, end))
@@ -194,13 +201,17 @@ def _joined(
     part_counts = np.bincount(kind[first_entry], minlength=len(runs.counts))
     run = np.repeat(np.arange(len(runs.kind)), part_counts[runs.kind])
     own_kind = ragged.ranges(ragged.starts(part_counts)[runs.kind], part_counts[runs.kind])
-    patch_count = int(blocks[:, 1].max())
-    keys = block[first_entry][own_kind] * patch_count + runs.patch[run]
+    # Polynomials of some neighbouring patches are neighbours, block by block: their vertices stay in a core's cache.
+    class_of_block = np.repeat(np.arange(len(used)), [len(parts[index].rows) for index in used])
+    run_block, patch = block[first_entry][own_kind], runs.patch[run]
+    chunk = class_of_block[run_block] * (1 + int(patch.max()) // PATCHES_TOGETHER) + patch // PATCHES_TOGETHER
+    keys = (chunk * len(blocks) + run_block) * PATCHES_TOGETHER + patch % PATCHES_TOGETHER
     # Stable: fast where keys are sorted in large parts, as those of a uniform grid are.
     of_polynomial = np.argsort(keys, kind="stable")
-    keys, run = keys[of_polynomial], run[of_polynomial]
-    first_run = np.flatnonzero(np.diff(keys, prepend=-1))
-    run_block, patch = np.divmod(keys[first_run], patch_count)
+    run = run[of_polynomial]
+    first_run = np.flatnonzero(np.diff(keys[of_polynomial], prepend=-1))
+    first = of_polynomial[first_run]
+    run_block, patch = run_block[first], patch[first]
     magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])[block]
     tangent_weights = np.zeros(len(blocks))
     slopes = (np.abs(_monomials(powers, st[sample])[1:]) * magnitude.T).sum(axis=1).max(axis=0)
