@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -15,7 +14,8 @@ from ..mesh.shared import Shared
 from ..patches.piece_table import NOTHING, PACKET, piece_packets
 from .array_types import NO_CONFLICTS, ArrayTypes
 from .control_values import WeightedValues
-from .types import FloatBuffer, Index, IndexBuffer, Vector3, Vector4
+from .types import FloatBuffer, Index, IndexBuffer, Vector4
+from .weight_rows import WeightRows, padded_rows
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -187,9 +187,8 @@ class _Blocks:
         columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
         block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
         packet = (to + index * apart)[block] + patch * step[block]
-        return _Packets(
-            WeightRows(types, self.width, columns, weights, controls, block, patch), self.width, types, packet
-        )
+        rows = WeightRows(types, self.width, columns, weights, controls, block, patch)
+        return _Packets(rows, types, types.indices(packet))
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +196,8 @@ class _Packets:
     """Blocks of weights whose vectors are written to packets."""
 
     rows: WeightRows
-    width: int  # Number of vectors of a lane
     types: ArrayTypes
-    packet: np.ndarray  # (n,) int: the first packet of each lane
-
-    @cached_property
-    def _at(self) -> IndexBuffer:
-        return self.types.indices(self.packet)
+    first: IndexBuffer  # Of each lane its first packet
 
     def write(self, padded: FloatBuffer, found: FloatBuffer) -> None:
         """Scatter packets of all vectors, computed from the padded control points."""
@@ -212,119 +206,14 @@ class _Packets:
         numbers += [self.types.float(0)] * (-len(numbers) % PACKET)
         for i in range(0, len(numbers), PACKET):
             packet = self.types.vector4(*numbers[i : i + PACKET])
-            dr.scatter(found, packet, self._at + i // PACKET, mode=NO_CONFLICTS)
+            dr.scatter(found, packet, self.first + i // PACKET, mode=NO_CONFLICTS)
 
     def add_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
         """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
-        of_lane = piece_packets(self.width)
-        numbers = self.types.row(gradient, PACKET * of_lane, self._at // of_lane)
-        vectors = [self.types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self.width)]
+        of_lane = piece_packets(self.rows.width)
+        numbers = self.types.row(gradient, PACKET * of_lane, self.first // of_lane)
+        vectors = [self.types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self.rows.width)]
         self.rows.add_transposed(vectors, sums)
-
-
-class WeightRows:
-    """Blocks of weights on a device, and a lane for each patch of each block.
-
-    Parameters
-    ----------
-    width : int
-        Number of vectors that a row of weights computes.
-    columns : (b, 4) int
-        Of each block the index of its first control in ``controls``, how far those of a patch are apart, and how many
-        they are; its first row of weights.
-    weights : (w, ..) float
-        A row for each control point of a block, with a number for each vector that it makes.
-    controls : index array
-        Indices of control points.
-    block, patch : (n,) int
-        Of each lane. Lanes of a block are consecutive, so that they read the same weights.
-    """
-
-    def __init__(
-        self,
-        types: ArrayTypes,
-        width: int,
-        columns: np.ndarray,
-        weights: np.ndarray,
-        controls: IndexBuffer,
-        block: np.ndarray,
-        patch: np.ndarray,
-    ) -> None:
-        self._types, self._width, self._controls = types, width, controls
-        self._row_size, self.count = weights.shape[1], len(block)
-        self._lane = types.indices(block), types.indices(patch)
-        self._columns, self._weights = types.indices(columns), types.floats(weights)
-
-    def vectors(self, padded: FloatBuffer) -> tuple[list[Vector3], Vector3, Vector3]:
-        """Compute the vectors of each lane from the padded control points.
-
-        Also returns the first control point, which the others are relative to, and how far they are from it along each
-        axis.
-        """
-        types = self._types
-        control, control_count, row = self._lanes()
-        origin = types.packet(padded, control(types.index(0)))
-
-        def add(k, extent, *sums):
-            relative = types.packet(padded, control(k)) - origin
-            added = (dr.fma(relative, weight, total) for weight, total in zip(self._row(row + k), sums, strict=True))
-            return k + 1, dr.maximum(extent, dr.abs(relative)), *added
-
-        zero: Vector3 = dr.zeros(types.vector3, self.count)
-        start = (dr.full(types.index, 1, self.count), *(types.vector3(zero) for _ in range(self._width + 1)))
-        _, extent, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
-        sums[0] = sums[0] + origin
-        return sums, origin, extent
-
-    def add_transposed(self, vectors: Sequence[Vector3], sums: FloatBuffer) -> None:
-        """Scatter-add vectors of each lane, times the weights, to the control points' packets."""
-        types = self._types
-        control, control_count, row = self._lanes()
-
-        def add(k):
-            total = vectors[0] * 0
-            for vector, weight in zip(vectors, self._row(row + k), strict=True):
-                total = dr.fma(vector, weight, total)
-            dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
-            return (k + 1,)
-
-        start: tuple[Index] = (dr.zeros(types.index, self.count),)
-        dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
-
-    def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index]:
-        """Per lane: a function that finds its control points; their number, and its first row of weights."""
-        types = self._types
-        lane: Index = dr.arange(types.index, self.count)
-        block, patch = (types.fetch(types.index, each, lane) for each in self._lane)
-        first_control, apart, control_count, row = types.fetch(types.index4, self._columns, block)
-        at = first_control + patch
-
-        def control(k: Index) -> Index:
-            return types.fetch(types.index, self._controls, dr.fma(k, apart, at))
-
-        return control, control_count, row
-
-    def _row(self, row: Index) -> list:
-        """A row of weights, one for each vector."""
-        return self._types.row(self._weights, self._row_size, row)[: self._width]
-
-
-def padded_rows(blocks: Sequence[np.ndarray], dtype: type) -> np.ndarray:
-    """Blocks ``(b, m, K)``, in which the first control point is the origin, as rows of `WeightRows`.
-
-    Rows are those of all control points of a block, then of the next one. Weights of the origin are those of the
-    transposed map, which make sums one for constants and zero for other coefficients.
-    """
-    size = -(-blocks[0].shape[1] // PACKET) * PACKET
-    found = np.zeros((sum(len(block) * block.shape[2] for block in blocks), size), dtype=dtype)
-    end = 0
-    for block in blocks:
-        begin, end = end, end + len(block) * block.shape[2]
-        own = found[begin:end].reshape(len(block), block.shape[2], size)[:, :, : block.shape[1]]
-        own[:] = block.swapaxes(1, 2)
-        own[:, 0] = -block[:, :, 1:].sum(axis=2)
-        own[:, 0, 0] += 1
-    return found
 
 
 class _Coefficients(dr.CustomOp):

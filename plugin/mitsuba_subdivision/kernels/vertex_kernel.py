@@ -12,11 +12,11 @@ import numpy as np
 from ..mesh import ragged
 from ..patches.piece_table import PACKET
 from .array_types import NO_CONFLICTS, ArrayTypes
-from .coefficient_map import WeightRows, padded_rows
 from .control_values import WeightedValues
 from .polynomial import Monomials
 from .types import Float, FloatBuffer, Index, IndexBuffer, Vector3
 from .unit_normal import LEAST_EXTENT, TANGENT_ROUNDING, RoundingBound, UnitNormal
+from .weight_rows import WeightRows, padded_rows
 
 if TYPE_CHECKING:
     from ..tessellation import VertexPolynomials, VertexTable
@@ -36,7 +36,6 @@ class VertexKernel:
     def __init__(self, table: VertexTable, float_type: type) -> None:
         self.vertex_count, self.control_count = table.vertex_count, table.control_count
         self._types = types = ArrayTypes.of(float_type)
-        self.vector3 = types.vector3
         self._refined_count, self._refinement = table.control_count, None
         if table.refinement is not None:
             self._refined_count = table.refinement.shape[0]

@@ -147,89 +147,105 @@ def vertex_polynomials(
 
     ``uv`` are the samples ``(s, 2)`` of each class.
     """
-    # At low rates, patches of other classes may have all samples of a class.
-    used = np.unique(runs.patch_class)
-    classes, uv = [classes[index] for index in used.tolist()], [uv[index] for index in used.tolist()]
-    runs = runs._replace(patch_class=np.searchsorted(used, runs.patch_class))
+    # At low rates, patches of other classes may have all samples of a class. One-rings of the same size come together.
+    used = np.unique(runs.patch_class).tolist()
+    used.sort(key=lambda index: classes[index].controls.shape[1])
+    number = np.empty(len(classes), dtype=np.int64)
+    number[used] = np.arange(len(used))
+    classes, uv = [classes[index] for index in used], [uv[index] for index in used]
     known: Known = {}
     found = [
         sampled_polynomials(element_of(scheme, each.signature), own, known)
         for each, own in counted(list(zip(classes, uv, strict=True)), "Polynomials of patch classes")
     ]
-    counts = np.array([len(own) for own in uv])
+    # Samples are counted through all classes from now on.
+    first_sample = ragged.offsets([len(own) for own in uv])
+    runs = runs._replace(
+        patch_class=number[runs.patch_class],
+        samples=np.repeat(first_sample[number[runs.patch_class]], runs.counts) + runs.samples,
+    )
     forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), zip(*found, strict=True), strict=True)
-    built = [_joined(powers, classes, parts, counts, runs) for powers, parts in forms]
-    return tuple(each for each in built if each is not None)
+    return tuple(
+        _of_form(powers, classes, parts, first_sample, runs)
+        for powers, parts in forms
+        if any(len(part.rows) for part in parts)
+    )
 
 
-def _joined(
+def _of_form(
     powers: IntArray,
     classes: Sequence[PatchClass],
     parts: Sequence[Polynomials],
-    sample_counts: IntArray,
+    first_sample: IntArray,
     runs: VertexRuns,
-) -> VertexPolynomials | None:
-    """Polynomials of one form of all classes."""
-    used = [index for index, part in enumerate(parts) if len(part.rows)]
-    if not used:
-        return None
-    # Blocks of one-rings of the same size follow each other.
-    used.sort(key=lambda index: classes[index].controls.shape[1])
-    sizes = np.array([classes[index].controls.shape[1] for index in used])
-    first_block = np.zeros(len(classes), dtype=np.int64)
-    first_block[used] = ragged.starts(np.array([len(parts[index].rows) for index in used]))
-    first_sample = ragged.starts(sample_counts)
-    block_of_sample, st = np.full(int(sample_counts.sum()), -1), np.zeros((int(sample_counts.sum()), 2))
-    for part, block, start in zip(parts, first_block.tolist(), first_sample.tolist(), strict=True):
+) -> VertexPolynomials:
+    """Polynomials of the same monomials of all classes."""
+    block_counts = np.array([len(part.rows) for part in parts])
+    class_of_block = np.repeat(np.arange(len(parts)), block_counts)
+    blocks = np.array([(each.first_control, *each.controls.shape) for each in classes])[class_of_block]
+    of_size: dict[int, list[FloatArray]] = {}
+    for part in parts:
+        if len(part.rows):
+            of_size.setdefault(part.rows.shape[2], []).append(part.rows)
+    weights = tuple(map(np.concatenate, of_size.values()))
+    block_of_sample, st = np.full(int(first_sample[-1]), -1), np.zeros((int(first_sample[-1]), 2))
+    for part, block, start in zip(parts, ragged.starts(block_counts), first_sample[:-1], strict=True):
         block_of_sample[start + part.sample] = block + part.polynomial
         st[start + part.sample] = part.st
-    weights = tuple(
-        np.concatenate([parts[index].rows for index, own in zip(used, sizes, strict=True) if own == size])
-        for size in np.unique(sizes)
-    )
-    blocks = np.concatenate(
-        [np.tile([classes[i].first_control, *classes[i].controls.shape], (len(parts[i].rows), 1)) for i in used]
-    )
-    # Each kind is divided into those of its samples that lie in the same block.
-    sample = np.repeat(first_sample[runs.patch_class], runs.counts) + runs.samples
-    kind, offset = np.repeat(np.arange(len(runs.counts)), runs.counts), ragged.index_in_row(runs.counts)
-    block = block_of_sample[sample]
-    order = np.lexsort((block, kind))
-    order = order[block[order] >= 0]
-    sample, kind, offset, block = sample[order], kind[order], offset[order], block[order]
-    first_entry = np.flatnonzero((np.diff(kind, prepend=-1) != 0) | (np.diff(block, prepend=-1) != 0))
-    part_counts = np.bincount(kind[first_entry], minlength=len(runs.counts))
-    run = np.repeat(np.arange(len(runs.kind)), part_counts[runs.kind])
-    own_kind = ragged.ranges(ragged.starts(part_counts)[runs.kind], part_counts[runs.kind])
-    # Polynomials of some neighbouring patches are neighbours, block by block: their vertices stay in a core's cache.
-    class_of_block = np.repeat(np.arange(len(used)), [len(parts[index].rows) for index in used])
+    kind, entry, first_entry = _divided_kinds(runs, block_of_sample)
+    sample = runs.samples[entry]
+    st, block = st[sample], block_of_sample[sample]
+    run, own_kind = _divided_runs(runs, kind[first_entry])
     run_block, patch = block[first_entry][own_kind], runs.patch[run]
+    # Polynomials of some neighbouring patches are neighbours, block by block: their vertices stay in a core's cache.
     chunk = class_of_block[run_block] * (1 + int(patch.max()) // PATCHES_TOGETHER) + patch // PATCHES_TOGETHER
     keys = (chunk * len(blocks) + run_block) * PATCHES_TOGETHER + patch % PATCHES_TOGETHER
     # Stable: fast where keys are sorted in large parts, as those of a uniform grid are.
-    of_polynomial = np.argsort(keys, kind="stable")
-    run = run[of_polynomial]
-    first_run = np.flatnonzero(np.diff(keys[of_polynomial], prepend=-1))
-    first = of_polynomial[first_run]
-    run_block, patch = run_block[first], patch[first]
-    magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])[block]
-    tangent_weights = np.zeros(len(blocks))
-    slopes = (np.abs(_monomials(powers, st[sample])[1:]) * magnitude.T).sum(axis=1).max(axis=0)
-    np.maximum.at(tangent_weights, block, slopes)
+    order = np.argsort(keys, kind="stable")
+    first_run = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    first = order[first_run]
     return VertexPolynomials(
         powers,
         weights,
         blocks,
-        tangent_weights,
-        run_block.astype(np.int32),
-        patch.astype(np.int32),
+        _tangent_weights(powers, weights, block, st),
+        run_block[first].astype(np.int32),
+        patch[first].astype(np.int32),
         np.append(first_run, len(keys)),
-        own_kind[of_polynomial].astype(np.int32),
-        runs.first_vertex[run].astype(np.uint32),
+        own_kind[order].astype(np.int32),
+        runs.first_vertex[run[order]].astype(np.uint32),
         np.append(first_entry, len(sample)),
-        offset.astype(np.int32),
-        st[sample],
+        ragged.index_in_row(runs.counts)[entry].astype(np.int32),
+        st,
     )
+
+
+def _divided_kinds(runs: VertexRuns, block_of_sample: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Kinds divided into those of samples in the same block.
+
+    Returns the kind and the index in ``runs.samples`` of each sample that is in a block, and where the parts begin.
+    """
+    kind, block = np.repeat(np.arange(len(runs.counts)), runs.counts), block_of_sample[runs.samples]
+    order = np.lexsort((block, kind))
+    order = order[block[order] >= 0]
+    kind, block = kind[order], block[order]
+    return kind, order, np.flatnonzero((np.diff(kind, prepend=-1) != 0) | (np.diff(block, prepend=-1) != 0))
+
+
+def _divided_runs(runs: VertexRuns, kind_of_part: IntArray) -> tuple[IntArray, IntArray]:
+    """Runs divided as their kinds are: of each part of each run the run, and which part of all kinds it is."""
+    part_counts = np.bincount(kind_of_part, minlength=len(runs.counts))
+    counts = part_counts[runs.kind]
+    return np.repeat(np.arange(len(counts)), counts), ragged.ranges(ragged.starts(part_counts)[runs.kind], counts)
+
+
+def _tangent_weights(powers: IntArray, weights: tuple[FloatArray, ...], block: IntArray, st: FloatArray) -> FloatArray:
+    """`VertexPolynomials.tangent_weights`, from the block and the parameters of each entry."""
+    magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])
+    slopes = (np.abs(_monomials(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0)
+    found = np.zeros(len(magnitude))
+    np.maximum.at(found, block, slopes)
+    return found
 
 
 def _monomials(powers: IntArray, st: FloatArray) -> FloatArray:
