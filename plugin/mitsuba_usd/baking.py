@@ -39,16 +39,14 @@ class Baked:
 Source = Callable[[TextureContents], tuple[Values, NDArray[np.float64]] | None]
 
 
-def baked(expression: NodeContents, source: Source) -> Baked:
+def baked(
+    expression: NodeContents,
+    source: Source,  # Reads pictures; where there is none, its fallback is taken
+) -> Baked:
     """Values of an expression.
 
     Where all pictures lie in one place of the plane, at the resolution of the largest; else over the unit square, which
     repeats.
-
-    Parameters
-    ----------
-    source : callable
-        Reads pictures; where there is none, its fallback is taken.
     """
     found = leaves(expression)
     textures = [each for each in found if isinstance(each, TextureContents)]

@@ -52,14 +52,12 @@ class Bsdfs:
         opacity = values.number(PrimvarContents("displayOpacity", [1.0]))
         return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
 
-    def surface(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
-        """BSDF of a material.
-
-        Parameters
-        ----------
-        shape : ShapeContents
-            Whose attributes the material may read.
-        """
+    def surface(
+        self,
+        material: MaterialContents,
+        shape: ShapeContents,  # Whose attributes the material may read
+    ) -> SceneNode:
+        """BSDF of a material."""
         return _Surface(material, _Values(self._textures, self._notes, shape)).bsdf()
 
     def radiance(self, material: MaterialContents) -> SceneNode | None:
@@ -96,17 +94,15 @@ def absorbs(material: MaterialContents) -> bool:
     return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
 
 
-def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear_lamps: bool = False) -> SceneNode:
+def integrator(
+    materials: list[MaterialContents],
+    usual: SceneNode,  # The integrator of scenes without glass
+    *,
+    has_clear_lamps: bool = False,  # Whether lights shine through the shapes of other lights
+) -> SceneNode:
     """An integrator with as long paths as glass needs, and that knows media and clear surfaces if there are any.
 
     Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
-
-    Parameters
-    ----------
-    usual : dict
-        The integrator of scenes without glass.
-    has_clear_lamps : bool
-        Whether lights shine through the shapes of other lights.
     """
     kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
     if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):

@@ -68,6 +68,8 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
 
 def with_copies(
     contents: SceneContents,
+    # dict of (n,) int array by shape: segments on each edge of limit surfaces that their copies need, in the
+    # order of `contents.placed_shapes`
     rates: Mapping[ShapeContents, IntArray],
     shading: str,
     notes: StageWarnings,
@@ -78,12 +80,6 @@ def with_copies(
 
     Copies that need different rates are different shapes. If all would take more than `MOST_BYTES`, their highest rate
     gives way, down to the lowest; if that is not enough, instances stay.
-
-    Parameters
-    ----------
-    rates : dict of (n,) int array by shape
-        Segments on each edge of limit surfaces that their copies need, in the order of ``contents.placed_shapes``.
-    shading : "vertex" or "exact"
     """
     placed = _of_instances(contents, rates)
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}

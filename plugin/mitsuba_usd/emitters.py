@@ -24,14 +24,12 @@ _LEAST_SOFTNESS = 1e-3
 _WITH_SHAPES = ("rect", "disk", "sphere", "cylinder")
 
 
-def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
-    """An emitter, or a shape with one.
-
-    Parameters
-    ----------
-    up : "y" or "z"
-        Up axis of the stage.
-    """
+def emitter(
+    light: LightContents,
+    up: str,  # Up axis of the stage
+    textures: Textures,
+) -> SceneNode:
+    """An emitter, or a shape with one."""
     return _MAKERS[light.kind](light, up, textures)
 
 

@@ -57,21 +57,14 @@ class LoadedShapes:
         self,
         shape: ShapeContents,
         material: MaterialContents | None,
-        bsdf: Callable[[], SceneNode],
-        area: SceneNode | None,
+        bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
+        area: SceneNode | None,  # Entry of its emitter
         notes: StageWarnings,
     ) -> mi.Object:
         """The object of a shape.
 
         Raises CageError if the cage is invalid, or its points are not finite. Raises SchemeError if the scheme cannot
         subdivide it.
-
-        Parameters
-        ----------
-        bsdf : callable
-            Makes the entry of its BSDF.
-        area : dict or None
-            Entry of its emitter.
         """
         # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
         self._counts[shape.name] += 1

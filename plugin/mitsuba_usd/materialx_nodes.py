@@ -291,18 +291,16 @@ OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
 SAMPLED = ("texcoord", "image", "heighttonormal")
 
 
-def node(category: str, kind: str, **inputs: Input) -> Input:
+def node(
+    # As of `NodeContents`. `kind` is its type.
+    category: str,
+    kind: str,
+    **inputs: Input,  # `in_` for `in`
+) -> Input:
     """An expression: a node, or what it comes to.
 
     What has only constant inputs is computed. A picture that is multiplied by constants and moved by them stays a
     picture; what changes nothing is left out.
-
-    Parameters
-    ----------
-    category, kind : str
-        As of `NodeContents`. ``kind`` is its type.
-    **inputs : Input
-        ``in_`` for ``in``.
     """
     given = {"in" if name == "in_" else name: value for name, value in inputs.items()}
     if category not in SAMPLED and all(map(is_constant, given.values())):

@@ -21,15 +21,13 @@ AROUND, ALONG = 64, 24
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 
 
-def read_normals(reader: MeshReader, cage: CageContents) -> NDArray[np.float64] | None:
+def read_normals(
+    reader: MeshReader,
+    cage: CageContents,  # Contents of the mesh, in its own space
+) -> NDArray[np.float64] | None:
     """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``, after skinning; None without any.
 
     Normals that do not fit the mesh are left out, with a message to the reader.
-
-    Parameters
-    ----------
-    cage : CageContents
-        Contents of the mesh, in its own space.
     """
     from pxr import UsdGeom
 

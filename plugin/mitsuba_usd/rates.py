@@ -36,28 +36,17 @@ def is_chosen(parameters: dict[str, Any]) -> bool:
 
 def triangles_for_picture(
     contents: SceneContents,
-    segments: Mapping[ShapeContents, IntArray],
-    outline: SceneNode,
-    parameters: dict[str, Any],
+    segments: Mapping[ShapeContents, IntArray],  # dict of (n,) int array by shape: see `segments_of`
+    outline: SceneNode,  # Of the sensor; see `outline_for`
+    parameters: dict[str, Any],  # Of every limit surface: the shading, and how many segments there are at most
     *,
-    follows_sensor: bool = True,
+    follows_sensor: bool = True,  # Whether the scene is rendered by this sensor only
 ) -> dict[ShapeContents, dict[str, Any]]:
     """Parameters of limit surfaces with the fewest triangles whose facets do not show in an image.
 
     With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
 
     Returns dict of dict by shape: cages that cannot be used are missing.
-
-    Parameters
-    ----------
-    segments : dict of (n,) int array by shape
-        See `segments_of`.
-    outline : dict
-        Of the sensor; see `outline_for`.
-    parameters : dict
-        Of every limit surface: the shading, and how many segments there are at most.
-    follows_sensor : bool
-        Whether the scene is rendered by this sensor only.
     """
     shading, most = parameters["shading"], parameters["tessellation_rate"]
     needed = {shape: int(segments[shape].max()) for shape in contents.all_shapes if shape in segments}

@@ -20,21 +20,13 @@ from .stage_warnings import StageWarnings
 
 def subdivision(
     shape: ShapeContents,
-    surfaces: Surfaces,
+    surfaces: Surfaces,  # Where its cage is validated
     bsdf: SceneNode | None,
     emitter: SceneNode | mi.Object | None,
-    parameters: dict[str, Any],
+    parameters: dict[str, Any],  # Of the shape `subdivision`
     notes: StageWarnings,
 ) -> SceneNode:
-    """A limit surface. Raises CageError if the cage is invalid. Raises SchemeError if the scheme cannot subdivide it.
-
-    Parameters
-    ----------
-    surfaces : Surfaces
-        Where its cage is validated.
-    parameters : dict
-        Of the shape ``subdivision``.
-    """
+    """A limit surface. Raises CageError for an invalid cage, SchemeError if the scheme cannot subdivide it."""
     # Validated here, so that messages name the prim.
     surfaces.note_warnings(shape, notes)
     # Any, as the stubs call it an object.

@@ -101,18 +101,13 @@ def read_settings(stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings) ->
 
 def read_camera(
     camera: UsdGeom.Camera,
+    # (4, 4) float64: for column vectors. Scales are left out, as USD's own frustum of a camera has none.
     to_world: NDArray[np.float64],
     time: Usd.TimeCode,
     settings: FrameSettings,
     notes: StageWarnings,
 ) -> CameraContents:
-    """Read a camera.
-
-    Parameters
-    ----------
-    to_world : (4, 4) float64
-        For column vectors. Scales are left out, as USD's own frustum of a camera has none.
-    """
+    """Read a camera."""
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)
     up = y - forward * (forward @ y)

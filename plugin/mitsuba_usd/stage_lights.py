@@ -47,15 +47,12 @@ _NEUTRAL = {
 
 
 def read_light(
-    prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
+    prim: Usd.Prim,
+    to_world: NDArray[np.float64],  # (4, 4) float64: for column vectors
+    time: Usd.TimeCode,
+    notes: StageWarnings,
 ) -> LightContents | None:
-    """Read a light; None if its kind is not supported.
-
-    Parameters
-    ----------
-    to_world : (4, 4) float64
-        For column vectors.
-    """
+    """Read a light; None if its kind is not supported."""
     path, given = prim.GetPath(), str(prim.GetTypeName())
     kind = KINDS.get(given)
     if kind is None:

@@ -49,14 +49,12 @@ class ShapeReader:
         self._notes = notes
         self._skinning = Skinning(time, notes.add)
 
-    def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
-        """Shapes of a prim: one for each material. Raises CageError, TypeError, ValueError if it cannot be used.
-
-        Parameters
-        ----------
-        to_world : (4, 4) float64
-            From the prim's space, for column vectors.
-        """
+    def read(
+        self,
+        prim: Usd.Prim,
+        to_world: NDArray[np.float64],  # (4, 4) float64: from the prim's space, for column vectors
+    ) -> list[ShapeContents]:
+        """Shapes of a prim: one for each material. Raises CageError, TypeError, ValueError if it cannot be used."""
         location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
         if not is_invertible(to_world):
             raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")

@@ -20,14 +20,12 @@ class StageWarnings:
         # The first message of kinds of which each message names its prim.
         self._first: dict[str, str] = {}
 
-    def add(self, what: str, prim: object) -> None:
-        """Record a problem of a prim.
-
-        Parameters
-        ----------
-        what : str
-            The problem and its consequence, the same text for all of its kind.
-        """
+    def add(
+        self,
+        what: str,  # The problem and its consequence, the same text for all of its kind
+        prim: object,
+    ) -> None:
+        """Record a problem of a prim."""
         prims = self._prims.setdefault(what, [])
         if str(prim) not in prims:
             prims.append(str(prim))

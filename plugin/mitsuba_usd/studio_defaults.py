@@ -43,23 +43,13 @@ def angles_for(contents: SceneContents, look: Look) -> View:
 
 def with_studio_defaults(
     contents: SceneContents,
-    points: NDArray[np.float64],
-    is_lit: bool,
+    points: NDArray[np.float64],  # (n, 3) float64: in the world, that the studio is set up around
+    is_lit: bool,  # Whether the stage has lights
     look: Look,
     notes: StageWarnings,
-    name: str | None = None,
+    name: str | None = None,  # Of the stage, with which messages begin
 ) -> SceneNode:
-    """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        In the world, that the studio is set up around.
-    is_lit : bool
-        Whether the stage has lights.
-    name : str, optional
-        Of the stage, with which messages begin.
-    """
+    """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene."""
     camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     if (bounds[0] == bounds[1]).all():

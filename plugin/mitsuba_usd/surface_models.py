@@ -283,15 +283,14 @@ def reflectance(ior: Input) -> Input:
     return number("multiply", root, root)
 
 
-def conductor(reflectivity: ArrayLike, edge: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def conductor(
+    # (..., 3) float: what it reflects head-on, and how it turns to white towards grazing angles
+    reflectivity: ArrayLike,
+    edge: ArrayLike,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Index of refraction and absorption of a metal.
 
     Source: [Gulbrandsen 2014], equations 11 to 15.
-
-    Parameters
-    ----------
-    reflectivity, edge : (..., 3) float
-        What it reflects head-on, and how it turns to white towards grazing angles.
     """
     r, g = np.clip(reflectivity, 0, 0.99), np.clip(edge, 0, 1)
     root = np.sqrt(r)

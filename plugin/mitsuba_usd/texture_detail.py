@@ -22,15 +22,13 @@ MOST_EDGES = 0.95
 MOST_SAMPLES = 20_000
 
 
-def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
+def texels_for_pictures(
+    contents: SceneContents,
+    sensors: Sequence[SceneNode],  # Entries of a scene
+) -> dict[str, float]:
     """Pixels along the sides of textures that pictures show at most, by file; of tiles, along those of each.
 
     Files of which the detail is unknown are missing, or have no bound.
-
-    Parameters
-    ----------
-    sensors : list of dict
-        Entries of a scene.
     """
     seen = [(outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
     matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}

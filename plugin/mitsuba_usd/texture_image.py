@@ -54,22 +54,15 @@ class TextureImage:
 
 
 def read_texture_image(
-    path: str, color_space: str = "auto", needed: float = math.inf, most: int | None = None
+    path: str,  # `a.usdz[b.png]` for a file in an archive. With "<UDIM>" in it, all tiles that there are.
+    color_space: str = "auto",  # In which files are halved
+    # Pixels along the sides of a file that its use needs; files that have more are halved, see `halvings`
+    needed: float = math.inf,
+    most: int | None = None,  # Pixels along the sides of a file at most
 ) -> TextureImage:
     """Read the image of a texture.
 
     Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it cannot be read, or there is no tile.
-
-    Parameters
-    ----------
-    path : str
-        ``a.usdz[b.png]`` for a file in an archive. With "<UDIM>" in it, all tiles that there are.
-    color_space : "auto", "raw" or "sRGB"
-        In which files are halved.
-    needed : float
-        Pixels along the sides of a file that its use needs; files that have more are halved, see `halvings`.
-    most : int, optional
-        Pixels along the sides of a file at most.
     """
     if UDIM not in path:
         return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))
@@ -243,18 +236,12 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
         return np.array(image)
 
 
-def halvings(size: Sequence[int], needed: float, most: int | None = None) -> int:
-    """How often an image is halved.
-
-    Parameters
-    ----------
-    size : sequence of 2 int
-        Its sides in pixels; halves are rounded up.
-    needed : float
-        Its sides stay at least as long, or as they are.
-    most : int, optional
-        Its sides become at most as long, whatever is needed.
-    """
+def halvings(
+    size: Sequence[int],  # Its sides in pixels; halves are rounded up
+    needed: float,  # Its sides stay at least as long, or as they are
+    most: int | None = None,  # Its sides become at most as long, whatever is needed
+) -> int:
+    """How often an image is halved."""
     shorter, longer = sorted(size)
     count = 0
     while longer > 1 and (shorter >= 2 * max(needed, 1) or (most is not None and longer > most)):
@@ -262,15 +249,14 @@ def halvings(size: Sequence[int], needed: float, most: int | None = None) -> int
     return count
 
 
-def reduced(pixels: NDArray, needed: float, most: int | None = None, *, is_srgb: bool) -> NDArray:
-    """An image halved as often as `halvings` says.
-
-    Parameters
-    ----------
-    pixels : (h, w, c) array
-    is_srgb : bool
-        Whether colours are encoded; alpha is linear.
-    """
+def reduced(
+    pixels: NDArray,  # (h, w, c) array
+    needed: float,
+    most: int | None = None,
+    *,
+    is_srgb: bool,  # Whether colours are encoded; alpha is linear
+) -> NDArray:
+    """An image halved as often as `halvings` says."""
     count = halvings(pixels.shape[:2], needed, most)
     if not count:
         return pixels

@@ -52,14 +52,13 @@ class Textures:
             for key, picture in zip(first, found, strict=True):
                 self._keep(key, picture)
 
-    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
-        """A texture of colours, or the fallback of a picture that cannot be read.
-
-        Parameters
-        ----------
-        is_radiance : bool
-            Whether values may be above 1.
-        """
+    def color(
+        self,
+        given: TextureContents | NodeContents,
+        *,
+        is_radiance: bool = False,  # Whether values may be above 1
+    ) -> SceneNode:
+        """A texture of colours, or the fallback of a picture that cannot be read."""
         most = None if is_radiance else 1.0
         if isinstance(given, NodeContents):
             found = self._baked(given)

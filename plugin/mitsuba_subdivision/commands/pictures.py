@@ -184,7 +184,13 @@ def _look(options: argparse.Namespace) -> Look:
     return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
 
 
-def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> list[Path]:
+def save_scene(
+    # As for `mi.load_dict`; a polygon mesh may have the type "ply" and, as `mesh`, an object with a method `save`
+    # that takes a path
+    scene: SceneNode,
+    path: Path,
+    inputs: Iterable[Path] = (),  # Files that must not be written to, besides those that the scene names
+) -> list[Path]:
     """Write a scene as XML, so that it renders to the same picture.
 
     Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
@@ -194,14 +200,6 @@ def save_scene(scene: SceneNode, path: Path, inputs: Iterable[Path] = ()) -> lis
     Returns list of Path: the files that were written; the scene is the last. Raises ValueError if the path does not end
     in .xml, something in memory can be written to no file, or a file to write is one that the scene reads. Nothing has
     been written then. Raises OSError if a file cannot be written.
-
-    Parameters
-    ----------
-    scene : dict
-        As for ``mi.load_dict``; a polygon mesh may have the type "ply" and, as ``mesh``, an object with a method
-        ``save`` that takes a path.
-    inputs : iterable of Path
-        Files that must not be written to, besides those that the scene names.
     """
     if path.suffix.lower() != ".xml":
         raise ValueError(f'scene "{path}"; expected a name ending in .xml')

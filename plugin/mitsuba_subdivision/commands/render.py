@@ -362,16 +362,12 @@ def require_encoder(path: Path) -> None:
         ) from None
 
 
-def write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
-    """Write images as a video, an animated GIF that repeats or an MP4 file.
-
-    Parameters
-    ----------
-    frames : sequence of Path
-        PNG files of one size.
-    fps : float
-        Frames per second.
-    """
+def write_video(
+    path: Path,
+    frames: Sequence[Path],  # PNG files of one size
+    fps: float,  # Frames per second
+) -> None:
+    """Write images as a video, an animated GIF that repeats or an MP4 file."""
     import imageio.v2 as imageio
 
     # A GIF file repeats for ever, and its durations are milliseconds.

@@ -175,20 +175,16 @@ class DividedElement:
         return np.concatenate(rows + below)
 
     def coefficients(
-        self, form: FloatArray, dtype: DTypeLike = np.float64, known: dict[DividedElement, FloatArray] | None = None
+        self,
+        # (m, R) float64: makes a piece's coefficients of its control points, in the order of the scheme's
+        # lattice
+        form: FloatArray,
+        dtype: DTypeLike = np.float64,  # Of the result; sums are float64
+        # Coefficients of elements below, by the same form: one dictionary for all elements of a cage saves
+        # half of the time. Without it nothing is kept, as these are by far the largest arrays.
+        known: dict[DividedElement, FloatArray] | None = None,
     ) -> NDArray[np.floating]:
-        """Coefficients of regular pieces over the element's one-ring. Returns (r, m, K).
-
-        Parameters
-        ----------
-        form : (m, R) float64
-            Makes a piece's coefficients of its control points, in the order of the scheme's lattice.
-        dtype : float64 or float32
-            Of the result; sums are float64.
-        known : dict, optional
-            Coefficients of elements below, by the same form: one dictionary for all elements of a cage saves half of
-            the time. Without it nothing is kept, as these are by far the largest arrays.
-        """
+        """Coefficients of regular pieces over the element's one-ring. Returns (r, m, K)."""
         known = {} if known is None else known
         found = np.empty((self.regular_count, len(form), self.control_count), dtype=dtype)
         if self.piece is not None:

@@ -168,13 +168,11 @@ class DividedTile:
         return pieces, rest
 
 
-def part_of_tile(element: DividedElement, stencils: FloatArray) -> tuple[DividedTile | None, FloatArray]:
+def part_of_tile(
+    element: DividedElement,
+    stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the tile
+) -> tuple[DividedTile | None, FloatArray]:
     """The part of a tile that an element covers; the same tile for equal ones.
-
-    Parameters
-    ----------
-    stencils : (K_element, K) float64
-        The element's control points over those of the tile.
 
     Returns
     -------

@@ -85,7 +85,11 @@ class Eigenbasis:
         return Eigenbasis(self.vectors * sign, self.inverse * sign[:, None], self.eigenvalues, self.moduli, blocks)
 
 
-def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenbasis:
+def eigenbasis(
+    matrix: FloatArray,  # (K, K) float64: one is a simple eigenvalue and all others are smaller
+    # (K,) float64: the eigenvector of one; where rows sum to one, it is one everywhere
+    constant: FloatArray | None = None,
+) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
     ``numpy.linalg.eig`` alone is not enough. Rounding turns a repeated eigenvalue into a conjugate pair, whose vectors
@@ -95,13 +99,6 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
 
     Raises EigenbasisError if the second eigenvalue is not below one, different eigenvalues are too close to find
     vectors for each, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
-
-    Parameters
-    ----------
-    matrix : (K, K) float64
-        One is a simple eigenvalue and all others are smaller.
-    constant : (K,) float64, optional
-        The eigenvector of one; where rows sum to one, it is one everywhere.
     """
     size = len(matrix)
     eigenvalues, eigenvectors = np.linalg.eig(matrix)
@@ -140,16 +137,14 @@ def eigenbasis(matrix: FloatArray, constant: FloatArray | None = None) -> Eigenb
     return basis
 
 
-def require_basis(matrix: FloatArray | sparse.csr_array, basis: Eigenbasis, probes: FloatArray) -> None:
-    """Check that a basis is one of a matrix.
-
-    Parameters
-    ----------
-    matrix : (K, K) float64, or sparse array
-    probes : (K, p) float64
-        Vectors that the equations are multiplied by: all unit vectors, or a few of random signs, which the products of
-        wrong matrices cannot but differ for [Freivalds 1977].
-    """
+def require_basis(
+    matrix: FloatArray | sparse.csr_array,  # (K, K) float64, or sparse array
+    basis: Eigenbasis,
+    # (K, p) float64: vectors that the equations are multiplied by: all unit vectors, or a few of random signs,
+    # which the products of wrong matrices cannot but differ for [Freivalds 1977]
+    probes: FloatArray,
+) -> None:
+    """Check that a basis is one of a matrix."""
     coordinates = basis.inverse @ probes
     image: NDArray = probes
     powers: NDArray = coordinates
@@ -169,21 +164,17 @@ def require_basis(matrix: FloatArray | sparse.csr_array, basis: Eigenbasis, prob
             )
 
 
-def times_block_powers(rows: NDArray, levels: NDArray[np.int64], block: FloatArray, mean: float) -> NDArray:
+def times_block_powers(
+    rows: NDArray,  # (d, s, m) float: their precision is the precision of the product
+    levels: NDArray[np.int64],  # (s,) int64
+    block: FloatArray,  # (m, m) float64
+    mean: float,  # Of the block's eigenvalues
+) -> NDArray:
     """Multiply each row by its power of a block of T: ``rows[.., s, :] @ block^levels[s]``.
 
     A Jordan block is ``mean`` times the identity plus a nilpotent part Z. Powers of Z end, at ``Z^2 = 0`` for the
     blocks of two that subdivision matrices have, so ``(mean + Z)^n`` is a short sum. The blocks of complex eigenvalues
     have no such part, and are multiplied out for each level.
-
-    Parameters
-    ----------
-    rows : (d, s, m) float
-        Their precision is the precision of the product.
-    levels : (s,) int64
-    block : (m, m) float64
-    mean : float
-        Of the block's eigenvalues.
     """
     real = rows.dtype.type
     nilpotent = block - mean * np.eye(len(block))

@@ -56,27 +56,17 @@ class ElementSamples:
 
 def evaluate_samples(
     located: LocatedSamples,
+    # list of (m, K, x) float64: control points of the samples of each element, in arrays that may be changed.
+    # They are rounded to the type of the evaluation.
     points: list[FloatArray],
-    extent: FloatArray,
+    extent: FloatArray,  # (x,) float64: bound of the extent of an element's control points along each axis
+    # The stabilised and the limit form take one control point of the element as the origin, so their precision
+    # does not depend on where the model stands. The others are as published.
     evaluator: Evaluator,
-    dtype: DTypeLike,
+    dtype: DTypeLike,  # Of all arithmetic
     derivatives: int,
 ) -> ElementSamples:
-    """Evaluate samples of any elements.
-
-    Parameters
-    ----------
-    points : list of (m, K, x) float64
-        Control points of the samples of each element, in arrays that may be changed. They are rounded to the type of
-        the evaluation.
-    extent : (x,) float64
-        Bound of the extent of an element's control points along each axis.
-    evaluator : "power" | "stam" | "stabilized" | "limit"
-        The stabilised and the limit form take one control point of the element as the origin, so their precision does
-        not depend on where the model stands. The others are as published.
-    dtype : float32 or float64
-        Of all arithmetic.
-    """
+    """Evaluate samples of any elements."""
     count, has_origin = len(located.leaf_sample), evaluator not in ("power", "stam")
     # Samples are along the last axis, as operations along rows of three would be slow.
     origin: FloatArray = np.zeros((len(extent), count), dtype=dtype)
@@ -122,16 +112,12 @@ def evaluate_samples(
 
 
 def element_stencils(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: IntArray | None = None
+    scheme: Scheme,
+    signature: Signature,
+    uv: FloatArray,  # (s, 2) float64: with (0, 0) at the sample's corner
+    corner: IntArray | None = None,  # (s,) int64: by default the first corner
 ) -> FloatArray:
     """Limit stencils of samples over an element's one-ring.
-
-    Parameters
-    ----------
-    uv : (s, 2) float64
-        With (0, 0) at the sample's corner.
-    corner : (s,) int64, optional
-        By default the first corner.
 
     Returns
     -------
@@ -224,17 +210,13 @@ def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
     )
 
 
-def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
+def curvature(
+    first: FloatArray,  # (2, s, 3): derivatives by u, by v
+    second: FloatArray,  # (3, s, 3): by uu, uv, vv
+) -> FloatArray:
     """Curvatures from the fundamental forms.
 
     Returns (2, s): Gaussian and mean, the latter positive where the surface bends towards ``du x dv``.
-
-    Parameters
-    ----------
-    first : (2, s, 3)
-        Derivatives by u, by v.
-    second : (3, s, 3)
-        By uu, uv, vv.
     """
     du, dv = first
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -245,7 +227,12 @@ def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
         return np.stack([(e * g - f * f) / area, (e * c - 2 * f * b + g * a) / (2 * area)])
 
 
-def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: FloatArray, which: IntArray) -> FloatArray:
+def irregular_curvature(
+    patch: IrregularPatch,
+    uv: FloatArray,  # (s, 2) float64: parameters in the patch
+    coordinates: FloatArray,  # (e, K, 3): eigen-coordinates of every element
+    which: IntArray,  # (s,) int64: element of each sample
+) -> FloatArray:
     """Curvatures in an irregular patch, relative to the frame of its limit normal.
 
     Near the extraordinary point second derivatives are almost tangential, and rounding drowns their small part along
@@ -255,15 +242,6 @@ def irregular_curvature(patch: IrregularPatch, uv: FloatArray, coordinates: Floa
 
     Returns (2, s): Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not
     a number.
-
-    Parameters
-    ----------
-    uv : (s, 2) float64
-        Parameters in the patch.
-    coordinates : (e, K, 3)
-        Eigen-coordinates of every element.
-    which : (s,) int64
-        Element of each sample.
     """
     level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])

@@ -122,15 +122,14 @@ def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], 
 
 
 def child_rows(
-    scheme: Scheme, uv: FloatArray, tables: FloatArray, derivatives: int
+    scheme: Scheme,
+    uv: FloatArray,
+    # (3, R, K) float: `P_k Ā` for rows over control points, `P_k Ā V` for rows over eigen-coordinates. Their
+    # precision is that of the rows.
+    tables: FloatArray,
+    derivatives: int,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Factors that all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, as for samples at level 0.
-
-    Parameters
-    ----------
-    tables : (3, R, K) float
-        ``P_k Ā`` for rows over control points, ``P_k Ā V`` for rows over eigen-coordinates. Their precision is that of
-        the rows.
 
     Returns
     -------
@@ -204,16 +203,12 @@ def limit_rows(size: int) -> FloatArray:
     return np.eye(3, size)
 
 
-def characteristic_jacobian(scheme: Scheme, children: FloatArray, vectors: FloatArray) -> float:
-    """The f of equation (13), in the middle of the first regular child. Its sign is the same all over the patch.
-
-    Parameters
-    ----------
-    children : (3, R, K) float64
-        ``P_k Ā``.
-    vectors : (K, K) float64
-        V.
-    """
+def characteristic_jacobian(
+    scheme: Scheme,
+    children: FloatArray,  # (3, R, K) float64: `P_k Ā`
+    vectors: FloatArray,  # (K, K) float64: V
+) -> float:
+    """The f of equation (13), in the middle of the first regular child. Its sign is the same all over the patch."""
     b_u, b_v = scheme.regular_basis(scheme.domain.centre[None], 1)[1:, 0]
     return float(np.linalg.det(np.stack([b_u, b_v]) @ children[0] @ vectors[:, 1:3]))
 
@@ -224,20 +219,17 @@ def distinct_levels(level: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArra
     return np.flatnonzero(occurs), (np.cumsum(occurs) - 1).take(level)
 
 
-def times_powers(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis, base: float) -> FloatArray:
+def times_powers(
+    rows: FloatArray,  # (d, s, K) float: their precision is the precision of the product
+    level: NDArray[np.int64],  # (s,) int64
+    basis: Eigenbasis,
+    base: float,  # Positive; the modulus of an eigenvalue
+) -> FloatArray:
     """Multiply each sample's row by ``(T / base)ⁿ``: its entries by ``(λ_i / base)ⁿ``.
 
     Terms of eigenvalues larger than the base become zero; the stabilised forms leave them out.
 
     Returns (d, s, K) of the same precision.
-
-    Parameters
-    ----------
-    rows : (d, s, K) float
-        Their precision is the precision of the product.
-    level : (s,) int64
-    base : float
-        Positive; the modulus of an eigenvalue.
     """
     real = rows.dtype.type
     kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)

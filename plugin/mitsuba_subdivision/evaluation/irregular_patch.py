@@ -124,17 +124,16 @@ class IrregularPatch:
         # Made once for an element, so in double precision, and rounded once.
         return (self.basis.inverse @ control_points).astype(control_points.dtype)
 
-    def rows(self, uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1) -> SampleRows:
+    def rows(
+        self,
+        uv: FloatArray,  # (s, 2) float64
+        evaluator: Evaluator,
+        dtype: DTypeLike,  # Precision of every product and sum from the child's parameters on
+        derivatives: int = 1,
+    ) -> SampleRows:
         """Coefficients of samples over the `coordinates`.
 
         At the extraordinary point itself (4) and (9) have no value, and second derivatives do not exist: not a number.
-
-        Parameters
-        ----------
-        uv : (s, 2) float64
-        evaluator : "power" | "stam" | "stabilized" | "limit"
-        dtype : float32 or float64
-            Precision of every product and sum from the child's parameters on.
         """
         if evaluator == "limit":
             return self._rows_at_point(len(uv), dtype, derivatives)

@@ -21,19 +21,14 @@ LEAST_LENGTH = {32: 2.0**-126, 64: 2.0**-1022}
 
 
 def unit_normals(
-    tangents: FloatArray, weights: FloatArray | None = None, extent: FloatArray | None = None
+    tangents: FloatArray,  # (2, 3, ...) float
+    # (2, ...) float: for each tangent, the sum of the absolute weights of the control points in it
+    weights: FloatArray | None = None,
+    extent: FloatArray | None = None,  # (3, ...) float: extent of these control points along each axis
 ) -> FloatArray:
     """Unit vectors along the cross products of pairs of tangents, whatever the tangents' lengths.
 
     Coordinates come before samples: operations along rows of three would be slow.
-
-    Parameters
-    ----------
-    tangents : (2, 3, ...) float
-    weights : (2, ...) float, optional
-        For each tangent, the sum of the absolute weights of the control points in it.
-    extent : (3, ...) float, optional
-        Extent of these control points along each axis.
 
     Returns
     -------
@@ -56,19 +51,13 @@ def unit_normals(
     return normal
 
 
-def _are_rounding(pair: FloatArray, squared: FloatArray, weights: FloatArray, extent: FloatArray) -> NDArray[np.bool_]:
-    """Whether cross products are no longer than their rounding errors may be.
-
-    Parameters
-    ----------
-    pair : (2, 3, ...)
-        Tangents, each divided by its longest component.
-    squared : (...)
-        Squared lengths of their cross products.
-    weights : (2, ...)
-        Divided by the longest components, too.
-    extent : (3, ...)
-    """
+def _are_rounding(
+    pair: FloatArray,  # (2, 3, ...): tangents, each divided by its longest component
+    squared: FloatArray,  # (...): squared lengths of their cross products
+    weights: FloatArray,  # (2, ...): divided by the longest components, too
+    extent: FloatArray,  # (3, ...)
+) -> NDArray[np.bool_]:
+    """Whether cross products are no longer than their rounding errors may be."""
     error = TANGENT_ROUNDING[8 * pair.dtype.itemsize] * weights
     # First by a bound that is too large, but takes little time. Where tangents are zero it may be not a number.
     suspect = ~(squared > 12 * ((error[0] + error[1]) * extent.max(axis=0)) ** 2)

@@ -47,16 +47,12 @@ class Piece:
         """``(K_piece, K)`` eigen-coordinates of an irregular piece over the element's one-ring."""
         return self.irregular_patch.basis.inverse @ self.stencils
 
-    def inside(self, domain: AffineMap, stencils: FloatArray) -> Piece:
-        """The same piece as a part of a larger element.
-
-        Parameters
-        ----------
-        domain : AffineMap
-            From the larger element's parameters to the element's.
-        stencils : (K, K_larger) float64
-            The element's control points over the larger element's one-ring.
-        """
+    def inside(
+        self,
+        domain: AffineMap,  # From the larger element's parameters to the element's
+        stencils: FloatArray,  # (K, K_larger) float64: the element's control points over the larger element's one-ring
+    ) -> Piece:
+        """The same piece as a part of a larger element."""
         return Piece(self.domain @ domain, self.stencils @ stencils, self.patch)
 
 
@@ -85,14 +81,12 @@ def regular_signature(scheme: Scheme) -> Signature:
     return Signature(scheme.element, (_regular_fan(scheme),) * corners)
 
 
-def isolated_signature(scheme: Scheme, valence: int) -> Signature:
-    """Signature of an element with one extraordinary point, at its first corner, amid regular faces and vertices.
-
-    Parameters
-    ----------
-    valence : int
-        Of the extraordinary vertex. Where elements are vertices, the number of corners of the extraordinary face.
-    """
+def isolated_signature(
+    scheme: Scheme,
+    # Of the extraordinary vertex. Where elements are vertices, the number of corners of the extraordinary face.
+    valence: int,
+) -> Signature:
+    """Signature of an element with one extraordinary point, at its first corner, amid regular faces and vertices."""
     regular = _regular_fan(scheme)
     if scheme.element == "vertex":
         return Signature("vertex", ((valence, *regular[1:]),))

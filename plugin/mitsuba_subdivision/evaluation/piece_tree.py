@@ -84,14 +84,12 @@ class PieceTree:
 
 # A tree takes up to some megabytes, where valences are high.
 @lru_cache(maxsize=128)
-def piece_tree(scheme: Scheme, signature: Signature, piece_levels: int = PIECE_LEVELS) -> PieceTree:
-    """Make the tree of an element of a signature.
-
-    Parameters
-    ----------
-    piece_levels : int
-        Number of levels of a tip that are pieces; the others are deeper ones.
-    """
+def piece_tree(
+    scheme: Scheme,
+    signature: Signature,
+    piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are deeper ones
+) -> PieceTree:
+    """Make the tree of an element of a signature."""
     (element,) = divided_elements(scheme, [signature])
     kinds, turns, first = element.nodes.T.copy()
     # Regular pieces come first, in their order, then those of tips.

@@ -72,7 +72,11 @@ def limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Floa
     return _Point(signature.fans[0], one_ring(signature), basis, border_faces).frame()
 
 
-def uneven_frame(tangents: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> FloatArray:
+def uneven_frame(
+    tangents: FloatArray,  # (2, s, K): `child_rows` of the two first derivatives
+    level: NDArray[np.int64],  # (s,) int64
+    basis: Eigenbasis,
+) -> FloatArray:
     """Frame at a finite level, where the second eigenvalue is larger than all that follow, as on borders.
 
     Let g_u and g_v be the coefficients of the second eigenvector in S_u and S_v. The frame is::
@@ -84,12 +88,6 @@ def uneven_frame(tangents: FloatArray, level: NDArray[np.int64], basis: Eigenbas
     own largest eigenvalue, so that neither fades beside the other.
 
     Returns (2, s, K).
-
-    Parameters
-    ----------
-    tangents : (2, s, K)
-        `child_rows` of the two first derivatives.
-    level : (s,) int64
     """
     by_u, by_v = tangents
     g_u, g_v = by_u[:, 1:2], by_v[:, 1:2]

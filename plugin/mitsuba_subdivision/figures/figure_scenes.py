@@ -34,25 +34,14 @@ def load_stage(name: str, **parameters: str | float) -> mi.Scene:
 
 
 def make_mesh(
-    positions: NDArray[np.floating],
-    triangles: NDArray[np.integer],
-    bsdf: SceneNode,
+    positions: NDArray[np.floating],  # (n, 3)
+    triangles: NDArray[np.integer],  # (m, 3) int
+    bsdf: SceneNode,  # As for `mi.load_dict`
+    # (n, 3): unit normals of the vertices. Without them Mitsuba averages those of the triangles.
     normals: NDArray[np.floating] | None = None,
-    face_colours: NDArray[np.floating] | None = None,
+    face_colours: NDArray[np.floating] | None = None,  # (m, 3): mesh attribute `face_color`
 ) -> mi.Mesh:
-    """Make a Mitsuba mesh.
-
-    Parameters
-    ----------
-    positions : (n, 3)
-    triangles : (m, 3) int
-    bsdf : dict
-        As for `mi.load_dict`.
-    normals : (n, 3), optional
-        Unit normals of the vertices. Without them Mitsuba averages those of the triangles.
-    face_colours : (m, 3), optional
-        Mesh attribute ``face_color``.
-    """
+    """Make a Mitsuba mesh."""
     buffers = {"vertex_positions": positions}
     if normals is not None:
         buffers["vertex_normals"] = normals
@@ -150,19 +139,13 @@ def grid_triangles(segments: int) -> NDArray[np.integer]:
 
 
 def draw_row(
-    options: FigureOptions, name: str, cases: Mapping[str, Mapping[str, Any]], metadata: dict[str, Any]
+    options: FigureOptions,
+    name: str,  # Of the scene and of the figure
+    # By the title of each panel, the parameters of the scene; a second line of the title stands below the panel
+    cases: Mapping[str, Mapping[str, Any]],
+    metadata: dict[str, Any],  # For the figure's pixels, besides the samples
 ) -> list[Path]:
-    """Render a scene once for each panel.
-
-    Parameters
-    ----------
-    name : str
-        Of the scene and of the figure.
-    cases : mapping of str to mapping
-        By the title of each panel, the parameters of the scene; a second line of the title stands below the panel.
-    metadata : dict
-        For the figure's pixels, besides the samples.
-    """
+    """Render a scene once for each panel."""
     figure, axes = panels(options, 1, len(cases))
     rendered = []
     for (title, parameters), axis in zip(cases.items(), axes.flat, strict=True):

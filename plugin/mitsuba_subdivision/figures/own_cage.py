@@ -20,22 +20,17 @@ FAR = 4
 SMALLEST = 1e-300
 
 
-def around_vertices(path: Path, most: int, like: tuple[NDArray[np.float64], ...]) -> dict[int, ControlCage]:
+def around_vertices(
+    path: Path,  # File of a Catmull-Clark cage
+    most: int,  # Number of vertices
+    like: tuple[NDArray[np.float64], ...],  # (3,), (3, 3), (): as `frame` returns it
+) -> dict[int, ControlCage]:
     """Cages around extraordinary vertices of a cage, one of each of the lowest valences, by their valences.
 
     Vertex 0 of each is extraordinary, the first faces lie around it, and each of them begins with it. The cage is
     moved, turned and scaled so that `frame` of the vertex becomes another one.
 
     Raises FigureError if the cage has no extraordinary vertex inside of its surface whose faces have no creases.
-
-    Parameters
-    ----------
-    path : Path
-        File of a Catmull-Clark cage.
-    most : int
-        Number of vertices.
-    like : (3,), (3, 3), ()
-        As `frame` returns it.
     """
     cage = read(path)
     for _ in range(REFINEMENTS):

@@ -43,31 +43,20 @@ def _program(name: str, *folders: str | None) -> Path | None:
 
 
 def osd_samples(
-    program: Path, cage: ControlCage, element: ArrayLike, uv: ArrayLike, method: str, level: int
+    program: Path,  # As `osd_peer` returns it
+    cage: ControlCage,  # Quads, without tags
+    element: ArrayLike,  # (s,) int: broadcasts with `uv`
+    uv: ArrayLike,  # (s, 2)
+    method: str,  # Patch tables, or surfaces of single faces
+    # For "far", the level at which extraordinary vertices are isolated, at most 10; for "bfr", the level of its
+    # approximation
+    level: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Evaluate OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
 
     Raises FigureError if the program fails.
 
-    Parameters
-    ----------
-    program : Path
-        As `osd_peer` returns it.
-    cage : ControlCage
-        Quads, without tags.
-    element : (s,) int
-        Broadcasts with ``uv``.
-    uv : (s, 2)
-    method : "far" or "bfr"
-        Patch tables, or surfaces of single faces.
-    level : int
-        For "far", the level at which extraordinary vertices are isolated, at most 10; for "bfr", the level of its
-        approximation.
-
-    Returns
-    -------
-    points, normals : (s, 3)
-        Unit normals, not a number where derivatives are parallel or vanish.
+    Returns points, normals, (s, 3): unit normals, not a number where derivatives are parallel or vanish.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
     records: dict[str, NDArray] = {
@@ -97,19 +86,14 @@ class BlenderMesh:
     version: str  # Of Blender, two numbers
 
 
-def blender_mesh(program: Path, cage: ControlCage, level: int) -> BlenderMesh:
+def blender_mesh(
+    program: Path,  # As `blender` returns it
+    cage: ControlCage,  # Without tags; Catmull-Clark's
+    level: int,  # Edges of quads become `2 ** level` segments
+) -> BlenderMesh:
     """Subdivide a cage in Blender, with the modifier's own defaults but for the level.
 
     Raises FigureError if Blender fails.
-
-    Parameters
-    ----------
-    program : Path
-        As `blender` returns it.
-    cage : ControlCage
-        Without tags; Catmull-Clark's.
-    level : int
-        Edges of quads become ``2 ** level`` segments.
     """
     records: dict[str, NDArray] = {
         "values": cage.positions,

@@ -12,14 +12,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
-    """Warn of the parts of a cage that a file of this format cannot hold.
-
-    Parameters
-    ----------
-    parts : dict of str to bool
-        Names of parts, and whether each is lost.
-    """
+def warn_of_losses(
+    path: str | Path,
+    parts: Mapping[str, bool],  # Names of parts, and whether each is lost
+) -> None:
+    """Warn of the parts of a cage that a file of this format cannot hold."""
     lost = [name for name, is_lost in parts.items() if is_lost]
     if lost:
         suffix = os.path.splitext(path)[1]

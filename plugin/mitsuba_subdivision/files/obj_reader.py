@@ -147,25 +147,16 @@ class _FaceCorners:
 
     def checked(
         self,
-        indices: IntArray,
+        indices: IntArray,  # (n,) int: as they are written
+        # (number of statements,) bool: the statements that the indices count: vertices or texture coordinates
         counted: NDArray[np.bool_],
+        # The values of these statements
         noun: str,
         nouns: str,
+        # (n_h,) bool: the face corners that have these indices; by default all
         corners: NDArray[np.bool_] | slice = slice(None),
     ) -> IntArray:
-        """0-based indices of some face corners into the statements that they count, or an error if one is out of range.
-
-        Parameters
-        ----------
-        indices : (n,) int
-            As they are written.
-        counted : (number of statements,) bool
-            The statements that the indices count: vertices or texture coordinates.
-        noun, nouns : str
-            The values of these statements.
-        corners : (n_h,) bool, optional
-            The face corners that have these indices; by default all.
-        """
+        """0-based indices of face corners into the statements that they count, or an error if one is out of range."""
         count = int(counted.sum())
         if indices.min() > 0 and indices.max() <= count:
             return indices - 1

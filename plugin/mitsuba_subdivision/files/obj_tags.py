@@ -90,16 +90,15 @@ class ObjTags:
         return rows[order]
 
 
-def take_plain_tags(tags: ObjTags, obj: ObjText, statements: IntArray) -> NDArray[np.bool_]:
+def take_plain_tags(
+    tags: ObjTags,
+    obj: ObjText,
+    statements: IntArray,  # (n,) int: numbers of the statements that are tags
+) -> NDArray[np.bool_]:
     """Add tags of one edge, vertex or face each to ``tags``, by whole-array operations.
 
     Returns (n,) bool: whether each statement has been added. `parse_tag` is to read the others, among them all that are
     malformed.
-
-    Parameters
-    ----------
-    statements : (n,) int
-        Numbers of the statements that are tags.
     """
     is_taken = np.zeros(len(statements), dtype=bool)
     text = np.frombuffer(obj.text, np.uint8)

@@ -93,24 +93,14 @@ def write_ply_triangles(
 
 def write_polygons(
     path: str | Path,
-    properties: Mapping[str, NDArray],
-    face_sizes: NDArray,
-    face_vertices: NDArray,
-    materials: NDArray | None = None,
+    properties: Mapping[str, NDArray],  # dict of str to (n,) float32 or float64 array: properties of vertices by name
+    face_sizes: NDArray,  # (n_f,) int
+    face_vertices: NDArray,  # (sum of face_sizes,) int: 0-based
+    materials: NDArray | None = None,  # (n_f,) int: number of each face's material; negative for none
 ) -> None:
     """Write polygons to a binary PLY file, which appears whole or not at all.
 
     Raises OSError if the file cannot be written.
-
-    Parameters
-    ----------
-    properties : dict of str to (n,) float32 or float64 array
-        Properties of vertices by name.
-    face_sizes : (n_f,) int
-    face_vertices : (sum of face_sizes,) int
-        0-based.
-    materials : (n_f,) int, optional
-        Number of each face's material; negative for none.
     """
     types = {name: values.dtype.newbyteorder("<") for name, values in properties.items()}
     vertex_count = len(next(iter(properties.values())))

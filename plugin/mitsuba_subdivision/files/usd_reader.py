@@ -122,17 +122,15 @@ class MeshReader:
         self.rules = rules or {}
         self._report = report
 
-    def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
+    def contents(
+        self,
+        *,
+        is_local: bool = False,  # Whether points are left in the mesh's own space instead of the world's
+        choice: PrimvarChoice | None = None,  # Which primvars are read, by default all
+    ) -> CageContents:
         """The mesh as contents of a cage.
 
         Returns CageContents: in its own space, a mesh that is not to be smoothed has no scheme.
-
-        Parameters
-        ----------
-        is_local : bool
-            Whether points are left in the mesh's own space instead of the world's.
-        choice : PrimvarChoice, optional
-            Which primvars are read, by default all.
         """
         mesh = self.mesh
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)

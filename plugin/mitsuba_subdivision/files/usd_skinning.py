@@ -43,18 +43,15 @@ class Skinning:
         return self._skinned(query, points) if query.HasJointInfluences() else points
 
     def normals(
-        self, mesh: UsdGeom.Mesh, points: NDArray[np.float64], corners: IntArray, normals: NDArray[np.float64]
+        self,
+        mesh: UsdGeom.Mesh,
+        points: NDArray[np.float64],  # (n, 3) float64
+        corners: IntArray,  # (n_h,) int64: the point of each face corner
+        normals: NDArray[np.float64],  # (n_h, 3) float64
     ) -> NDArray[np.float64]:
         """Normals ``(n_h, 3)`` at face corners after joints.
 
         Joints move each point by an affine map; its linear part is the difference of the images of shifted points.
-
-        Parameters
-        ----------
-        points : (n, 3) float64
-        corners : (n_h,) int64
-            The point of each face corner.
-        normals : (n_h, 3) float64
         """
         query = self._query(mesh.GetPrim())
         if query is None:

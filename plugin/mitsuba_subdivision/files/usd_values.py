@@ -64,17 +64,13 @@ def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
 
 
 def local_to_world(
-    prim: Usd.Prim, time_of: Callable[[Usd.Attribute], Usd.TimeCode], known: dict[str, Gf.Matrix4d] | None = None
+    prim: Usd.Prim,
+    # Time code at which an attribute is read. Operations may have different ones.
+    time_of: Callable[[Usd.Attribute], Usd.TimeCode],
+    # Transforms by path, to which those of the prim and the prims above are added
+    known: dict[str, Gf.Matrix4d] | None = None,
 ) -> Gf.Matrix4d:
-    """Transform of a prim to world space, for row vectors.
-
-    Parameters
-    ----------
-    time_of : callable
-        Time code at which an attribute is read. Operations may have different ones.
-    known : dict, optional
-        Transforms by path, to which those of the prim and the prims above are added.
-    """
+    """Transform of a prim to world space, for row vectors."""
     from pxr import Gf, UsdGeom
 
     path = str(prim.GetPath())

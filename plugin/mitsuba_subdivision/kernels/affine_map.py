@@ -21,14 +21,13 @@ class AffineMap:
     inverse: tuple[Sequence[Float], ...]  # Of the linear map
 
     @classmethod
-    def of(cls, matrix: Matrix4, inverse: Matrix4 | None = None) -> AffineMap:
-        """The map of a 4x4 matrix, whose last row is not used.
-
-        Parameters
-        ----------
-        matrix, inverse : 4x4 matrices
-            Of Dr.Jit or NumPy. An inverse that is not given is computed, with derivatives.
-        """
+    def of(
+        cls,
+        # Of Dr.Jit or NumPy. An inverse that is not given is computed, with derivatives.
+        matrix: Matrix4,
+        inverse: Matrix4 | None = None,
+    ) -> AffineMap:
+        """The map of a 4x4 matrix, whose last row is not used."""
         rows = _rows(matrix)
         return cls(rows, [matrix[i, 3] for i in range(3)], _inverse(rows) if inverse is None else _rows(inverse))
 

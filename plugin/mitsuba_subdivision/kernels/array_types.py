@@ -99,16 +99,14 @@ class ArrayTypes:
         """A user's values as an array of one of these types; vectors of NumPy have a row for each component."""
         return mapped(kind, values.T) if isinstance(values, np.ndarray) else kind(values)
 
-    def fetch(self, kind: type, buffer: FloatBuffer | IndexBuffer, index: Index, active: Mask = True) -> Any:
-        """Gather a number or a vector from an array that `indices` or `floats` uploaded.
-
-        Parameters
-        ----------
-        kind : type
-            One of the attributes. Vectors are stored consecutively.
-        active : mask
-            Inactive lanes read zero.
-        """
+    def fetch(
+        self,
+        kind: type,  # One of the attributes. Vectors are stored consecutively.
+        buffer: FloatBuffer | IndexBuffer,
+        index: Index,
+        active: Mask = True,  # Inactive lanes read zero
+    ) -> Any:
+        """Gather a number or a vector from an array that `indices` or `floats` uploaded."""
         return dr.gather(kind, buffer, index, active)
 
     def row(self, buffer: FloatBuffer, size: int, index: Index, active: Mask = True) -> list[Float]:
@@ -138,15 +136,12 @@ class ArrayTypes:
         return dr.ravel(dr.gather(self.vector3, flat, index))
 
 
-def float_type_of(variant: str) -> type:
+def float_type_of(
+    variant: str,  # Such as "llvm_ad_rgb"
+) -> type:
     """Flat float array type of a variant of Mitsuba.
 
     Raises ValueError if the variant is scalar, or its backend is unknown.
-
-    Parameters
-    ----------
-    variant : str
-        Such as "llvm_ad_rgb".
     """
     backend, *features = variant.split("_")
     if backend not in ("llvm", "cuda"):

@@ -41,16 +41,12 @@ class CoefficientMap:
         """The map of a table, shared by all callers."""
         return _MAPS.get((table, float_type), lambda: cls(table, float_type))
 
-    def __call__(self, points: FloatBuffer, made: FloatBuffer | None = None) -> FloatBuffer:
-        """Compute the coefficients, see `PieceTable`.
-
-        Parameters
-        ----------
-        points : flat array
-            x, y, z of each control point of the cage.
-        made : flat array, optional
-            The coefficients if they are known, to attach them to the points only.
-        """
+    def __call__(
+        self,
+        points: FloatBuffer,  # x, y, z of each control point of the cage
+        made: FloatBuffer | None = None,  # The coefficients if they are known, to attach them to the points only
+    ) -> FloatBuffer:
+        """Compute the coefficients, see `PieceTable`."""
         return dr.custom(_Coefficients, self, points, made)
 
     def apply(self, points: FloatBuffer) -> FloatBuffer:

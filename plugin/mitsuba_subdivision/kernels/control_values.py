@@ -155,14 +155,12 @@ class SparseMatrix:
         self._start, self._columns = types.indices(matrix.indptr), types.indices(matrix.indices)
         self._entries = types.floats(matrix.data)
 
-    def __call__(self, flat: FloatBuffer, size: int = 3) -> FloatBuffer:
-        """The product as the flat components of ``n`` vectors, from those of ``m`` vectors.
-
-        Parameters
-        ----------
-        size : int
-            Number of components, at most 4.
-        """
+    def __call__(
+        self,
+        flat: FloatBuffer,
+        size: int = 3,  # Number of components, at most 4
+    ) -> FloatBuffer:
+        """The product as the flat components of ``n`` vectors, from those of ``m`` vectors."""
         types = self._types
         vector = types.vector(size)
         row: Index = dr.arange(types.index, self._row_count)

@@ -52,21 +52,14 @@ class Heights(Protocol):
         ...
 
 
-def displaced(surface: PatchValues, height: tuple[Float, Float, Float]) -> PatchValues:
+def displaced(
+    surface: PatchValues,  # With second derivatives; its vectors are 3-vectors of Dr.Jit, or lists of three arrays
+    height: tuple[Float, Float, Float],  # The height, and its derivatives by the parameters
+) -> PatchValues:
     """Displace points of a surface along its normals.
 
-    Parameters
-    ----------
-    surface : PatchValues
-        With second derivatives; its vectors are 3-vectors of Dr.Jit, or lists of three arrays.
-    height : tuple
-        The height, and its derivatives by the parameters.
-
-    Returns
-    -------
-    PatchValues
-        Of the displaced surface, without second derivatives. Its normal is the cross product of the derivatives where
-        these span the tangent plane, else that of the surface. A point without a normal does not move.
+    Returns PatchValues: of the displaced surface, without second derivatives. Its normal is the cross product of the
+    derivatives where these span the tangent plane, else that of the surface. A point without a normal does not move.
     """
     uu, uv, vv = surface.second
     crossed = cross(surface.du, surface.dv)

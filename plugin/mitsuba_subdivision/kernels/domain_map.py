@@ -65,17 +65,14 @@ def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> 
     return number, inner_u, inner_v, scale
 
 
-def doublings(types: ArrayTypes, x: Float, most: Index) -> tuple[Index, Float]:
+def doublings(
+    types: ArrayTypes,
+    x: Float,  # Has no derivatives here
+    most: Index,  # The number of times at most
+) -> tuple[Index, Float]:
     """How many times a positive number can be doubled before it is 1 or more, and two to the power of that.
 
     Its exponent's bits are exact, and take a tenth of the operations of logarithms.
-
-    Parameters
-    ----------
-    x : float array
-        Has no derivatives here.
-    most : index array
-        The number of times at most.
     """
     integer, mantissa, bias = (types.index64, 52, 1023) if types.is_double else (types.index, 23, 127)
     bits: Index = dr.reinterpret_array(integer, dr.detach(x))
@@ -99,10 +96,7 @@ def turned(domain: ParameterDomain, u: Float, v: Float, turn: Index) -> tuple[Fl
 def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tuple[Float, Float, Float, Float]:
     """Derivatives of the parameters seen from the first corner by those seen from corner ``turn``.
 
-    Returns
-    -------
-    a, b, c, d : float arrays
-        Of u by u and v; of v by u and v.
+    Returns a, b, c, d, float arrays: of u by u and v; of v by u and v.
     """
     is_turned = [turn == k for k in range(1, domain.corner_count)]
     entries = []

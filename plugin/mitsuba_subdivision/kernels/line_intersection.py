@@ -170,20 +170,18 @@ class LineIntersection:
         return dr.clip(over(self._rounding * size * piece.magnification, longest), STEP_TOLERANCE, 1)
 
     def _steps(
-        self, piece: AnyPiece, p: Vector3, d: Vector3, is_still: Mask, turns: Mask, side: Float, facing: Float
+        self,
+        piece: AnyPiece,
+        p: Vector3,
+        d: Vector3,
+        is_still: Mask,  # Where none are taken
+        turns: Mask,  # Where the line is to be along the normal
+        # Unless zero, the line has intersected the surface on the wrong side. From a point that faces the
+        # wrong way, a step leads along the surface: in the direction of the line, or against it.
+        side: Float,
+        facing: Float,
     ) -> _Round:
-        """Newton's steps within a piece.
-
-        Parameters
-        ----------
-        is_still : mask
-            Where none are taken.
-        turns : mask
-            Where the line is to be along the normal.
-        side : float array
-            Unless zero, the line has intersected the surface on the wrong side. From a point that faces the wrong way,
-            a step leads along the surface: in the direction of the line, or against it.
-        """
+        """Newton's steps within a piece."""
         types = self._types
 
         def continues(left: Index, *_: Any) -> Mask:

@@ -60,15 +60,13 @@ class NearestLocation:
         self._types, self._walk, self._piece = types, walk, piece
         self._domain = walk.domain
 
-    def found(self, p: Vector3, start: Location, active: Mask = True) -> tuple[Location, NearestPoints]:
+    def found(
+        self,
+        p: Vector3,  # Without derivatives
+        start: Location,  # Where to begin
+        active: Mask = True,
+    ) -> tuple[Location, NearestPoints]:
         """Locations where the distance to points is least, at least among those nearby.
-
-        Parameters
-        ----------
-        p : 3-vector
-            Without derivatives.
-        start : Location
-            Where to begin.
 
         Returns
         -------

@@ -282,29 +282,16 @@ class PieceKernel:
 
     def piece(
         self,
-        buffer: FloatBuffer,
-        half_edge: Index,
+        buffer: FloatBuffer,  # Coefficients
+        half_edge: Index,  # Of an element
+        # Inside the domain, seen from the half-edge
         u: Float,
         v: Float,
         active: Mask = True,
-        row: Index4 | None = None,
-        size: int = 3,
+        row: Index4 | None = None,  # `ElementWalk.row` of the half-edges, if it is known
+        size: int = 3,  # How many of a coefficient's three numbers are wanted
     ) -> Piece:
-        """The piece in which parameters lie.
-
-        Parameters
-        ----------
-        buffer : flat array
-            Coefficients.
-        half_edge : index array
-            Of an element.
-        u, v : float arrays
-            Inside the domain, seen from the half-edge.
-        row : index array, optional
-            `ElementWalk.row` of the half-edges, if it is known.
-        size : int
-            How many of a coefficient's three numbers are wanted.
-        """
+        """The piece in which parameters lie."""
         types, domain = self.types, self.domain
         # Dr.Jit evaluates this again for derivatives, and must find the same array then, whatever the object has been
         # assigned since.

@@ -424,16 +424,12 @@ class AreaSampler:
         self._matrices, self._offsets = types.floats(cells.matrices), types.floats(cells.offsets)
         self._density = types.floats(chances / size)
 
-    def drawn(self, choice: Float, inside: Vector2) -> tuple[Location, Float]:
-        """Locations, and their density by the parameters of their elements.
-
-        Parameters
-        ----------
-        choice : float array
-            In [0, 1).
-        inside : 2-vector
-            In [0, 1) each.
-        """
+    def drawn(
+        self,
+        choice: Float,  # In [0, 1)
+        inside: Vector2,  # In [0, 1) each
+    ) -> tuple[Location, Float]:
+        """Locations, and their density by the parameters of their elements."""
         types = self._types
 
         def is_before(index: Index) -> Mask:

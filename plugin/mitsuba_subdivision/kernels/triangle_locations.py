@@ -32,14 +32,12 @@ class TriangleLocations(Protocol):
         ...
 
 
-def triangle_locations(table: VertexTable, walk: ElementWalk, types: ArrayTypes) -> TriangleLocations:
-    """Parameters on the triangles of a tessellation.
-
-    Parameters
-    ----------
-    walk : ElementWalk
-        Over the same elements.
-    """
+def triangle_locations(
+    table: VertexTable,
+    walk: ElementWalk,  # Over the same elements
+    types: ArrayTypes,
+) -> TriangleLocations:
+    """Parameters on the triangles of a tessellation."""
     if isinstance(table.grid, UniformGrid):
         return UniformLocations(table.grid, walk, types)
     return AdaptiveLocations(cast("AdaptiveGrid", table.grid), walk, types)

@@ -219,9 +219,7 @@ class EvaluatedVertices:
 
         Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
 
-        Returns
-        -------
-        positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
+        Returns positions, normals, flat Dr.Jit float arrays, (3 vertex_count).
         """
         positions, normals = self.positions, self.normals
         if dr.grad_enabled(control_points):

@@ -257,13 +257,10 @@ class Topology:
         return np.where(beyond < 0, -1, self.next[beyond])[()]
 
 
-def paired(keys: IntArray) -> tuple[IndexArray, IndexArray, int]:
+def paired(
+    keys: IntArray,  # (n,) int: A number from 0 on that a half-edge shares with the others of its edge alone
+) -> tuple[IndexArray, IndexArray, int]:
     """Join half-edges of equal keys into edges.
-
-    Parameters
-    ----------
-    keys : (n,) int
-        A number from 0 on that a half-edge shares with the others of its edge alone.
 
     Returns
     -------

@@ -85,13 +85,11 @@ def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray
     return rules
 
 
-def _split_vertices(mesh: SharpMesh, is_border: NDArray[np.bool_]) -> tuple[NDArray[np.int32], IntArray]:
+def _split_vertices(
+    mesh: SharpMesh,
+    is_border: NDArray[np.bool_],  # (n_h,) bool: whether each half-edge lies on a border after the cut
+) -> tuple[NDArray[np.int32], IntArray]:
     """Give every side of a vertex, the faces between two borders, a copy of it; the first one keeps the vertex itself.
-
-    Parameters
-    ----------
-    is_border : (n_h,) bool
-        Whether each half-edge lies on a border after the cut.
 
     Returns
     -------
@@ -136,7 +134,12 @@ def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: I
 
 
 def semi_sharpness_of_cut(
-    mesh: SharpMesh, cut: CutMesh, is_cut: NDArray[np.bool_], is_sharpened_across: NDArray[np.bool_] | None = None
+    mesh: SharpMesh,  # The mesh before the cut
+    cut: CutMesh,  # The mesh after it, with the rules of its vertices
+    is_cut: NDArray[np.bool_],  # (n_h,) bool: whether each half-edge lies on the cut
+    # (n,) bool: whether semi-sharp edges across the cut sharpen each vertex of the cut mesh. By default they
+    # sharpen all.
+    is_sharpened_across: NDArray[np.bool_] | None = None,
 ) -> SemiSharpness | None:
     """Semi-sharp features of a cut mesh, whose vertices also know the semi-sharp edges across the cut.
 
@@ -153,17 +156,6 @@ def semi_sharpness_of_cut(
     There is a row for every pair of a semi-sharp half-edge and a copy of the vertex where it begins, but for pairs of a
     half-edge with its own copy, which `SemiSharpness.edges` has. A semi-sharp edge may also be cut itself, along a
     seam. It then belongs to neither side and sharpens no copy; Chaikin's method still averages over it.
-
-    Parameters
-    ----------
-    mesh : SharpMesh
-        The mesh before the cut.
-    cut : CutMesh
-        The mesh after it, with the rules of its vertices.
-    is_cut : (n_h,) bool
-        Whether each half-edge lies on the cut.
-    is_sharpened_across : (n,) bool, optional
-        Whether semi-sharp edges across the cut sharpen each vertex of the cut mesh. By default they sharpen all.
     """
     t, sharpness, method = mesh.topology, mesh.sharpness, mesh.crease_method
     if not sharpness.any:

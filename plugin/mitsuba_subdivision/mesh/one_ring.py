@@ -67,18 +67,15 @@ class OneRing:
                 return neighbours[:-1]
 
     def gather(
-        self, topology: Topology, half_edges: NDArray[np.integer], columns: NDArray[np.int32] | None = None
+        self,
+        topology: Topology,
+        half_edges: NDArray[np.integer],  # (e,) int: the half-edge that names each element
+        # (K, e) int32: array for the result, which is a transposed view of it
+        columns: NDArray[np.int32] | None = None,
     ) -> NDArray[np.int32]:
         """Find the one-rings of many elements of this signature: the vertices of ``topology`` at each local vertex.
 
         Returns (e, K) int32.
-
-        Parameters
-        ----------
-        half_edges : (e,) int
-            The half-edge that names each element.
-        columns : (K, e) int32, optional
-            Array for the result, which is a transposed view of it.
         """
         # This is often the largest array of all, and is filled column by column.
         if columns is None:

@@ -31,7 +31,11 @@ def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
     return cut_along_creases(SharpMesh(topology, sharpness, no_corners, topology.is_border_vertex))
 
 
-def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> tuple[Topology, IntArray]:
+def value_mesh(
+    mesh: SharpMesh,
+    mode: str,  # Which values are corners, as listed above
+    indices: IntArray,  # (n_h,) int64: 0-based row of the attribute's values at each face corner
+) -> tuple[Topology, IntArray]:
     """Mesh on which face-varying values are subdivided, in every mode but "all".
 
     The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, also if its sides have the same index at one of
@@ -59,13 +63,6 @@ def value_mesh(mesh: SharpMesh, mode: str, indices: IntArray) -> tuple[Topology,
     second one twice and may then treat its two parts as if they had nothing in common; here both indices are corners.
     And where semi-sharp edges of one index sharpen the other while the seam itself is semi-sharp for longer, OpenSubdiv
     lets the other become smooth one refinement late; here both become smooth together.
-
-    Parameters
-    ----------
-    mode : str
-        Which values are corners, as listed above.
-    indices : (n_h,) int64
-        0-based row of the attribute's values at each face corner.
 
     Returns
     -------
@@ -168,18 +165,15 @@ def _rules_at_seams(
 
 
 def _corner_conditions(
-    mesh: SharpMesh, vertex: IntArray, copy_count: IntArray, face_count: IntArray
+    mesh: SharpMesh,
+    vertex: IntArray,  # (c,) int: the mesh's vertex of each value
+    # (c,) int: number of copies of the vertex, and of faces at it, of each value
+    copy_count: IntArray,
+    face_count: IntArray,
 ) -> dict[str, NDArray[np.bool_]]:
     """Conditions that may make a value at a seam a corner, each ``(c,)``.
 
     A value is all copies of one vertex that have the same row of the attribute.
-
-    Parameters
-    ----------
-    vertex : (c,) int
-        The mesh's vertex of each value.
-    copy_count, face_count : (c,) int
-        Number of copies of the vertex, and of faces at it, of each value.
     """
     count = mesh.topology.vertex_count
     values_there = np.bincount(vertex, minlength=count)[vertex]

@@ -39,7 +39,8 @@ class SemiSharpness:
     @classmethod
     def decaying(
         cls,
-        origin: IntArray,
+        origin: IntArray,  # (n_h,) int: vertex at which each half-edge begins
+        # As `SemiSharpness` has them
         edges: FloatArray,
         vertices: FloatArray,
         across_vertex: IntArray,
@@ -52,14 +53,6 @@ class SemiSharpness:
         A refinement lowers each sharpness by one. Chaikin's method first replaces the sharpness of an edge by three
         quarters of it and a quarter of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998], as
         OpenSubdiv does.
-
-        Parameters
-        ----------
-        origin : (n_h,) int
-            Vertex at which each half-edge begins.
-        edges, vertices, across_vertex, across_sharpness, across_sharpens
-            As `SemiSharpness` has them.
-        method : "uniform" or "chaikin"
         """
         if not (edges.any() or vertices.any() or across_sharpness.any()):
             return None
@@ -79,18 +72,15 @@ class SemiSharpness:
         return _lowered(self.vertices)
 
     def refined(
-        self, origin: IntArray, edges: FloatArray, new_vertex_count: int, method: CreaseMethod
+        self,
+        # (n_h',): vertex at which each refined half-edge begins, and its sharpness: `edges_refined`, or 0 for
+        # new edges
+        origin: IntArray,
+        edges: FloatArray,
+        new_vertex_count: int,  # Number of vertices that are new
+        method: CreaseMethod,
     ) -> SemiSharpness | None:
-        """Sharpness of a refined mesh whose first vertices are those of this one.
-
-        Parameters
-        ----------
-        origin, edges : (n_h',)
-            Vertex at which each refined half-edge begins, and its sharpness: `edges_refined`, or 0 for new edges.
-        new_vertex_count : int
-            Number of vertices that are new.
-        method : "uniform" or "chaikin"
-        """
+        """Sharpness of a refined mesh whose first vertices are those of this one."""
         vertices = np.concatenate([self.vertices_refined, np.zeros(new_vertex_count)])
         # Edges that have become smooth are dropped: kept at 0, they would make signatures of equal surroundings differ.
         kept = self.across_refined > 0

@@ -75,17 +75,14 @@ class Shared(Generic[Value]):
         self._making: dict[Hashable, RLock] = {}
         self._lock = Lock()
 
-    def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value of a key.
-
-        Parameters
-        ----------
-        key : hashable
-            Of what all of the value follows from. Held for as long as the value lives.
-        make : callable
-            Makes the value if there is none. It may request other values. It must not wait for Dr.Jit, which may begin
-            other work meanwhile that asks for the same value.
-        """
+    def get(
+        self,
+        key: Hashable,  # Of what all of the value follows from. Held for as long as the value lives.
+        # Makes the value if there is none. It may request other values. It must not wait for Dr.Jit, which
+        # may begin other work meanwhile that asks for the same value.
+        make: Callable[[], Value],
+    ) -> Value:
+        """The value of a key."""
         with self._lock:
             found = self._values.get(key)
             if found is not None:

@@ -235,16 +235,12 @@ def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
     return TaggedFan(fan.ahead, fan.behind, fan.rule, fan.is_closed, sharpness)
 
 
-def with_sharpness(smooth: Signature, topology: Topology, around: IndexArray) -> Signature:
-    """Signature of an element with its semi-sharp features.
-
-    Parameters
-    ----------
-    smooth : Signature
-        Without them.
-    around : (n,) int32
-        The result of `half_edges_around`.
-    """
+def with_sharpness(
+    smooth: Signature,  # Without them
+    topology: Topology,
+    around: IndexArray,  # (n,) int32: the result of `half_edges_around`
+) -> Signature:
+    """Signature of an element with its semi-sharp features."""
     semi = topology.semi_sharpness
     if semi is None:
         return smooth

@@ -50,19 +50,14 @@ class ChannelLayout:
 
     @classmethod
     def of(
-        cls, name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable
+        cls,
+        name: str,  # The attribute's name in error messages
+        attribute: Attribute,  # Of the cage, validated
+        cage: ControlCage,
+        scheme: Scheme,
+        patches: PatchTable,  # Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
     ) -> ChannelLayout:
-        """Choose how an attribute is interpolated. Raises SchemeError if the scheme has no rules for such attributes.
-
-        Parameters
-        ----------
-        name : str
-            The attribute's name in error messages.
-        attribute : Attribute
-            Of the cage, validated.
-        patches : PatchTable
-            Of the cage's surface. Channels whose values are subdivided on the same mesh share it.
-        """
+        """Choose how an attribute is interpolated. Raises SchemeError if the scheme has no rules for it."""
         key = cage.structure, scheme, attribute.interpolation, Content(attribute.indices)
         return _LAYOUTS.get(key, lambda: _layout_of(name, attribute, cage, scheme, patches))
 
@@ -228,19 +223,16 @@ class LinearChannel(_OfLayout):
 Channel = SubdividedChannel | LinearChannel
 
 
-def contracts_alike(channel: Channel, patches: PatchTable, half_edge: IntArray) -> NDArray[np.bool_]:
+def contracts_alike(
+    channel: Channel,
+    patches: PatchTable,  # Of the surface
+    half_edge: IntArray,  # (s,) int64: half-edges that begin at the points
+) -> NDArray[np.bool_]:
     """Whether a channel's values and the points of a surface contract alike around extraordinary points.
 
     If they are subdivided alike there, their tangents at the point are the same multiples of derivatives nearby.
 
     Returns (s,) bool.
-
-    Parameters
-    ----------
-    patches : PatchTable
-        Of the surface.
-    half_edge : (s,) int64
-        Half-edges that begin at the points.
     """
     if isinstance(channel, LinearChannel):
         return np.zeros(len(half_edge), dtype=bool)
@@ -337,23 +329,16 @@ class PatchSampler:
 
     def evaluate(
         self,
+        # (s,) int64: the corner of an element where each sample's parameters are (0, 0), a half-edge of
+        # `PatchTable.elements`
         half_edge: IntArray,
-        uv: FloatArray,
+        uv: FloatArray,  # (s, 2) float64: parameters, seen from that corner
+        # As for `LimitSurface.evaluate`
         evaluator: Evaluator = "stabilized",
         dtype: DTypeLike = np.float64,
         derivatives: int = 1,
     ) -> ElementSamples:
-        """Evaluate samples.
-
-        Parameters
-        ----------
-        half_edge : (s,) int64
-            The corner of an element where each sample's parameters are (0, 0), a half-edge of `PatchTable.elements`.
-        uv : (s, 2) float64
-            Parameters, seen from that corner.
-        evaluator, dtype, derivatives
-            As for `LimitSurface.evaluate`.
-        """
+        """Evaluate samples."""
         scheme, classes = self.patches.scheme, self.patches.classes
         class_index, patch, corner = self.patches.patch_at(half_edge)
         samples = ElementSamples.empty(len(uv), self.control_values.shape[1], dtype, derivatives)

@@ -373,17 +373,14 @@ class BoxTree:
             levels.append((np.minimum.reduceat(low, begins), np.maximum.reduceat(high, begins)))
         return cls(order, tuple(levels))
 
-    def near(self, points: FloatArray, squared_distance: FloatArray) -> tuple[IntArray, IntArray]:
+    def near(
+        self,
+        points: FloatArray,  # (s, 3) float64
+        squared_distance: FloatArray,  # (s,) float64
+    ) -> tuple[IntArray, IntArray]:
         """Pairs of a point and a box that is no further from it than a distance of its own.
 
-        Parameters
-        ----------
-        points : (s, 3) float64
-        squared_distance : (s,) float64
-
-        Returns
-        -------
-        point, box : (n,) int64
+        Returns point, box, (n,) int64.
         """
         point = np.repeat(np.arange(len(points)), len(self.levels[-1][0]))
         node = np.tile(np.arange(len(self.levels[-1][0])), len(points))

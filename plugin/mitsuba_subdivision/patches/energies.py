@@ -40,19 +40,13 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def energy_matrix(
-    patches: PatchTable, control_of_vertex: IntArray, control_points: FloatArray, density: Density, order: int
+    patches: PatchTable,
+    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
+    control_points: FloatArray,  # (n, 3) float64: of the surface
+    density: Density,
+    order: int,  # Gauss nodes along each parameter of a piece
 ) -> sparse.csr_array:
-    """Sum an energy over a surface. Returns (n, n) CSR array of float64: symmetric.
-
-    Parameters
-    ----------
-    control_of_vertex : (n_v,) int64
-        0-based control point at each mesh vertex.
-    control_points : (n, 3) float64
-        Of the surface.
-    order : int
-        Gauss nodes along each parameter of a piece.
-    """
+    """Sum an energy over a surface. Returns (n, n) CSR array of float64: symmetric."""
     from scipy import sparse
 
     controls, refinement = patches.control_rows(control_of_vertex, len(control_points))

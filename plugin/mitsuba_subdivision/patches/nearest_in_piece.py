@@ -36,19 +36,13 @@ ROUNDED = 2.0**-50
 
 
 def nearest_in_pieces(
-    pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
+    pieces: PolynomialPieces,
+    which: IntArray,  # (s,) int64: the piece for each point
+    points: FloatArray,  # (s, 3) float64
+    uv: FloatArray,  # (s, 2) float64: parameters to begin with, in the domain of the piece
+    size: float,  # Of the coordinates, for the rounding error
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find a local minimum of the distance to a point in each piece.
-
-    Parameters
-    ----------
-    which : (s,) int64
-        The piece for each point.
-    points : (s, 3) float64
-    uv : (s, 2) float64
-        Parameters to begin with, in the domain of the piece.
-    size : float
-        Of the coordinates, for the rounding error.
 
     Returns
     -------

@@ -22,14 +22,12 @@ from ..schemes.domain import FloatArray
 FEW_CODES = 1 << 16
 
 
-def fan_codes(topology: Topology, *, near: bool = False) -> IntArray:
-    """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face.
-
-    Parameters
-    ----------
-    near : bool
-        Whether the codes are those of fans that have the faces of `TaggedFan.near` only.
-    """
+def fan_codes(
+    topology: Topology,
+    *,
+    near: bool = False,  # Whether the codes are those of fans that have the faces of `TaggedFan.near` only
+) -> IntArray:
+    """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face."""
     t = topology
     far_vertices = _has_far_faces(t) if near else np.zeros(0, dtype=bool)
     face_count = np.where(far_vertices, NEAR_FACES, t.vertex_face_count) if far_vertices.any() else t.vertex_face_count
@@ -48,15 +46,12 @@ def fan_codes(topology: Topology, *, near: bool = False) -> IntArray:
     return row_codes(columns)
 
 
-def row_codes(columns: Sequence[IntArray]) -> IntArray:
+def row_codes(
+    columns: Sequence[IntArray],  # sequence of (n,) int: the first column counts most in the order
+) -> IntArray:
     """Number the rows of a table: equal rows get equal numbers, and lesser rows lesser ones.
 
     Returns (n,) unsigned int: of a type of few bytes, where few are enough.
-
-    Parameters
-    ----------
-    columns : sequence of (n,) int
-        The first column counts most in the order.
     """
     codes: IntArray = np.zeros(len(columns[0]), dtype=np.uint8)
     count = 1
@@ -127,20 +122,19 @@ def _has_far_faces(topology: Topology) -> NDArray[np.bool_]:
 
 
 def _codes_around(
-    topology: Topology, face_codes: IntArray, face_count: IntArray, cut: tuple[IntArray, IntArray] | None
+    topology: Topology,
+    # (n_h,) int: code of each half-edge's face; number of faces that it sees around its vertex
+    face_codes: IntArray,
+    face_count: IntArray,
+    # ((m,) int, (m,) int): half-edges that see `NEAR_FACES` of their fan only, and how many of them clockwise of
+    # their own
+    cut: tuple[IntArray, IntArray] | None,
 ) -> tuple[IntArray, IntArray]:
     """Two columns that encode which faces lie around the vertex of each half-edge, in which order.
 
     Around a vertex whose faces all have the same code, the first column is that code, and the second is 0. Around any
     other, the first column is 0, and the second numbers the whole sequence of codes, from 1 on, counter-clockwise from
     the half-edge's own face.
-
-    Parameters
-    ----------
-    face_codes, face_count : (n_h,) int
-        Code of each half-edge's face; number of faces that it sees around its vertex.
-    cut : ((m,) int, (m,) int), optional
-        Half-edges that see `NEAR_FACES` of their fan only, and how many of them clockwise of their own.
     """
     t = topology
     common, sequence = face_codes.astype(np.int64), np.zeros(t.half_edge_count, dtype=np.int64)

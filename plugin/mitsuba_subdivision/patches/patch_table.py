@@ -175,14 +175,11 @@ class PatchTable:
         return RefinedPatches(table, refinement.stencils.matrix)
 
     def control_rows(
-        self, control_of_vertex: IntArray, control_count: int
+        self,
+        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
+        control_count: int,
     ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
         """Control values of all patches and, for refined ones, the matrix that makes them of the cage's.
-
-        Parameters
-        ----------
-        control_of_vertex : (n_v,) int64
-            0-based control value at each mesh vertex.
 
         Returns
         -------
@@ -268,15 +265,12 @@ class PatchTable:
             corners = self.elements.next[corners]
         return columns
 
-    def _turned_to_least(self, fans: IntArray, corners: IndexArray) -> tuple[IndexArray, IntArray]:
+    def _turned_to_least(
+        self,
+        fans: IntArray,  # (n_h,) int: as made by `_fan_codes`
+        corners: IndexArray,  # (n,) int32: first corners of the elements
+    ) -> tuple[IndexArray, IntArray]:
         """Begin each whole element at the corner from which its code is least: turned copies get the same code.
-
-        Parameters
-        ----------
-        fans : (n_h,) int
-            As made by `_fan_codes`.
-        corners : (n,) int32
-            First corners of the elements.
 
         Returns
         -------

@@ -72,17 +72,14 @@ class PieceTable:
 
     @classmethod
     def build(
-        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int = PIECE_LEVELS
+        cls,
+        patches: PatchTable,
+        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
+        control_count: int,
+        # Number of levels of tips that are pieces, if these do not take too much memory
+        piece_levels: int = PIECE_LEVELS,
     ) -> PieceTable:
-        """Prepare the evaluation of some patches; equal arguments share the object while it is referenced.
-
-        Parameters
-        ----------
-        control_of_vertex : (n_v,) int64
-            0-based control value at each mesh vertex.
-        piece_levels : int
-            Number of levels of tips that are pieces, if these do not take too much memory.
-        """
+        """Prepare the evaluation of some patches; equal arguments share the object while it is referenced."""
         key = patches, Content(control_of_vertex), control_count, piece_levels
         return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))
 

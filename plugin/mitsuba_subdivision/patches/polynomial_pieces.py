@@ -246,14 +246,12 @@ class SurfacePieces:
     sizes: FloatArray
 
     @classmethod
-    def build(cls, patches: PatchTable, control_points: FloatArray) -> SurfacePieces:
-        """Divide all elements; those of very many pieces a few times only.
-
-        Parameters
-        ----------
-        control_points : (n_v, 3) float64
-            At each mesh vertex.
-        """
+    def build(
+        cls,
+        patches: PatchTable,
+        control_points: FloatArray,  # (n_v, 3) float64: at each mesh vertex
+    ) -> SurfacePieces:
+        """Divide all elements; those of very many pieces a few times only."""
         refined = patches.refined
         table = patches if refined is None else refined.table
         if refined is not None:
@@ -327,20 +325,14 @@ def _no_pieces(basis: BernsteinBasis) -> PolynomialPieces:
 
 
 def _seen(
-    patches: PatchTable, corners: IntArray, domain: AffineMap, near: FloatArray
+    patches: PatchTable,
+    corners: IntArray,  # (p,) int: corners of elements where the patches begin
+    domain: AffineMap,  # From the part's parameters to the patch's
+    near: FloatArray,  # (2,) float64: parameters of the patch to which the corner shall be near
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Of a part of each patch of a class, `half_edge`, `matrices` and `offsets` in its element.
 
     A part of a whole element is seen from the corner that is nearest, so that parameters lose no digits there.
-
-    Parameters
-    ----------
-    corners : (p,) int
-        Corners of elements where the patches begin.
-    domain : AffineMap
-        From the part's parameters to the patch's.
-    near : (2,) float64
-        Parameters of the patch to which the corner shall be near.
     """
     half_edge, shape = corners, patches.scheme.domain
     is_whole = patches.is_whole[patches.elements.face[corners]]
@@ -372,14 +364,11 @@ class ElementBounds:
     upper: FloatArray
 
 
-def element_bounds(pieces: SurfacePieces, elements: Topology) -> tuple[FloatArray, FloatArray]:
-    """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite where there is no element.
-
-    Parameters
-    ----------
-    elements : Topology
-        `PatchTable.elements`.
-    """
+def element_bounds(
+    pieces: SurfacePieces,
+    elements: Topology,  # `PatchTable.elements`
+) -> tuple[FloatArray, FloatArray]:
+    """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite where there is no element."""
     lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
 
     def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:

@@ -74,21 +74,14 @@ def joined_matrices(parts: Iterable[StencilRows], count: int, shape: tuple[int, 
 
 def sample_matrices(
     patches: PatchTable,
-    control_of_vertex: IntArray,
+    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
     control_count: int,
+    # Locations of the samples
     half_edge: IntArray,
     uv: FloatArray,
     derivatives: int = 1,
 ) -> StencilMatrices:
-    """Limit stencils of samples, given as for `PatchSampler.evaluate`.
-
-    Parameters
-    ----------
-    control_of_vertex : (n_v,) int64
-        0-based control point at each mesh vertex.
-    half_edge, uv
-        Locations of the samples.
-    """
+    """Limit stencils of samples, given as for `PatchSampler.evaluate`."""
     parts = _sample_rows(patches, control_of_vertex, half_edge, uv, derivatives)
     return StencilMatrices(*joined_matrices(parts, 3 if derivatives == 1 else 6, (len(uv), control_count)))
 

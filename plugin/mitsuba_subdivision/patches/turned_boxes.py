@@ -114,16 +114,12 @@ class TurnedBoxes:
         return cls(parts[0].basis, *(np.concatenate(column) for column in columns))
 
     def near(
-        self, points: FloatArray, which: IntArray, squared_reach: FloatArray
+        self,
+        points: FloatArray,  # (s, 3) float64
+        which: IntArray,  # (s,) int64: the box for each
+        squared_reach: FloatArray,  # (s,) float64
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """Which points are no further from their box than a distance of their own.
-
-        Parameters
-        ----------
-        points : (s, 3) float64
-        which : (s,) int64
-            The box for each.
-        squared_reach : (s,) float64
 
         Returns
         -------
@@ -146,17 +142,15 @@ class TurnedBoxes:
         near, squared_distance, away = map(np.concatenate, zip(*found, strict=True))
         return near, squared_distance, away
 
-    def are_convex(self, away: FloatArray, which: IntArray) -> NDArray[np.bool_]:
+    def are_convex(
+        self,
+        away: FloatArray,  # (n, 3) float64: as `near` gives it
+        which: IntArray,  # (n,) int64
+    ) -> NDArray[np.bool_]:
         """``(n,)`` whether squared distances from points have one minimum in each piece.
 
         They have where they are convex functions of the piece's parameters: half the second derivatives are those of
         the surface times the difference, plus products of tangents.
-
-        Parameters
-        ----------
-        away : (n, 3) float64
-            As `near` gives it.
-        which : (n,) int64
         """
         halves = self.halves[which]
         across, half, curvatures = away[:, 2:], halves[:, 2:], self.curvatures[which]

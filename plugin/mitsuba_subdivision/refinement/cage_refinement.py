@@ -65,16 +65,14 @@ class CageRefinement:
     corner: IntArray
 
 
-def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinement:
+def refine_cage(
+    cage: ControlCage,
+    chosen: str | Scheme | None,  # As for `adapted_scheme`. If it is given, the refined cage names it.
+) -> CageRefinement:
     """Refine a cage once.
 
     Raises CageError if no cage has the refined surface, or the refined values of an attribute. Raises SchemeError if
     the scheme does not number refined faces as Catmull-Clark, Loop or Doo-Sabin do, or has no rules for an attribute.
-
-    Parameters
-    ----------
-    chosen : str or Scheme, optional
-        As for `adapted_scheme`. If it is given, the refined cage names it.
     """
     scheme = adapted_scheme(cage, chosen)
     contents = CageContents(

@@ -32,11 +32,12 @@ BoolArray = NDArray[np.bool_]
 
 
 def refined_attributes(
+    # The refined one without attributes, but with all tags
     cage: ControlCage,
     refined: ControlCage,
     scheme: Scheme,
-    refinement: Refinement,
-    matrix: sparse.csr_array,
+    refinement: Refinement,  # Of the cut mesh
+    matrix: sparse.csr_array,  # (n, n_v) sparse array: the refined cage's vertices over the cage's
     corners: RefinedCorners,
 ) -> tuple[str, Attribute | None, dict[str, Attribute]]:
     """Refine texture coordinates and attributes under a scheme whose elements are faces.
@@ -46,15 +47,6 @@ def refined_attributes(
 
     Raises CageError if no rule makes the same corners. Raises SchemeError if the scheme has no rules for seams, and an
     attribute has some.
-
-    Parameters
-    ----------
-    cage, refined : ControlCage
-        The refined one without attributes, but with all tags.
-    refinement : Refinement
-        Of the cut mesh.
-    matrix : (n, n_v) sparse array
-        The refined cage's vertices over the cage's.
 
     Returns
     -------

@@ -110,16 +110,14 @@ class RefinedCorners:
         corner = np.where(self.kind[first] == VERTEX, half_edge - t.face_offsets[face], -1)
         return face, corner
 
-    def values(self, indices: IntArray) -> tuple[IntArray, IntArray]:
+    def values(
+        self,
+        indices: IntArray,  # (n_h,) int: of the values at the cage's face corners
+    ) -> tuple[IntArray, IntArray]:
         """How many different values of a face-varying attribute there are, and where.
 
         Corners share a value if they are of the same vertex of the refined cage and follow from the same values: those
         at the old vertex, or at both ends of the edge.
-
-        Parameters
-        ----------
-        indices : (n_h,) int
-            Of the values at the cage's face corners.
 
         Returns
         -------
@@ -146,15 +144,12 @@ class RefinedCorners:
         along = (values[h] + values[t.next[h]]) / 2
         return np.select([kind == VERTEX, kind == FACE], [values[h], means[t.face[h]]], along)
 
-    def at_ends(self, of_vertices: NDArray[np.bool_], topology: Topology) -> NDArray[np.bool_]:
-        """``(n_c,)`` whether a corner is the point of an edge on a border, at both of whose ends something holds.
-
-        Parameters
-        ----------
-        of_vertices : (n_v,) bool
-        topology : Topology
-            The mesh before, cut in some way.
-        """
+    def at_ends(
+        self,
+        of_vertices: NDArray[np.bool_],  # (n_v,) bool
+        topology: Topology,  # The mesh before, cut in some way
+    ) -> NDArray[np.bool_]:
+        """``(n_c,)`` whether a corner is the point of an edge on a border, at both of whose ends something holds."""
         h, t = self.half_edge, topology
         ends = of_vertices[t.face_vertices[h]] & of_vertices[t.face_vertices[t.next[h]]]
         return (self.kind == EDGE) & (t.twin[h] < 0) & ends

@@ -58,23 +58,16 @@ class LoadedScene:
 
 def load_scene(
     source: SceneSource,
+    # Values for parameters of the file, which it declares by `<default name=".."/>`
     parameters: Mapping[str, Any] | None = None,
+    # Reconstruction filter to use instead of the film's own. With "box", the same seed gives the same bits.
     filter_name: str | None = None,
-    sensor_index: int = 0,
+    sensor_index: int = 0,  # Which of the scene's sensors renders, from 0 on
 ) -> LoadedScene:
     """Load a scene in the current variant.
 
     Raises RegressionError if there is no such file or sensor, or the filter of a scene that is already loaded is
     another.
-
-    Parameters
-    ----------
-    parameters : dict, optional
-        Values for parameters of the file, which it declares by ``<default name=".."/>``.
-    filter_name : str, optional
-        Reconstruction filter to use instead of the film's own. With "box", the same seed gives the same bits.
-    sensor_index : int
-        Which of the scene's sensors renders, from 0 on.
     """
     with timed("Loading shapes and their hierarchy"):
         loaded = _loaded_scene(source, parameters, filter_name)

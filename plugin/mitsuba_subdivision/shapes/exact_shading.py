@@ -144,18 +144,13 @@ class ExactShading:
         self.side = _side_of(shape)
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
-    def set_transform(self, to_world: Matrix4, coefficients: FloatBuffer, placement: Placement) -> None:
-        """Set the transformation and coefficients; derivatives by both reach surface interactions.
-
-        Parameters
-        ----------
-        to_world : 4x4 matrix
-            From points relative to the centre to the world.
-        coefficients : flat array
-            The kernel's coefficients, maybe with derivatives.
-        placement : Placement
-            Of the same transformation.
-        """
+    def set_transform(
+        self,
+        to_world: Matrix4,  # From points relative to the centre to the world
+        coefficients: FloatBuffer,  # The kernel's coefficients, maybe with derivatives
+        placement: Placement,  # Of the same transformation
+    ) -> None:
+        """Set the transformation and coefficients; derivatives by both reach surface interactions."""
         self._are_turned = placement.mirrors
         self.kernel.take(coefficients)
         # Assign into the same array, because others may hold a reference to it.
@@ -299,19 +294,16 @@ class ExactShading:
         return self._texcoords(location, active)[0]
 
     def _fill_in(
-        self, si: mi.SurfaceInteraction3f, found: SurfacePoints, is_before: Mask, o: Vector3, d: Vector3, facing: Float
+        self,
+        si: mi.SurfaceInteraction3f,
+        found: SurfacePoints,
+        is_before: Mask,  # Where the surface is in front of the triangle
+        # The ray
+        o: Vector3,
+        d: Vector3,
+        facing: Float,  # Below zero where the ray meets the triangle from outside
     ) -> None:
-        """Set the normals, and the point that rays leave from.
-
-        Parameters
-        ----------
-        is_before : mask
-            Where the surface is in front of the triangle.
-        o, d : 3-vectors
-            The ray.
-        facing : float array
-            Below zero where the ray meets the triangle from outside.
-        """
+        """Set the normals, and the point that rays leave from."""
         variant, side = self._variant, self.side()
         if side is Side.EMITTER:
             return
@@ -372,16 +364,12 @@ def _side_of(shape: mi.Mesh) -> Callable[[], Side]:
     return side
 
 
-def _welded(table: VertexTable, split: AttributeLayout | None = None, first: IntArray | None = None) -> AttributeLayout:
-    """Triangles without copies of vertices, shared between shapes.
-
-    Parameters
-    ----------
-    split : AttributeLayout, optional
-        Triangles with copies of vertices along seams, if there are seams.
-    first : (n,) int64, optional
-        The vertex of `split` whose attributes each vertex has.
-    """
+def _welded(
+    table: VertexTable,
+    split: AttributeLayout | None = None,  # Triangles with copies of vertices along seams, if there are seams
+    first: IntArray | None = None,  # (n,) int64: the vertex of `split` whose attributes each vertex has
+) -> AttributeLayout:
+    """Triangles without copies of vertices, shared between shapes."""
 
     def triangles() -> NDArray[np.uint32]:
         if not table.copies.size:

@@ -57,19 +57,14 @@ class MovingVertices:
         self._computed: set[int] = set()
 
     def evaluated(
-        self, control_points: FloatBuffer, placement: Placement, on_backward: Callable, *, moves_points: bool
+        self,
+        control_points: FloatBuffer,  # The parameter
+        placement: Placement,
+        on_backward: Callable,  # Called with gradients, by name, after reverse mode has reached the moving arrays
+        *,
+        moves_points: bool,  # Whether control points have changed
     ) -> dict[str, FloatBuffer]:
-        """Evaluate the mesh's buffers, by their names, and have exact shading follow.
-
-        Parameters
-        ----------
-        control_points : flat array
-            The parameter.
-        on_backward : callable
-            Called with gradients, by name, after reverse mode has reached the moving arrays.
-        moves_points : bool
-            Whether control points have changed.
-        """
+        """Evaluate the mesh's buffers, by their names, and have exact shading follow."""
         points = self._points(control_points)
         is_attached = self.are_differentiable and dr.grad_enabled(points)
         kernel = self._kernel
@@ -92,15 +87,14 @@ class MovingVertices:
         return self._placed(*self._vertices.attached(points), placement, on_backward)
 
     def warn_of_lost(
-        self, gradients: dict[str, FloatBuffer | Matrix4], control_points: FloatBuffer, placement: Placement
+        self,
+        # By names of the arrays computed from the parameters. Gradients are zero for shapes of scenes out of
+        # use.
+        gradients: dict[str, FloatBuffer | Matrix4],
+        control_points: FloatBuffer,
+        placement: Placement,
     ) -> None:
-        """Warn if a gradient has come to the parameters, but could not get to what these were computed from.
-
-        Parameters
-        ----------
-        gradients : dict of str to arrays
-            By names of the arrays computed from the parameters. Gradients are zero for shapes of scenes out of use.
-        """
+        """Warn if a gradient has come to the parameters, but could not get to what these were computed from."""
         lost = self._computed - computed_ones(control_points, placement.matrix, *self._others())
         if lost and not is_recording() and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
             parameters = "control_points, to_world or heights" if self._others() else "control_points or to_world"

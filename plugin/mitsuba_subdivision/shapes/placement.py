@@ -99,16 +99,12 @@ class Placement:
 
     @classmethod
     def of(
-        cls, to_world: mi.AffineTransform4f, value: NDArray[np.float64], centre: NDArray[np.float64] | None
+        cls,
+        to_world: mi.AffineTransform4f,
+        value: NDArray[np.float64],  # (4, 4) float64: its matrix
+        centre: NDArray[np.float64] | None,  # (3,) float64 or None
     ) -> Placement:
-        """The placement by a transformation.
-
-        Parameters
-        ----------
-        value : (4, 4) float64
-            Its matrix.
-        centre : (3,) float64 or None
-        """
+        """The placement by a transformation."""
         is_jit = dr.is_jit_v(to_world.matrix)
         matrix, inverse = cls._recentred(to_world.matrix if is_jit else value, centre), np.linalg.inv(value)
         is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)

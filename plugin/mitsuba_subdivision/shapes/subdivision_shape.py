@@ -39,14 +39,10 @@ _MOVED = ["vertex_positions", "vertex_normals"]
 _CHOOSING = set(LIMITS)
 
 
-def make_subdivision(variant: Variant) -> type:
-    """Make the shape class of a variant of Mitsuba.
-
-    Parameters
-    ----------
-    variant : module
-        Such as ``mitsuba.llvm_ad_rgb``; its ``Mesh`` is the base class.
-    """
+def make_subdivision(
+    variant: Variant,  # Such as `mitsuba.llvm_ad_rgb`; its `Mesh` is the base class
+) -> type:
+    """Make the shape class of a variant of Mitsuba."""
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
@@ -329,14 +325,11 @@ def make_subdivision(variant: Variant) -> type:
                     self.control_points, self._placement, on_backward, moves_points=moves_points
                 )
 
-        def renew_derivatives(self, gradients: dict[str, FloatBuffer | Matrix4]) -> None:
-            """Attach the moving arrays to the parameters again, without evaluating them; see `MovingVertices`.
-
-            Parameters
-            ----------
-            gradients : dict of str to Dr.Jit arrays
-                By names of the arrays computed from the parameters.
-            """
+        def renew_derivatives(
+            self,
+            gradients: dict[str, FloatBuffer | Matrix4],  # By names of the arrays computed from the parameters
+        ) -> None:
+            """Attach the moving arrays to the parameters again, without evaluating them; see `MovingVertices`."""
             self._vertices.warn_of_lost(gradients, self.control_points, self._placement)
             if dr.grad_enabled([self._cage.values[name] for name in self._cage.moving]):
                 # `renew_attribute` receives the gradients next. Attaching vertices twice in one pass crashes Dr.Jit.

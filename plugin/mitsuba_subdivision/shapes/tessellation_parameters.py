@@ -78,18 +78,14 @@ class AdaptiveTessellation:
     fits_outline: bool  # Whether the limit holds only where the sensor may see the surface edge-on
 
     def table(
-        self, surface: LimitSurface, control_points: NDArray, to_world: NDArray, bound: DisplacementBound | None = None
+        self,
+        surface: LimitSurface,
+        control_points: NDArray,  # (n, 3) float64: in object space
+        to_world: NDArray,  # (4, 4) float64
+        # In object space. With it, the limit holds everywhere, as the silhouettes are unknown.
+        bound: DisplacementBound | None = None,
     ) -> VertexTable:
-        """Prepare the tessellation.
-
-        Parameters
-        ----------
-        control_points : (n, 3) float64
-            In object space.
-        to_world : (4, 4) float64
-        bound : DisplacementBound, optional
-            In object space. With it, the limit holds everywhere, as the silhouettes are unknown.
-        """
+        """Prepare the tessellation."""
         from ..tessellation import Criterion, DisplacementBound, Measure
 
         if bound is not None:

@@ -122,19 +122,11 @@ def vertices_of(
     attributes: AttributeTable,
     parameters: Parameters,
     displacement: ShapeDisplacement | None,
-    float_type: type | None,
+    float_type: type | None,  # Flat Dr.Jit array of a JIT variant; None in scalar variants
     *,
-    is_exact: bool,
+    is_exact: bool,  # Whether shading is exact
 ) -> Vertices:
-    """Choose the evaluator of the shape's vertices.
-
-    Parameters
-    ----------
-    float_type : type or None
-        Flat Dr.Jit array of a JIT variant; None in scalar variants.
-    is_exact : bool
-        Whether shading is exact.
-    """
+    """Choose the evaluator of the shape's vertices."""
     split = attributes
     if displacement is not None:
         # Copies along seams: their displacements differ, and are averaged.

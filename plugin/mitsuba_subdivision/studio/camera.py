@@ -41,21 +41,16 @@ class Camera:
 
 
 def framed(
-    points: NDArray[np.float64], azimuth: float, elevation: float, size: tuple[int, int], margin: float = MARGIN
+    points: NDArray[np.float64],  # (n, 3) float64: in the studio's axes
+    # Where the camera is, seen from the points, in degrees
+    azimuth: float,
+    elevation: float,
+    size: tuple[int, int],  # (width, height)
+    margin: float = MARGIN,  # Part of the picture's width and height that stays empty on each side
 ) -> Camera:
     """Place a camera so that points just fit into its image, centred.
 
     Points that are deeper than they are wide are smaller than that, as the camera keeps away from them.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-        In the studio's axes.
-    azimuth, elevation : float
-        Where the camera is, seen from the points, in degrees.
-    size : (width, height)
-    margin : float
-        Part of the picture's width and height that stays empty on each side.
     """
     axes = camera_axes(azimuth, elevation)
     slopes = _slopes(size, margin)
@@ -72,18 +67,13 @@ def framed(
     return Camera(axes, axes @ np.array([*middle, depth]), float(centre - depth))
 
 
-def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The few points that determine the camera of `framed`, and the bounds of all points.
-
-    Parameters
-    ----------
-    points : (n, 3) float64
-    up : "y" or "z"
-        The axis that points up in the world.
-    view : str or (azimuth, elevation)
-        From where the camera looks.
-    size : (width, height)
-    """
+def outermost(
+    points: NDArray[np.float64],  # (n, 3) float64
+    up: str,  # The axis that points up in the world
+    view: View,  # str or (azimuth, elevation): from where the camera looks
+    size: tuple[int, int],  # (width, height)
+) -> NDArray[np.float64]:
+    """The few points that determine the camera of `framed`, and the bounds of all points."""
     x, y = _slopes(size, MARGIN)
     # Away from each side of what the camera sees, then along its view and along the axes.
     towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
@@ -104,15 +94,12 @@ def camera_axes(azimuth: float, elevation: float) -> NDArray[np.float64]:
     return np.stack([right, np.cross(right, forward), forward], axis=1)
 
 
-def angles_of(view: View) -> tuple[float, float]:
+def angles_of(
+    view: View,  # str or (azimuth, elevation): A name in `VIEWS`, or two angles
+) -> tuple[float, float]:
     """Azimuth and elevation of a view, in degrees.
 
     Raises ValueError if there is no such view, or the elevation is not between -90 and 90.
-
-    Parameters
-    ----------
-    view : str or (azimuth, elevation)
-        A name in `VIEWS`, or two angles.
     """
     if isinstance(view, str):
         if view not in VIEWS:

@@ -126,28 +126,23 @@ class Model:
         """The drawn cage."""
         return CageWire(self.cage, float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2))
 
-    def as_shape(self, triangles: SceneNode, shading: str, *, in_memory: bool = False) -> SceneNode:
-        """The shape ``subdivision`` as an entry of a scene, without a material.
-
-        Parameters
-        ----------
-        triangles : dict
-            Parameters of its tessellation.
-        in_memory : bool
-            Whether the shape gets the cage itself, rather than its file.
-        """
+    def as_shape(
+        self,
+        triangles: SceneNode,  # Parameters of its tessellation
+        shading: str,
+        *,
+        in_memory: bool = False,  # Whether the shape gets the cage itself, rather than its file
+    ) -> SceneNode:
+        """The shape ``subdivision`` as an entry of a scene, without a material."""
         cage = self._in_memory() if in_memory or self.path is None else self._in_file(self.path)
         shape = {"type": "subdivision", **cage, **triangles}
         return shape if shading == "vertex" else {**shape, "shading": shading}
 
-    def triangles_for(self, sensor: SceneNode) -> SceneNode:
-        """Parameters of the coarsest exactly shaded tessellation whose facets do not show in an image of this sensor.
-
-        Parameters
-        ----------
-        sensor : dict
-            Entry of the scene's sensor.
-        """
+    def triangles_for(
+        self,
+        sensor: SceneNode,  # Entry of the scene's sensor
+    ) -> SceneNode:
+        """Parameters of the coarsest exactly shaded tessellation whose facets this sensor does not see."""
         outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
         segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
         highest = highest_rate(segments, np.array([corners]))

@@ -30,20 +30,16 @@ MOST_TRIANGLES = 4_000_000
 FEW_TRIANGLES = 20_000
 
 
-def shading_for(variant: str, parameters: SceneNode) -> str:
+def shading_for(
+    variant: str,  # Variant in which the scene is rendered
+    parameters: SceneNode,  # Of the shape `subdivision`; by default its shading is `auto`
+) -> str:
     """Shading of the limit surfaces of a scene, "exact" or "vertex".
 
     If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
     would make an error of every scene in a scalar variant where warnings are errors.
 
     Raises ValueError if there is no such shading.
-
-    Parameters
-    ----------
-    variant : str
-        Variant in which the scene is rendered.
-    parameters : dict
-        Of the shape ``subdivision``; by default its shading is ``auto``.
     """
     shading = parameters.get("shading", "auto")
     if shading not in SHADINGS:
@@ -60,20 +56,13 @@ def shading_for(variant: str, parameters: SceneNode) -> str:
 
 
 def segments_for(
-    cage: ControlCage, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float, shading: str
+    cage: ControlCage,
+    to_world: NDArray[np.float64],  # (n, 4, 4) float64: of each copy of the cage
+    outline: SceneNode,  # Of the sensor; see `outline_for`
+    near_clip: float,  # Of the sensor
+    shading: str,
 ) -> NDArray[np.int64]:
-    """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`. Returns (n,) int64.
-
-    Parameters
-    ----------
-    to_world : (n, 4, 4) float64
-        Of each copy of the cage.
-    outline : dict
-        Of the sensor; see `outline_for`.
-    near_clip : float
-        Of the sensor.
-    shading : "vertex" or "exact"
-    """
+    """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`. Returns (n,) int64."""
     linear = to_world[:, :3, :3]
     box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
     corners = box_corners(box) @ linear.transpose(0, 2, 1) + to_world[:, None, :3, 3]
@@ -84,16 +73,12 @@ def segments_for(
     return np.maximum(1, segments.astype(np.int64))
 
 
-def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) -> int:
-    """Largest rate, up to `FINEST_RATE`, with which cages have no more than `MOST_TRIANGLES`.
-
-    Parameters
-    ----------
-    segments : (n,) int
-        That each cage needs.
-    corners : (n,) int
-        Of its faces; a quadrilateral has four, and two triangles for each square of the rate.
-    """
+def highest_rate(
+    segments: NDArray[np.integer],  # (n,) int: that each cage needs
+    # (n,) int: of its faces; a quadrilateral has four, and two triangles for each square of the rate
+    corners: NDArray[np.integer],
+) -> int:
+    """Largest rate, up to `FINEST_RATE`, with which cages have no more than `MOST_TRIANGLES`."""
     rates = np.arange(2, FINEST_RATE + 1)
     triangles = (np.minimum(segments, rates[:, None]) ** 2 * corners).sum(axis=1) // 2
     return 1 + int(np.searchsorted(triangles, MOST_TRIANGLES, side="right"))
@@ -104,23 +89,16 @@ def outline_for(sensor: SceneNode) -> SceneNode:
     return pixel_error_for(mi.load_dict(sensor), ERRORS["exact"], outline=True)
 
 
-def triangles_for(segments: int, corners: int, most: int, outline: SceneNode, highest: int) -> SceneNode:
+def triangles_for(
+    segments: int,  # That it needs on each edge
+    corners: int,  # Of the faces of its cage
+    most: int,  # Segments of a uniform tessellation at most
+    outline: SceneNode,  # See `outline_for`
+    highest: int,  # Segments on each edge of an adaptive one at most
+) -> SceneNode:
     """Parameters of an exactly shaded shape in a still picture.
 
     Adaptive triangles are chosen where that pays: not where uniform ones are few, or as many as the cage has.
-
-    Parameters
-    ----------
-    segments : int
-        That it needs on each edge.
-    corners : int
-        Of the faces of its cage.
-    most : int
-        Segments of a uniform tessellation at most.
-    outline : dict
-        See `outline_for`.
-    highest : int
-        Segments on each edge of an adaptive one at most.
     """
     is_enough = segments <= most and segments**2 * corners <= 2 * FEW_TRIANGLES
     if is_enough or min(segments, highest) == 1:

@@ -129,15 +129,12 @@ def studio(
     return scene
 
 
-def sampler(spp: int) -> SceneNode:
-    """Well-spread samples, as for ``mi.load_dict``.
-
-    Parameters
-    ----------
-    spp : int
-        Samples of a pixel at least. They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a
-        warning.
-    """
+def sampler(
+    # Samples of a pixel at least. They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with
+    # a warning.
+    spp: int,
+) -> SceneNode:
+    """Well-spread samples, as for ``mi.load_dict``."""
     rows = isqrt(spp)
     return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
 
@@ -199,18 +196,15 @@ def _check_film(size: tuple[int, int], spp: int) -> None:
         raise ValueError(f"spp {spp!r}; expected 1 or more samples per pixel")
 
 
-def backdrop(front: float, bend: float, wall: float, height: float, half_width: float) -> ControlCage:
-    """Cage of a sweep across the x axis: the floor is z = 0, and the wall rises towards +y.
-
-    Parameters
-    ----------
-    front : float
-        How far the floor reaches towards -y; more than ``wall - 2 * bend``.
-    bend, wall : float
-        Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height ``wall - bend``.
-    height : float
-        Of the wall; more than ``2 * (wall - bend)``.
-    """
+def backdrop(
+    front: float,  # How far the floor reaches towards -y; more than `wall - 2 * bend`
+    # Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height `wall - bend`
+    bend: float,
+    wall: float,
+    height: float,  # Of the wall; more than `2 * (wall - bend)`
+    half_width: float,
+) -> ControlCage:
+    """Cage of a sweep across the x axis: the floor is z = 0, and the wall rises towards +y."""
     # A cubic spline is straight where four control points in a row are.
     step = wall - bend
     floor = [[-front, 0], [bend - step, 0], [bend, 0]]

@@ -56,17 +56,14 @@ class AttributeTable:
 
     @classmethod
     def build(
-        cls, table: VertexTable, patches: PatchTable, control_of_vertex: IntArray, channels: Mapping[str, Channel]
+        cls,
+        table: VertexTable,  # Of the tessellation
+        # The inputs that the table was built from
+        patches: PatchTable,
+        control_of_vertex: IntArray,
+        channels: Mapping[str, Channel],
     ) -> AttributeTable:
-        """Evaluate attributes in float64.
-
-        Parameters
-        ----------
-        table : VertexTable
-            Of the tessellation.
-        patches, control_of_vertex
-            The inputs that the table was built from.
-        """
+        """Evaluate attributes in float64."""
         layouts = tuple(channel.layout for channel in channels.values())
 
         def make() -> AttributeLayout:

@@ -236,27 +236,22 @@ def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
     return np.abs(dot(du[:, None], dv[None])).max(axis=(0, 1))
 
 
-def _slip(tangents: tuple[TangentCone, TangentCone], longest: FloatArray) -> FloatArray:
-    """``(.., t)`` relative excess of the distance over its part along the normal, at one segment.
-
-    Parameters
-    ----------
-    longest : (.., t) float
-        Largest squared second derivative.
-    """
+def _slip(
+    tangents: tuple[TangentCone, TangentCone],
+    longest: FloatArray,  # (.., t) float: largest squared second derivative
+) -> FloatArray:
+    """``(.., t)`` relative excess of the distance over its part along the normal, at one segment."""
     shortest = np.minimum(tangents[0].shortest, tangents[1].shortest)
     return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)
 
 
-def least_product(forms: FloatArray) -> IntArray:
+def least_product(
+    # (f, 3, t) float64: A, B and C, not negative; `f` of them, each of which is to be no more than one
+    forms: FloatArray,
+) -> IntArray:
     """Integers whose product is least, of those with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` no more than one.
 
     Returns (t, 2) int64.
-
-    Parameters
-    ----------
-    forms : (f, 3, t) float64
-        A, B and C, not negative; ``f`` of them, each of which is to be no more than one.
     """
     forms = np.minimum(forms, MOST)
     a, b, c = np.maximum(forms.max(axis=0), TINY)

@@ -73,15 +73,12 @@ def exceeded_limit(needed: float, most: int | None = None) -> int | None:
     return None if limit is None or needed <= limit else limit
 
 
-def available_memory(root: str | Path = "/") -> int | None:
+def available_memory(
+    root: str | Path = "/",  # Parent of the folders `proc` and `sys`
+) -> int | None:
     """Bytes that the process can still allocate: the minimum over the machine, its control groups and its own limit.
 
     Returns int or None: None if the system does not report it.
-
-    Parameters
-    ----------
-    root : str or Path
-        Parent of the folders ``proc`` and ``sys``.
     """
     from pathlib import Path
 

@@ -56,14 +56,12 @@ class PatchFrames:
         return found & self.is_whole
 
     @classmethod
-    def of(cls, patches: PatchTable, control_of_vertex: IntArray) -> PatchFrames:
-        """Frames of a table's patches.
-
-        Parameters
-        ----------
-        control_of_vertex : (n_v,) int64
-            0-based control point at each mesh vertex.
-        """
+    def of(
+        cls,
+        patches: PatchTable,
+        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
+    ) -> PatchFrames:
+        """Frames of a table's patches."""
         t, is_split = patches.elements, patches.refined is not None
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)

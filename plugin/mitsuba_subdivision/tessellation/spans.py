@@ -163,15 +163,14 @@ class Spans:
         on, edge = (np.concatenate(each) for each in zip(*((own.on[i], own.edge[i]) for own, i in chosen), strict=True))
         return on, edge
 
-    def numbered(self, edge: IndexArray, vertex: IndexArray) -> SpanVertices:
-        """Number the vertices where spans begin and inside spans, by which edges and vertices are the same.
-
-        Parameters
-        ----------
-        edge, vertex : (n_h,) int32
-            Numbers of edges and vertices, as those of `PatchFrames`. Spans and their beginnings are the same if they
-            lie in the same place, and on edges and vertices of the same numbers.
-        """
+    def numbered(
+        self,
+        # (n_h,) int32: numbers of edges and vertices, as those of `PatchFrames`. Spans and their beginnings
+        # are the same if they lie in the same place, and on edges and vertices of the same numbers.
+        edge: IndexArray,
+        vertex: IndexArray,
+    ) -> SpanVertices:
+        """Number the vertices where spans begin and inside spans, by which edges and vertices are the same."""
         frames = self.frames
         point, of_point = self._points
         span, of_span = self.at, first_of_each(self.at)

@@ -78,17 +78,16 @@ def inner_steps(rates: IntArray, corner_count: int) -> IntArray:
     return np.stack([at - (v * width - v * (v - 1) // 2) + 1, v + 1], axis=1)
 
 
-def stitched(rates: IntArray, sides: SideSamples, keeps_corner: NDArray[np.bool_] | None = None) -> IndexArray:
+def stitched(
+    rates: IntArray,  # (t, 2) int64
+    sides: SideSamples,
+    # (t, m) bool: corners that no triangle cuts off, of tiles with inner samples
+    keeps_corner: NDArray[np.bool_] | None = None,
+) -> IndexArray:
     """Join the samples of tiles by triangles.
 
     Returns (n, 3) int32: tile by tile, the samples of each triangle: those along the sides of all tiles are numbered
     first, then those inside.
-
-    Parameters
-    ----------
-    rates : (t, 2) int64
-    keeps_corner : (t, m) bool, optional
-        Corners that no triangle cuts off, of tiles with inner samples.
     """
     is_inner = has_inner(rates, sides.corner_count)
     is_plain = np.diff(sides.side_start[:: sides.corner_count]) == sides.corner_count

@@ -107,18 +107,14 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
 
 
 def _whole_patches(
-    patches: PatchTable, frames: PatchFrames, points: FloatArray, features: NDArray[np.bool_]
+    patches: PatchTable,
+    frames: PatchFrames,
+    points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
+    features: NDArray[np.bool_],  # (n_h,) bool: as `feature_edges`
 ) -> Iterator[tuple[Tiles, DividedTile | None, FloatArray]]:
     """All patches, each as one tile, in blocks of one class that bound temporary memory.
 
     Yields the tiles; how they are divided, or None for pieces; and their control points, or Bernstein coefficients.
-
-    Parameters
-    ----------
-    points : (n_v, 3) float64
-        At the vertices of the mesh.
-    features : (n_h,) bool
-        As `feature_edges`.
     """
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
@@ -288,17 +284,15 @@ def _interleaved(values: IntArray) -> IntArray:
 
 
 def feature_edges(
-    patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
+    patches: PatchTable,
+    frames: PatchFrames,
+    points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
+    criterion: Criterion,
 ) -> NDArray[np.bool_]:
     """``(n_h,)`` the half-edges along which curves hold to the limit by themselves.
 
     On open borders and folds, surfaces may be flat and end along curves all the same. Elsewhere the surface on one side
     of an edge holds the other, unless it may be coarse there.
-
-    Parameters
-    ----------
-    points : (n_v, 3) float64
-        At the vertices of the mesh.
     """
     t, names = frames.topology, frames.edge
     if criterion.measure is Measure.EDGE:

@@ -52,38 +52,32 @@ class TileRates:
         return limit
 
     def are_within(
-        self, tiles: Tiles, lower: FloatArray, upper: FloatArray, axis: FloatArray, extent: FloatArray
+        self,
+        tiles: Tiles,
+        # (3, t) float64: boxes of the hulls
+        lower: FloatArray,
+        upper: FloatArray,
+        axis: FloatArray,  # (3, t) float64: across which surfaces are hoped to be flat; unit vectors, or zero
+        extent: FloatArray,  # (t,) float64: of the hulls, along these axes
     ) -> NDArray[np.bool_]:
-        """``(t,)`` whether two triangles approximate tiles with these hulls within the tolerance.
-
-        Parameters
-        ----------
-        lower, upper : (3, t) float64
-            Boxes of the hulls.
-        axis : (3, t) float64
-            Across which surfaces are hoped to be flat; unit vectors, or zero.
-        extent : (t,) float64
-            Of the hulls, along these axes.
-        """
+        """``(t,)`` whether two triangles approximate tiles with these hulls within the tolerance."""
         limit = self.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
         size = np.linalg.norm(upper - lower, axis=0)
         if self.criterion.measure is Measure.EDGE:
             return size <= limit
         return np.where(axis.any(axis=0), extent, size) <= limit
 
-    def rated(self, tiles: Tiles, coefficients: FloatArray, triangle_count: int) -> list[Tiles]:
+    def rated(
+        self,
+        tiles: Tiles,
+        coefficients: FloatArray,  # (b, 3, t) float64: Bernstein coefficients over the tiles
+        triangle_count: int,  # Of all tiles before
+    ) -> list[Tiles]:
         """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
 
         Rates are those that the limit needs, and may exceed the highest; see `clipped`.
 
         Raises MemoryError if there would be too many triangles.
-
-        Parameters
-        ----------
-        coefficients : (b, 3, t) float64
-            Bernstein coefficients over the tiles.
-        triangle_count : int
-            Of all tiles before.
         """
         axis = axis_across(coefficients[self.basis.corners])
         extent = np.ptp(dot(coefficients, axis), axis=0)
@@ -198,15 +192,12 @@ class TileRates:
             sides[on, side] = np.minimum(needed, np.iinfo(sides.dtype).max)
         return sides
 
-    def _forms(self, coefficients: FloatArray, maps: FloatArray) -> FloatArray:
-        """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles.
-
-        Parameters
-        ----------
-        coefficients : (b, 3, t) float64
-        maps : (6, b, p, b) float64
-            As `_parts`.
-        """
+    def _forms(
+        self,
+        coefficients: FloatArray,  # (b, 3, t) float64
+        maps: FloatArray,  # (6, b, p, b) float64: as `_parts`
+    ) -> FloatArray:
+        """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles."""
         found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
         size, length = maps.shape[-1], max(1, PARTS_AT_ONCE // maps.shape[2])
         criterion, corner_count, parts_across = self.criterion, self.domain.corner_count, isqrt(maps.shape[2])

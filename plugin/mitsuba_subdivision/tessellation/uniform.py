@@ -24,21 +24,16 @@ MOST_VERTICES = ((1 << 32) - 1) // 6
 
 
 def uniform_table(
-    patches: PatchTable, rate: int, control_of_vertex: IntArray | None = None, control_count: int | None = None
+    patches: PatchTable,
+    rate: int,  # Segments per edge, at least 1
+    # (n_v,) int64: 0-based control point at each mesh vertex, where the mesh has several copies of some
+    control_of_vertex: IntArray | None = None,
+    control_count: int | None = None,  # Number of control points. By default there is one for each mesh vertex.
 ) -> VertexTable:
     """Prepare the uniform tessellation of a cage's patches; the same for equal arguments, while somebody holds it.
 
     Raises ValueError if the rate is no integer, below 1, or so high that there are more vertices than buffers hold.
     Raises MemoryError if the tessellation would not fit into memory.
-
-    Parameters
-    ----------
-    rate : int
-        Segments per edge, at least 1.
-    control_of_vertex : (n_v,) int64, optional
-        0-based control point at each mesh vertex, where the mesh has several copies of some.
-    control_count : int, optional
-        Number of control points. By default there is one for each mesh vertex.
     """
 
     def make() -> VertexTable:

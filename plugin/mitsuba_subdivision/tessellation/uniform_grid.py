@@ -215,18 +215,14 @@ class UniformGrid(ABC):
         """Vertices at corners."""
         return self.corner_vertex[self.topology.face_vertices[corners]]
 
-    def side_parts(self, corners: IntArray, sides: list[IntArray], along: FloatArray) -> list[GridPart]:
-        """Parts at the corners and along the sides of patches that are whole elements.
-
-        Parameters
-        ----------
-        corners : (p,) int64
-            Where the patches begin.
-        sides : list of (rate + 1,) int64
-            Samples of a patch's sides, counter-clockwise from this corner on.
-        along : (rate + 1,) float64
-            Parameters of these along a side.
-        """
+    def side_parts(
+        self,
+        corners: IntArray,  # (p,) int64: where the patches begin
+        # list of (rate + 1,) int64: samples of a patch's sides, counter-clockwise from this corner on
+        sides: list[IntArray],
+        along: FloatArray,  # (rate + 1,) float64: parameters of these along a side
+    ) -> list[GridPart]:
+        """Parts at the corners and along the sides of patches that are whole elements."""
         parts = []
         uv = np.stack([along, np.zeros_like(along)], axis=1)
         for side in sides:

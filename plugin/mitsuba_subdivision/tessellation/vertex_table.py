@@ -70,17 +70,14 @@ class VertexTable:
         """Points that `controls` are indices of, ``(n, k)``, from ``(control_count, k)`` of the cage."""
         return control_points if self.refinement is None else self.refinement @ control_points
 
-    def apply(self, control_points: FloatArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def apply(
+        self,
+        control_points: FloatArray,  # (control_count, 3) float64
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Evaluate every vertex.
 
-        Parameters
-        ----------
-        control_points : (control_count, 3) float64
-
-        Returns
-        -------
-        positions, normals : (vertex_count, 3) float64
-            Normals are zero where the surface has none, see `SurfaceSamples`.
+        Returns positions, normals, (vertex_count, 3) float64: normals are zero where the surface has none, see
+        `SurfaceSamples`.
         """
         positions, normals = (np.empty((self.vertex_count, 3)) for _ in range(2))
         points, are_rounded = self.refined(control_points), self.refinement is not None

@@ -58,14 +58,11 @@ class Trial:
         return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
 
 
-def trial_problem(variant: Variant, attach: Callable[[mi.Mesh, Trial], None]) -> str | None:
-    """Difference between Mitsuba's virtual functions and the expected ones; None if there is none.
-
-    Parameters
-    ----------
-    attach : callable
-        Hooks a shape's functions.
-    """
+def trial_problem(
+    variant: Variant,
+    attach: Callable[[mi.Mesh, Trial], None],  # Hooks a shape's functions
+) -> str | None:
+    """Difference between Mitsuba's virtual functions and the expected ones; None if there is none."""
     trial, shape = Trial(variant), _triangle(variant)
     attach(shape, trial)
     ray = variant.Ray3f(variant.Point3f(*_ORIGIN), variant.Vector3f(*_DIRECTION))

@@ -370,14 +370,10 @@ def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
         return _hooks[variant]
 
 
-def exact_shading_problem(variant: Variant) -> str | None:
-    """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading.
-
-    Parameters
-    ----------
-    variant : module
-        Such as ``mitsuba.llvm_ad_rgb``.
-    """
+def exact_shading_problem(
+    variant: Variant,  # Such as `mitsuba.llvm_ad_rgb`
+) -> str | None:
+    """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading."""
     if not dr.is_jit_v(variant.Float):
         return "exact shading needs a variant of llvm or cuda"
     problem = hook_problem() or _trial_problem(variant)
@@ -419,17 +415,13 @@ def clear_frames(error: BaseException) -> None:
         traceback.clear_frames(each.__traceback__)
 
 
-def raise_itself(error: BaseException, frame: FrameType | None) -> None:
+def raise_itself(
+    error: BaseException,  # About to be raised through C++
+    frame: FrameType | None,  # Frame that called C++; None in threads that Python did not start
+) -> None:
     """Raise an error itself in the user's code that called Mitsuba, instead of one that was raised from it.
 
     This uses the trace function: under a debugger, which needs it too, the other error is raised.
-
-    Parameters
-    ----------
-    error : exception
-        About to be raised through C++.
-    frame : frame, or None
-        Frame that called C++; None in threads that Python did not start.
     """
     caller = _caller(frame)
     if caller is None or sys.gettrace() is not None:

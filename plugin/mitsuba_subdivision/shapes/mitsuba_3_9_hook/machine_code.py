@@ -138,17 +138,13 @@ def tag_of(address: int) -> int:
     return address >> _LOWEST_BIT << 16 & 0xFFFF0000
 
 
-def replace_function(entry: int, address: int) -> None:
+def replace_function(
+    entry: int,  # Address of the entry in the table
+    address: int,  # Of the function
+) -> None:
     """Replace an entry of a write-protected virtual function table.
 
     Raises OSError if the system does not allow it to be written.
-
-    Parameters
-    ----------
-    entry : int
-        Address of the entry in the table.
-    address : int
-        Of the function.
     """
     page = entry - entry % mmap.PAGESIZE
     _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
