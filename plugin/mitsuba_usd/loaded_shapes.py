@@ -32,14 +32,12 @@ class LoadedShapes:
 
     A limit surface that only moves reuses the object of the frame before, with new control points: its patches and
     weights stay. A polygon mesh that moves is rebuilt.
-
-    Parameters
-    ----------
-    parameters : dict
-        Of every shape ``subdivision``.
     """
 
-    def __init__(self, parameters: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        parameters: dict[str, Any],  # Of every shape `subdivision`
+    ) -> None:
         self._parameters = parameters
         self._before: dict[tuple[str, int], Loaded] = {}
         self._now: dict[tuple[str, int], Loaded] = {}

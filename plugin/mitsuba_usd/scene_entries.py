@@ -29,35 +29,20 @@ class SceneEntries:
     """Scene entries of a stage, without those of a studio.
 
     Limit surfaces are entries of the shape ``subdivision``, polygon meshes those of `PolygonMesh`.
-
-    Parameters
-    ----------
-    parameters : dict
-        Of every shape ``subdivision``; see `with_rate`.
-    surfaces : Surfaces
-        Provides the limit surfaces.
-    triangles : dict of dict by shape, optional
-        Parameters of the tessellations of some limit surfaces, instead of the rate of all.
-    needed : dict of float by file, optional
-        Pixels along the sides of textures; see `texels_for_pictures`.
-    texture_size : int, optional
-        Pixels along the sides of textures of materials at most.
-    loaded : LoadedShapes, optional
-        If given, its objects are used as shapes.
-    has_clear_lamps : bool
-        Whether shapes of lights let light through, which takes the integrator ``volpath``.
     """
 
     def __init__(
         self,
         contents: SceneContents,
         notes: StageWarnings,
-        parameters: dict[str, Any],
-        surfaces: Surfaces,
+        parameters: dict[str, Any],  # Of every shape `subdivision`; see `with_rate`
+        surfaces: Surfaces,  # Provides the limit surfaces
+        # Parameters of the tessellations of some limit surfaces, instead of the rate of all
         triangles: Mapping[ShapeContents, dict[str, Any]] | None = None,
-        needed: Mapping[str, float] | None = None,
-        texture_size: int | None = None,
-        loaded: LoadedShapes | None = None,
+        needed: Mapping[str, float] | None = None,  # Pixels along the sides of textures; see `texels_for_pictures`
+        texture_size: int | None = None,  # Pixels along the sides of textures of materials at most
+        loaded: LoadedShapes | None = None,  # If given, its objects are used as shapes
+        # Whether shapes of lights let light through, which takes the integrator `volpath`
         has_clear_lamps: bool = False,
     ) -> None:
         self._contents = contents

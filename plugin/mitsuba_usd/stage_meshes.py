@@ -29,18 +29,15 @@ _NO_FACES: IntArray = np.zeros(0, np.int64)
 
 
 class ShapeReader:
-    """Reads meshes, and the shapes that USD has without meshes.
-
-    Parameters
-    ----------
-    name : str
-        Beginning of messages.
-    code : Usd.TimeCode
-        The same time, for all but the cage.
-    """
+    """Reads meshes, and the shapes that USD has without meshes."""
 
     def __init__(
-        self, name: str, time: float | None, code: Usd.TimeCode, materials: MaterialReader, notes: StageWarnings
+        self,
+        name: str,  # Beginning of messages
+        time: float | None,
+        code: Usd.TimeCode,  # The same time, for all but the cage
+        materials: MaterialReader,
+        notes: StageWarnings,
     ) -> None:
         self._name = name
         self._time = time

@@ -59,33 +59,19 @@ class StageScenes:
     Everything may move: shapes, their control points, instances, lights and the stage's camera. Limit surfaces whose
     topology stays keep their patches and weights. Where only the camera moves, the scene stays loaded. The studio's
     lights are there if no frame has lights.
-
-    Parameters
-    ----------
-    path : str or Path
-        A USD file; for frames also the name of several, with a number in it.
-    look : Look
-        Its view, size and samples.
-    parameters : dict
-        Of every shape ``subdivision``.
-    camera : str, optional
-        Path of the stage's camera.
-    numbers : range, optional
-        Times or numbers of files, if there are frames.
-    shutter : int, optional
-        Number of the sub-frames of each frame, which share its samples. Their times are the middles of equal parts of
-        the interval in which the shutter of the first frame's camera is open.
     """
 
     def __init__(
         self,
-        path: str | Path,
-        look: Look,
-        parameters: dict[str, Any],
+        path: str | Path,  # A USD file; for frames also the name of several, with a number in it
+        look: Look,  # Its view, size and samples
+        parameters: dict[str, Any],  # Of every shape `subdivision`
         *,
         time: float | None = None,
-        camera: str | None = None,
-        numbers: range | None = None,
+        camera: str | None = None,  # Path of the stage's camera
+        numbers: range | None = None,  # Times or numbers of files, if there are frames
+        # Number of the sub-frames of each frame, which share its samples. Their times are the middles of
+        # equal parts of the interval in which the shutter of the first frame's camera is open.
         shutter: int | None = None,
     ) -> None:
         self.name = f'"{path}"'

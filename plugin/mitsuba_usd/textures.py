@@ -24,18 +24,14 @@ _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 
 
 class Textures:
-    """Builds textures from images, each of which is read once.
-
-    Parameters
-    ----------
-    needed : dict of float by file, optional
-        Pixels along the sides of textures of materials that pictures show; see `texels_for_pictures`.
-    most : int, optional
-        Pixels along their sides at most.
-    """
+    """Builds textures from images, each of which is read once."""
 
     def __init__(
-        self, notes: StageWarnings, needed: Mapping[str, float] | None = None, most: int | None = None
+        self,
+        notes: StageWarnings,
+        # Pixels along the sides of textures of materials that pictures show; see `texels_for_pictures`
+        needed: Mapping[str, float] | None = None,
+        most: int | None = None,  # Pixels along their sides at most
     ) -> None:
         self._notes, self._needed, self._most = notes, needed or {}, most
         # By file and the colour space in which it is halved; whole ones have none.

@@ -31,19 +31,18 @@ DIVISIONS_OF_NORMALS = 4
 
 
 class DividedTile:
-    """A tile that holds several pieces.
+    """A tile that holds several pieces."""
 
-    Parameters
-    ----------
-    source : DividedElement or IrregularPatch
-        The element that it covers; or the patch around an extraordinary point, from any level on, whose control points
-        here are its eigen-coordinates.
-    turn : int
-        How a patch around an extraordinary point is turned in the tile: `ParameterDomain.rotation` of this. Elements
-        are not turned.
-    """
-
-    def __init__(self, scheme: Scheme, source: DividedElement | IrregularPatch, turn: int) -> None:
+    def __init__(
+        self,
+        scheme: Scheme,
+        # The element that it covers; or the patch around an extraordinary point, from any level on, whose
+        # control points here are its eigen-coordinates
+        source: DividedElement | IrregularPatch,
+        # How a patch around an extraordinary point is turned in the tile: `ParameterDomain.rotation` of this.
+        # Elements are not turned.
+        turn: int,
+    ) -> None:
         self._scheme, self._source, self._turn = scheme, source, turn
 
     @property

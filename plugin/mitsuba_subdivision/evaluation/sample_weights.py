@@ -70,16 +70,6 @@ class LocatedSamples:
     Raises SchemeError if refinement does not separate the irregularities of a one-ring, or something always stays
     semi-sharp.
 
-    Parameters
-    ----------
-    elements : sequence of DividedElement
-        All different.
-    element : (s,) int64
-        Index of each sample's element, in increasing order.
-    uv : (s, 2) float64
-        Parameters, with (0, 0) at the sample's corner. They stay exact near it.
-    corner : (s,) int64
-
     Attributes
     ----------
     leaf_sample : (s,) int64
@@ -91,10 +81,10 @@ class LocatedSamples:
     def __init__(
         self,
         scheme: Scheme,
-        elements: Sequence[DividedElement],
-        element: IntArray,
-        uv: FloatArray,
-        corner: IntArray,
+        elements: Sequence[DividedElement],  # All different
+        element: IntArray,  # (s,) int64: index of each sample's element, in increasing order
+        uv: FloatArray,  # (s, 2) float64: parameters, with (0, 0) at the sample's corner. They stay exact near it.
+        corner: IntArray,  # (s,) int64
     ) -> None:
         self.scheme, self._given = scheme, (elements, element, uv, corner)
         self.leaves: list[Leaves] = []

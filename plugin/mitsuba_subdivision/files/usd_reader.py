@@ -89,28 +89,18 @@ def read_usd(
 
 
 class MeshReader:
-    """Reads the attributes of one mesh.
-
-    Parameters
-    ----------
-    location : str
-        Beginning of messages.
-    time, rules
-        As for `read_usd`.
-    skinning : Skinning
-        Of the stage, at the time.
-    report : function, optional
-        Gets messages about attributes that do not fit the mesh, which are then left out, and their paths. By default,
-        these are errors.
-    """
+    """Reads the attributes of one mesh."""
 
     def __init__(
         self,
         mesh: UsdGeom.Mesh,
-        location: str,
+        location: str,  # Beginning of messages
+        # As for `read_usd`
         time: float | None,
-        skinning: Skinning,
+        skinning: Skinning,  # Of the stage, at the time
         rules: Mapping[str, str] | None = None,
+        # Gets messages about attributes that do not fit the mesh, which are then left out, and their paths.
+        # By default, these are errors.
         report: Callable[[str, object], None] | None = None,
     ) -> None:
         from pxr import Usd

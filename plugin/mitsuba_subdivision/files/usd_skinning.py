@@ -15,17 +15,13 @@ if TYPE_CHECKING:
 
 
 class Skinning:
-    """Evaluates UsdSkel at one time, for the meshes of a stage.
+    """Evaluates UsdSkel at one time, for the meshes of a stage."""
 
-    Parameters
-    ----------
-    time : float or None
-        Time code; by default, the first one of each value.
-    report : function
-        Gets what is ignored, and the path of the mesh.
-    """
-
-    def __init__(self, time: float | None, report: Callable[[str, object], None]) -> None:
+    def __init__(
+        self,
+        time: float | None,  # Time code; by default, the first one of each value
+        report: Callable[[str, object], None],  # Gets what is ignored, and the path of the mesh
+    ) -> None:
         from pxr import Usd, UsdGeom, UsdSkel
 
         self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))

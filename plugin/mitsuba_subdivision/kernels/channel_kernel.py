@@ -30,20 +30,17 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 class SubdividedChannelKernel:
     """Values subdivided like points.
 
-    Parameters
-    ----------
-    channel : SubdividedChannel
-        Of 1, 2 or 3 numbers.
-    float_type : type
-        Flat Dr.Jit array, or ``float``.
-
     Attributes
     ----------
     values : ControlValues
         Coefficients of pieces, padded to 3-vectors with zeros.
     """
 
-    def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
+    def __init__(
+        self,
+        channel: SubdividedChannel,  # Of 1, 2 or 3 numbers
+        float_type: type,  # Flat Dr.Jit array, or `float`
+    ) -> None:
         table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
         self._kernel, types = PieceKernel.shared(table, float_type), ArrayTypes.of(float_type)
         self._map = coefficients = CoefficientMap.shared(table, float_type)
@@ -80,19 +77,14 @@ class BilinearPiece:
 
 
 class LinearChannelKernel:
-    """Linearly interpolated values.
+    """Linearly interpolated values."""
 
-    Parameters
-    ----------
-    channel : LinearChannel
-        Of 1, 2 or 3 numbers.
-    walk : ElementWalk
-        Over the surface's elements.
-    float_type : type
-        Flat Dr.Jit array, or ``float``.
-    """
-
-    def __init__(self, channel: LinearChannel, walk: ElementWalk, float_type: type) -> None:
+    def __init__(
+        self,
+        channel: LinearChannel,  # Of 1, 2 or 3 numbers
+        walk: ElementWalk,  # Over the surface's elements
+        float_type: type,  # Flat Dr.Jit array, or `float`
+    ) -> None:
         self._types, self._walk = ArrayTypes.of(float_type), walk
         patches = channel.patches
         t, half_edges = patches.topology, patches.half_edge_of_corner

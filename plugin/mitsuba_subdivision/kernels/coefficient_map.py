@@ -22,18 +22,16 @@ if TYPE_CHECKING:
 
 
 class CoefficientMap:
-    """The map of a piece table from control values to coefficients; differentiable, forward and backward.
-
-    Parameters
-    ----------
-    float_type : type
-        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
-    """
+    """The map of a piece table from control values to coefficients; differentiable, forward and backward."""
 
     # See `WeightedValues`.
     UPLOADED_LATER = ("_steps",)
 
-    def __init__(self, table: PieceTable, float_type: type) -> None:
+    def __init__(
+        self,
+        table: PieceTable,
+        float_type: type,  # Flat Dr.Jit array, such as `drjit.llvm.ad.Float`, or `float`
+    ) -> None:
         self._table, self._types = table, ArrayTypes.of(float_type)
 
     @classmethod
@@ -144,11 +142,6 @@ class _Steps:
 class _Blocks:
     """Collects blocks: rows of weights shared by all patches of a class.
 
-    Parameters
-    ----------
-    width : int
-        Number of vectors that a row computes.
-
     Attributes
     ----------
     added : list of tuple of ints
@@ -156,7 +149,10 @@ class _Blocks:
         controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(
+        self,
+        width: int,  # Number of vectors that a row computes
+    ) -> None:
         self.width = width
         self.added: list[tuple[int, ...]] = []
         self._weights: dict[int, tuple[np.ndarray, int]] = {}

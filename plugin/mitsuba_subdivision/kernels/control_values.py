@@ -21,20 +21,16 @@ _MADE: Shared[LaterArray] = Shared()
 
 
 class WeightedValues:
-    """Weights times values; differentiable, forward and backward.
-
-    Parameters
-    ----------
-    weights : (n, m) sparse array
-        Rows sum to one.
-    float_type : type
-        Flat Dr.Jit array of the values, whose precision weights get; ``float`` for values in NumPy.
-    """
+    """Weights times values; differentiable, forward and backward."""
 
     # Properties that upload arrays when they are first used; see `shapes.device_state`.
     UPLOADED_LATER = ("product", "transposed")
 
-    def __init__(self, weights: sparse.csr_array, float_type: type) -> None:
+    def __init__(
+        self,
+        weights: sparse.csr_array,  # (n, m) sparse array: rows sum to one
+        float_type: type,  # Flat Dr.Jit array of the values, whose precision weights get; `float` for values in NumPy
+    ) -> None:
         self._weights, self._float = weights, float_type
 
     @classmethod
@@ -78,16 +74,6 @@ class _Product(dr.CustomOp):
 class ControlValues:
     """Values that kernels gather by index, and that may change.
 
-    Parameters
-    ----------
-    values : (n, k) float64
-        Of a cage.
-    make : callable, optional
-        Computes the gathered values, flat, from the cage's, which are flat on a device, else ``(n, k)`` float64. The
-        default is the identity.
-    key : hashable, optional
-        Of what ``make`` does: with it, equal values share what is made of them until they are set.
-
     Attributes
     ----------
     size : int
@@ -98,9 +84,12 @@ class ControlValues:
 
     def __init__(
         self,
-        values: NDArray[np.floating],
+        values: NDArray[np.floating],  # (n, k) float64: of a cage
         types: ArrayTypes,
+        # Computes the gathered values, flat, from the cage's, which are flat on a device, else `(n, k)`
+        # float64. The default is the identity.
         make: Callable[[FloatBuffer], FloatBuffer] | None = None,
+        # Of what `make` does: with it, equal values share what is made of them until they are set
         key: Hashable = None,
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
@@ -137,18 +126,17 @@ _WEIGHTED: Shared[WeightedValues] = Shared()
 
 
 class SparseMatrix:
-    """A sparse matrix on the device; not differentiable by itself.
+    """A sparse matrix on the device; not differentiable by itself."""
 
-    Parameters
-    ----------
-    matrix : (n, m) sparse array
-    float_type : type
-        Flat Dr.Jit array of the vectors, such as ``drjit.llvm.ad.Float``. Entries get its precision.
-    is_relative : bool
-        Whether rows sum to one. Then sums are taken relative to the first vector of each row, and lose fewer digits.
-    """
-
-    def __init__(self, matrix: sparse.csr_array, float_type: type, *, is_relative: bool) -> None:
+    def __init__(
+        self,
+        matrix: sparse.csr_array,  # (n, m) sparse array
+        float_type: type,  # Flat Dr.Jit array of the vectors, such as `drjit.llvm.ad.Float`. Entries get its precision.
+        *,
+        # Whether rows sum to one. Then sums are taken relative to the first vector of each row, and lose
+        # fewer digits.
+        is_relative: bool,
+    ) -> None:
         self._types = types = ArrayTypes.of(float_type)
         self._row_count = matrix.shape[0]
         self._is_relative = is_relative

@@ -10,15 +10,12 @@ from .types import Float, Value
 
 
 class Monomials:
-    """The monomials of some polynomials.
+    """The monomials of some polynomials."""
 
-    Parameters
-    ----------
-    powers : (m, 2) sequence of int
-        Of s and of t.
-    """
-
-    def __init__(self, powers: Sequence[Sequence[int]]) -> None:
+    def __init__(
+        self,
+        powers: Sequence[Sequence[int]],  # (m, 2) sequence of int: of s and of t
+    ) -> None:
         highest = max(b for _, b in powers)
         # Of each power of t, the monomials by their powers of s.
         self._columns: list[list[int | None]] = []

@@ -400,15 +400,14 @@ def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
 
 
 class AreaSampler:
-    """Draws random locations on a surface.
+    """Draws random locations on a surface."""
 
-    Parameters
-    ----------
-    walk : ElementWalk
-        Over the surface's elements.
-    """
-
-    def __init__(self, cells: SamplingCells, types: ArrayTypes, walk: ElementWalk) -> None:
+    def __init__(
+        self,
+        cells: SamplingCells,
+        types: ArrayTypes,
+        walk: ElementWalk,  # Over the surface's elements
+    ) -> None:
         self._types, self._walk = types, walk
         self._count = len(cells.areas)
         if not cells.areas.sum() > 0:

@@ -114,17 +114,14 @@ def _inside(
 
 
 class SomeTriangles:
-    """Parameters on some triangles of a tessellation.
+    """Parameters on some triangles of a tessellation."""
 
-    Parameters
-    ----------
-    locations : TriangleLocations
-        Of all.
-    kept : (n,) int64
-        Their numbers.
-    """
-
-    def __init__(self, locations: TriangleLocations, kept: IntArray, types: ArrayTypes) -> None:
+    def __init__(
+        self,
+        locations: TriangleLocations,  # Of all
+        kept: IntArray,  # (n,) int64: their numbers
+        types: ArrayTypes,
+    ) -> None:
         self._locations, self._kept, self._types = locations, types.indices(kept), types
 
     def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:

@@ -27,18 +27,17 @@ class RoundingBound:
 
 
 class UnitNormal:
-    """The normal along the cross product of two tangents: of unit length, or zero where these are parallel.
+    """The normal along the cross product of two tangents: of unit length, or zero where these are parallel."""
 
-    Parameters
-    ----------
-    du, dv : 3-vectors
-        Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`.
-    bound : RoundingBound, optional
-        Of the tangents. Where rounding alone could have made the plane that the tangents span,
-        the normal is zero, too, as in `evaluation.normals.unit_normals`.
-    """
-
-    def __init__(self, du: Vector3, dv: Vector3, bound: RoundingBound | None = None) -> None:
+    def __init__(
+        self,
+        # Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`
+        du: Vector3,
+        dv: Vector3,
+        # Of the tangents. Where rounding alone could have made the plane that the tangents span, the normal
+        # is zero, too, as in `evaluation.normals.unit_normals`.
+        bound: RoundingBound | None = None,
+    ) -> None:
         # The tangents' lengths matter neither to the normal nor, but for these factors, to its derivative.
         self._scale_u, self._scale_v = _scale(du), _scale(dv)
         self._du, self._dv = du * self._scale_u, dv * self._scale_v

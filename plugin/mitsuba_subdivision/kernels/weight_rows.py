@@ -13,30 +13,19 @@ from .types import FloatBuffer, Index, IndexBuffer, Vector3
 
 
 class WeightRows:
-    """Blocks of weights on a device, and a lane for each patch of each block.
-
-    Parameters
-    ----------
-    width : int
-        Number of vectors that a row of weights computes.
-    columns : (b, 4) int
-        Of each block the index of its first control in ``controls``, how far those of a patch are apart, and how many
-        they are; its first row of weights.
-    weights : (w, ..) float
-        A row for each control point of a block, with a number for each vector that it makes.
-    controls : index array
-        Indices of control points.
-    block, patch : (n,) int
-        Of each lane. Lanes of a block are consecutive, so that they read the same weights.
-    """
+    """Blocks of weights on a device, and a lane for each patch of each block."""
 
     def __init__(
         self,
         types: ArrayTypes,
-        width: int,
+        width: int,  # Number of vectors that a row of weights computes
+        # (b, 4) int: of each block the index of its first control in `controls`, how far those of a patch are
+        # apart, and how many they are; its first row of weights
         columns: np.ndarray,
+        # (w, ..) float: A row for each control point of a block, with a number for each vector that it makes
         weights: np.ndarray,
-        controls: IndexBuffer,
+        controls: IndexBuffer,  # Indices of control points
+        # (n,) int: of each lane. Lanes of a block are consecutive, so that they read the same weights.
         block: np.ndarray,
         patch: np.ndarray,
     ) -> None:

@@ -16,17 +16,14 @@ Value = TypeVar("Value")
 
 
 class Content:
-    """An array as part of a key: equal to others with the same numbers, of the same type, in the same shape.
-
-    Parameters
-    ----------
-    array : array or None
-        Not to be changed afterwards.
-    """
+    """An array as part of a key: equal to others with the same numbers, of the same type, in the same shape."""
 
     __slots__ = ("_array", "_hash")
 
-    def __init__(self, array: NDArray | None) -> None:
+    def __init__(
+        self,
+        array: NDArray | None,  # Not to be changed afterwards
+    ) -> None:
         self._array = array
         self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array).data)))
 

@@ -156,21 +156,13 @@ class ClosestPointSearch:
 
 
 class _Best:
-    """The nearest locations so far of some points.
-
-    Parameters
-    ----------
-    points : (s, 3) float64
-    size : float
-        Of the coordinates.
-    squared_distance, half_edge, uv
-        Of known locations, see `ClosestPointSearch.nearest`.
-    """
+    """The nearest locations so far of some points."""
 
     def __init__(
         self,
-        points: FloatArray,
-        size: float,
+        points: FloatArray,  # (s, 3) float64
+        size: float,  # Of the coordinates
+        # Of known locations, see `ClosestPointSearch.nearest`
         squared_distance: FloatArray,
         half_edge: NDArray[np.int64],
         uv: FloatArray,

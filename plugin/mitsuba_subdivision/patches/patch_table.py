@@ -44,21 +44,17 @@ class PatchClass:
 
 
 class PatchTable:
-    """All patches of a cage. An element that fits the scheme's domain is one patch, another has one at every corner.
-
-    Parameters
-    ----------
-    topology : Topology
-        The mesh: the cage, cut along its creases.
-    is_hole : (n_f,) bool, optional
-        Faces that are no elements.
-    may_turn : bool
-        Whether a patch may begin at any corner of its element, so that elements whose one-rings are turned copies of
-        each other share a class. If not, each begins at its element's first corner.
-    """
+    """All patches of a cage. An element that fits the scheme's domain is one patch, another has one at every corner."""
 
     def __init__(
-        self, topology: Topology, scheme: Scheme, is_hole: NDArray[np.bool_] | None = None, *, may_turn: bool = True
+        self,
+        topology: Topology,  # The mesh: the cage, cut along its creases
+        scheme: Scheme,
+        is_hole: NDArray[np.bool_] | None = None,  # (n_f,) bool: faces that are no elements
+        *,
+        # Whether a patch may begin at any corner of its element, so that elements whose one-rings are turned
+        # copies of each other share a class. If not, each begins at its element's first corner.
+        may_turn: bool = True,
     ) -> None:
         self.topology, self.scheme = topology, scheme
         self.is_hole, self.may_turn = is_hole, may_turn

@@ -47,18 +47,16 @@ def is_recording() -> bool:
 class DeviceState:
     """Exposes the arrays of a shape, and of the objects that it holds, to Dr.Jit; a shape keeps one.
 
-    Parameters
-    ----------
-    shape : mi.Shape
-        Not kept alive.
-
     Attributes
     ----------
     is_frozen : bool
         Whether a frozen function has seen the arrays. Dr.Jit goes on reading its tables, which are in NumPy's memory.
     """
 
-    def __init__(self, shape: Any) -> None:
+    def __init__(
+        self,
+        shape: Any,  # Not kept alive
+    ) -> None:
         self._shape, self.is_frozen = weakref.ref(shape), False
 
     # A scene that the garbage collector frees while a frozen function is called ends the process.

@@ -85,25 +85,16 @@ class DeviceDisplacement:
     """Displaces vertices on the device.
 
     Differentiable with respect to control points, the scale, and the texture or control values of the heights.
-
-    Parameters
-    ----------
-    slopes : (n,) bool
-        See `VertexLocations.follow_slopes`.
-    surface : SurfaceKernel
-        With the displacement, and the same control points.
-    has_normals : bool
-        Whether normals are needed.
     """
 
     def __init__(
         self,
         locations: VertexLocations,
-        slopes: NDArray[np.bool_],
-        surface: SurfaceKernel,
+        slopes: NDArray[np.bool_],  # (n,) bool: see `VertexLocations.follow_slopes`
+        surface: SurfaceKernel,  # With the displacement, and the same control points
         float_type: type,
         *,
-        has_normals: bool,
+        has_normals: bool,  # Whether normals are needed
     ) -> None:
         self._surface, self._has_normals = surface, has_normals
         self.is_differentiable = bool(dr.is_diff_v(float_type))
@@ -167,26 +158,18 @@ class DeviceDisplacement:
 
 
 class HostDisplacement:
-    """Displaces vertices in NumPy arrays.
-
-    Parameters
-    ----------
-    slopes : (n,) bool
-        See `VertexLocations.follow_slopes`.
-    has_normals : bool
-        Whether normals are needed.
-    """
+    """Displaces vertices in NumPy arrays."""
 
     is_differentiable = False
 
     def __init__(
         self,
         locations: VertexLocations,
-        slopes: NDArray[np.bool_],
+        slopes: NDArray[np.bool_],  # (n,) bool: see `VertexLocations.follow_slopes`
         surface: LimitSurface,
         displacement: ShapeDisplacement,
         *,
-        has_normals: bool,
+        has_normals: bool,  # Whether normals are needed
     ) -> None:
         self._locations, self._slopes = locations, slopes
         self._surface, self._displacement, self._has_normals = surface, displacement, has_normals

@@ -47,15 +47,6 @@ class ShapeDisplacement:
 
     Raises ValueError if the cage lacks the channel that heights depend on, or heights are not scalar.
 
-    Parameters
-    ----------
-    positions : (n, 3) float64
-        Its control points, relative to the centre of `RecentredPoints`.
-    given : str or mi.Texture
-        The parameter ``displacement``.
-    exact : ExactShading, optional
-        Exact shading, whose surface is displaced as well.
-
     Attributes
     ----------
     attribute : str
@@ -74,10 +65,10 @@ class ShapeDisplacement:
         self,
         variant: Variant,
         surface: LimitSurface,
-        positions: FloatArray,
-        given: Any,
+        positions: FloatArray,  # (n, 3) float64: its control points, relative to the centre of `RecentredPoints`
+        given: Any,  # The parameter `displacement`
         scale: float,
-        exact: ExactShading | None = None,
+        exact: ExactShading | None = None,  # Exact shading, whose surface is displaced as well
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
         self.heights: SurfaceHeights

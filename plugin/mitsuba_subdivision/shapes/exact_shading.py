@@ -73,13 +73,6 @@ class ExactShading:
     interaction its normal, parameters, their derivatives, and texture coordinates. Lines are intersected in object
     space, so that shapes with equal control points share the surface's coefficients.
 
-    Parameters
-    ----------
-    positions : (n, 3) float64
-        Its control points, relative to the centre of `RecentredPoints`.
-    use_stam : bool
-        Whether to evaluate by Stam's form.
-
     Attributes
     ----------
     kernel : SurfaceKernel
@@ -91,7 +84,13 @@ class ExactShading:
     """
 
     def __init__(
-        self, variant: Variant, surface: LimitSurface, positions: NDArray[np.float64], *, use_stam: bool
+        self,
+        variant: Variant,
+        surface: LimitSurface,
+        # (n, 3) float64: its control points, relative to the centre of `RecentredPoints`
+        positions: NDArray[np.float64],
+        *,
+        use_stam: bool,  # Whether to evaluate by Stam's form
     ) -> None:
         self._variant = variant
         self._name = surface.cage.source.name

@@ -53,15 +53,12 @@ class SurfaceHeights(Heights, Protocol):
 
 
 class AttributeHeights:
-    """Heights equal to a channel's values.
+    """Heights equal to a channel's values."""
 
-    Parameters
-    ----------
-    channel : Channel
-        Of one component.
-    """
-
-    def __init__(self, channel: Channel) -> None:
+    def __init__(
+        self,
+        channel: Channel,  # Of one component
+    ) -> None:
         self._values = channel.values
 
     def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:  # noqa: ARG002

@@ -36,18 +36,13 @@ class MovingVertices:
     another view, needs all this `attached` to the parameters once more. If the parameters were computed from other
     variables, Dr.Jit has forgotten that computation as well, and gradients end at the parameters: `warn_of_lost` says
     so.
-
-    Parameters
-    ----------
-    name : str
-        What warnings call the shape.
     """
 
     def __init__(
         self,
         vertices: Vertices,
         points: RecentredPoints,
-        name: str,
+        name: str,  # What warnings call the shape
         shading: ExactShading | None,
         displacement: ShapeDisplacement | None,
     ) -> None:

@@ -20,15 +20,14 @@ STEPS = 3
 
 
 class Parameterization:
-    """Finds points of a shape with exact shading by their texture coordinates, as Mitsuba does on triangles.
+    """Finds points of a shape with exact shading by their texture coordinates, as Mitsuba does on triangles."""
 
-    Parameters
-    ----------
-    exact : ExactShading
-        Of the shape, with its current texture coordinates.
-    """
-
-    def __init__(self, variant: Variant, shape: mi.Mesh, exact: ExactShading) -> None:
+    def __init__(
+        self,
+        variant: Variant,
+        shape: mi.Mesh,
+        exact: ExactShading,  # Of the shape, with its current texture coordinates
+    ) -> None:
         self._variant = variant
         uv = exact.texcoords_of_corners(shape.face_count())
         mesh = variant.Mesh("texture coordinates", vertex_count=len(uv), face_count=len(uv) // 3)

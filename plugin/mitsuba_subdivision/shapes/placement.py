@@ -47,15 +47,6 @@ class RecentredPoints:
     In single precision such points lose digits, as normals would show. A coordinate that still has the value with which
     it was loaded is replaced by its double-precision value relative to the centre.
 
-    Parameters
-    ----------
-    positions : (n, 3) float64
-        As they are loaded.
-    float_type : type
-        Flat Dr.Jit array of the parameter ``control_points``.
-    recentres : bool
-        Whether points may be recentred at all: published forms show what they make of the points as they are.
-
     Attributes
     ----------
     centre : (3,) float64, or None
@@ -64,7 +55,15 @@ class RecentredPoints:
         As they were loaded, relative to the centre.
     """
 
-    def __init__(self, positions: NDArray[np.float64], float_type: type, *, recentres: bool) -> None:
+    def __init__(
+        self,
+        positions: NDArray[np.float64],  # (n, 3) float64: as they are loaded
+        float_type: type,  # Flat Dr.Jit array of the parameter `control_points`
+        *,
+        # Whether points may be recentred at all: published forms show what they make of the points as they
+        # are
+        recentres: bool,
+    ) -> None:
         self.centre: NDArray[np.float64] | None = None
         self.positions = positions
         # Reductions along columns of three are slow.

@@ -35,20 +35,17 @@ def holds_spectra(variant: Variant, mesh_name: str, size: int) -> bool:
 
 
 class SpectralUpsampling:
-    """Coefficients of the spectra of colours, differentiable in JIT variants.
-
-    Parameters
-    ----------
-    variant : module
-        A spectral one.
-    """
+    """Coefficients of the spectra of colours, differentiable in JIT variants."""
 
     @classmethod
     def shared(cls, variant: Variant) -> SpectralUpsampling:
         """The same object for all shapes of a variant, while it is referenced."""
         return _UPSAMPLING.get(variant, lambda: cls(variant))
 
-    def __init__(self, variant: Variant) -> None:
+    def __init__(
+        self,
+        variant: Variant,  # A spectral one
+    ) -> None:
         self._variant = variant
         if not dr.is_jit_v(variant.Float):
             return

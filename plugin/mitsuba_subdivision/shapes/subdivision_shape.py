@@ -47,16 +47,14 @@ def make_subdivision(
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
     class MeshBuffers(variant.TraversalCallback):
-        """Reads or assigns the buffers that a mesh's `traverse` exposes; Mitsuba gives Python no other access.
-
-        Parameters
-        ----------
-        values : dict of str to arrays, optional
-            Values to assign; if omitted, buffers are read into it.
-        """
+        """Reads or assigns the buffers that a mesh's `traverse` exposes; Mitsuba gives Python no other access."""
 
         def __init__(
-            self, mesh: mi.Mesh, names: Collection[str], values: dict[str, FloatBuffer | IndexBuffer] | None = None
+            self,
+            mesh: mi.Mesh,
+            names: Collection[str],
+            # Values to assign; if omitted, buffers are read into it
+            values: dict[str, FloatBuffer | IndexBuffer] | None = None,
         ) -> None:
             super().__init__()
             self.mesh, self.names, self.assigns = mesh, names, values is not None

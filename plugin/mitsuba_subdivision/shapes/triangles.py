@@ -20,18 +20,14 @@ if TYPE_CHECKING:
 
 
 class Triangles:
-    """Triangles of a tessellation; arrays of Dr.Jit, or of NumPy in scalar variants.
-
-    Parameters
-    ----------
-    attributes : AttributeTable
-        Its vertices, with copies along seams or without.
-    kept : (n,) int64, optional
-        The triangles that the mesh has; by default all.
-    """
+    """Triangles of a tessellation; arrays of Dr.Jit, or of NumPy in scalar variants."""
 
     def __init__(
-        self, variant: Variant, table: VertexTable, attributes: AttributeTable, kept: IntArray | None = None
+        self,
+        variant: Variant,
+        table: VertexTable,
+        attributes: AttributeTable,  # Its vertices, with copies along seams or without
+        kept: IntArray | None = None,  # (n,) int64: the triangles that the mesh has; by default all
     ) -> None:
         self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
         self._kept = slice(None) if kept is None else kept

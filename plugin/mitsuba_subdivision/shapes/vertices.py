@@ -44,30 +44,20 @@ class Vertices:
     """Evaluates the vertices of a tessellation, copies them along the seams of attributes, and displaces them.
 
     Arrays are those of Dr.Jit, or of NumPy in scalar variants.
-
-    Parameters
-    ----------
-    are_differentiable : bool
-        Whether vertices have derivatives.
-    copied : (n,) int, optional
-        The vertex that ``evaluate`` returns for each vertex of the shape, where seams have several copies of one.
-    displacement : DeviceDisplacement or HostDisplacement, optional
-        Of the copied vertices.
-    kept : (m,) int, optional
-        Displaced vertices that the shape has. Exact shading needs one copy of each.
-    float_type : type, optional
-        Flat Dr.Jit array of JIT variants.
     """
 
     def __init__(
         self,
         evaluate: Evaluate,
-        are_differentiable: bool,
+        are_differentiable: bool,  # Whether vertices have derivatives
         *,
+        # (n,) int: the vertex that `evaluate` returns for each vertex of the shape, where seams have several
+        # copies of one
         copied: IntArray | None = None,
-        displacement: DeviceDisplacement | HostDisplacement | None = None,
+        displacement: DeviceDisplacement | HostDisplacement | None = None,  # Of the copied vertices
+        # (m,) int: displaced vertices that the shape has. Exact shading needs one copy of each.
         kept: IntArray | None = None,
-        float_type: type | None = None,
+        float_type: type | None = None,  # Flat Dr.Jit array of JIT variants
     ) -> None:
         self._evaluate, self._displacement, self.are_differentiable = evaluate, displacement, are_differentiable
         self._copies, self._kept = _Selection(copied, float_type), _Selection(kept, float_type)

@@ -82,17 +82,16 @@ class SceneSource(Protocol[C]):
 
 
 class StillPicture:
-    """One picture.
-
-    Parameters
-    ----------
-    follows_sensor : bool
-        Whether the scene is rendered by its own sensor only.
-    """
+    """One picture."""
 
     numbers = (1,)
 
-    def __init__(self, source: SceneSource[C], *, follows_sensor: bool = True) -> None:
+    def __init__(
+        self,
+        source: SceneSource[C],
+        *,
+        follows_sensor: bool = True,  # Whether the scene is rendered by its own sensor only
+    ) -> None:
         self.scene = source.scene(source.at(), follows_sensor=follows_sensor)
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
@@ -107,16 +106,15 @@ class Turntable:
     In Mitsuba the model stands still: the camera turns around it the other way, with the lights and the backdrop of the
     studio. The studio's camera sees all of it in all frames. Frame 1 is the still picture; in the next ones, what is
     shown is turned counter-clockwise, seen from above.
-
-    Parameters
-    ----------
-    count : int
-        Number of frames.
-    follows_sensor : bool
-        Whether the scene is rendered by its own sensor only, which turns.
     """
 
-    def __init__(self, source: SceneSource[C], count: int, *, follows_sensor: bool = True) -> None:
+    def __init__(
+        self,
+        source: SceneSource[C],
+        count: int,  # Number of frames
+        *,
+        follows_sensor: bool = True,  # Whether the scene is rendered by its own sensor only, which turns
+    ) -> None:
         self.numbers, self._count = range(1, count + 1), count
         contents = source.at()
         points, framing = source.points(contents), source.framing(contents)
@@ -155,14 +153,13 @@ class FrameRange:
     """Times of a USD file, or the files of frames. The studio's camera stands still, and sees all frames.
 
     Raises CageError, OSError if a frame cannot be read, or nothing is visible in any of them.
-
-    Parameters
-    ----------
-    numbers : range
-        Times or numbers of files.
     """
 
-    def __init__(self, source: SceneSource[C], numbers: range) -> None:
+    def __init__(
+        self,
+        source: SceneSource[C],
+        numbers: range,  # Times or numbers of files
+    ) -> None:
         self.numbers, self._source = numbers, source
         contents = source.at(numbers[0])
         framing, self._points = source.framing(contents), source.points(contents)
@@ -205,16 +202,13 @@ class FrameFiles:
     """File and time code of a frame.
 
     Raises CageError if the name has no number in it. Raises FileNotFoundError if there is no file for a frame.
-
-    Parameters
-    ----------
-    path : Path
-        A USD file, or a name with a number in it, such as "frame_%04d.obj".
-    numbers : range
-        Times or numbers of files.
     """
 
-    def __init__(self, path: Path, numbers: range) -> None:
+    def __init__(
+        self,
+        path: Path,  # A USD file, or a name with a number in it, such as "frame_%04d.obj"
+        numbers: range,  # Times or numbers of files
+    ) -> None:
         self._path, self.numbers = path, numbers
         self.are_many = bool(PATTERN.search(path.name))
         if not self.are_many and not path.suffix.lower().startswith(".usd"):

@@ -53,26 +53,20 @@ class CageScenes:
     stay. Each file is read once: its control points are kept in a temporary file.
 
     Raises CageError, OSError if there is no file of a frame.
-
-    Parameters
-    ----------
-    cage : ControlCage, str or Path
-        A cage, or the file of one. For frames, a USD file, or a name with a number in it, such as "frame_%04d.obj".
-    prim, time, scheme : optional
-        As for `ControlCage.from_file`.
-    numbers : range, optional
-        Times or numbers of files, if there are frames.
     """
 
     def __init__(
         self,
+        # A cage, or the file of one. For frames, a USD file, or a name with a number in it, such as
+        # "frame_%04d.obj".
         cage: ControlCage | str | Path,
         look: Look,
         *,
+        # As for `ControlCage.from_file`
         prim: str | None = None,
         time: float | None = None,
         scheme: str | None = None,
-        numbers: range | None = None,
+        numbers: range | None = None,  # Times or numbers of files, if there are frames
     ) -> None:
         self.name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
         self._cage, self._look = cage, look

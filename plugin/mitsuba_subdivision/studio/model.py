@@ -43,15 +43,6 @@ def frame_table(surface: LimitSurface) -> VertexTable:
 class Model:
     """A cage and its limit surface.
 
-    Parameters
-    ----------
-    cage : ControlCage, str or Path
-        A cage, or the file of one.
-    prim, time, scheme
-        As for `ControlCage.from_file`.
-    contents : CageContents, optional
-        What the file holds, if it has been read.
-
     Raises
     ------
     CageError, OSError, SchemeError
@@ -60,12 +51,13 @@ class Model:
 
     def __init__(
         self,
-        cage: ControlCage | str | Path,
+        cage: ControlCage | str | Path,  # A cage, or the file of one
         *,
+        # As for `ControlCage.from_file`
         prim: str | None = None,
         time: float | None = None,
         scheme: str | None = None,
-        contents: CageContents | None = None,
+        contents: CageContents | None = None,  # What the file holds, if it has been read
     ) -> None:
         self._chosen = {"prim": prim, "time": time, "scheme": scheme}
         if isinstance(cage, ControlCage):

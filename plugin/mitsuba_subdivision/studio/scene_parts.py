@@ -28,17 +28,13 @@ _ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "ho
 
 
 class SceneParts:
-    """Collects the parts of a scene that are in memory, and writes them to files.
+    """Collects the parts of a scene that are in memory, and writes them to files."""
 
-    Parameters
-    ----------
-    path : Path
-        Of the scene's XML file. A part of the entry NAME becomes ``SCENE_NAME`` with a suffix.
-    inputs : iterable of Path
-        Files that must not be written to.
-    """
-
-    def __init__(self, path: Path, inputs: Iterable[Path]) -> None:
+    def __init__(
+        self,
+        path: Path,  # Of the scene's XML file. A part of the entry NAME becomes `SCENE_NAME` with a suffix.
+        inputs: Iterable[Path],  # Files that must not be written to
+    ) -> None:
         self._path, self._inputs = path, list(inputs)
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}

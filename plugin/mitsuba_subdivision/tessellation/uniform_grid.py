@@ -57,21 +57,18 @@ class GridPart:
 
 
 class UniformGrid(ABC):
-    """Numbering of a uniform tessellation, see `Grid`.
-
-    Parameters
-    ----------
-    topology : Topology
-        Of the elements: each face is an element, and a half-edge stands for the corner where it begins. Faces without
-        corners are left out.
-    rate : int
-        Segments on every edge.
-    """
+    """Numbering of a uniform tessellation, see `Grid`."""
 
     whole_size: int
     """Corners of elements that fit the domain."""
 
-    def __init__(self, topology: Topology, rate: int) -> None:
+    def __init__(
+        self,
+        # Of the elements: each face is an element, and a half-edge stands for the corner where it begins.
+        # Faces without corners are left out.
+        topology: Topology,
+        rate: int,  # Segments on every edge
+    ) -> None:
         self.topology, self.rate = topology, rate
 
     @property

@@ -145,16 +145,13 @@ class InteractionHook:
     """Overrides functions of a variant's shapes in Python; see the module.
 
     Raises RuntimeError if there is a `hook_problem`, or the class lacks one of the functions.
-
-    Parameters
-    ----------
-    variant : module
-        Such as ``mitsuba.llvm_ad_rgb``.
-    example : mi.Mesh
-        Of the class whose shapes are to be hooked.
     """
 
-    def __init__(self, variant: Variant, example: mi.Mesh) -> None:
+    def __init__(
+        self,
+        variant: Variant,  # Such as `mitsuba.llvm_ad_rgb`
+        example: mi.Mesh,  # Of the class whose shapes are to be hooked
+    ) -> None:
         problem = hook_problem()
         if problem is not None:
             raise RuntimeError(problem)

@@ -88,29 +88,21 @@ class Trampoline:
 
     Raises OSError if the system allows no executable memory. Raises AttributeError if the libraries lack a function
     that is needed.
-
-    Parameters
-    ----------
-    original : int
-        Address of a function that returns an object, with up to six arguments besides the object's address: numbers
-        and addresses.
-    kind : type
-        Python's, of the object.
-    function : callable
-        Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
-    fail : callable
-        Called with an error of the function, even one before its first line, and its traceback. It has to raise an
-        error, which C++ throws. The object has been destructed.
-    equal : (2,) tuple of int, optional
-        Offsets of two words of the object. If they are equal, Python is not called.
     """
 
     def __init__(
         self,
+        # Address of a function that returns an object, with up to six arguments besides the object's address:
+        # numbers and addresses
         original: int,
-        kind: type,
+        kind: type,  # Python's, of the object
+        # Called with the object's address and the six arguments. The upper bits of smaller arguments are
+        # arbitrary.
         function: Callable[..., None],
+        # Called with an error of the function, even one before its first line, and its traceback. It has to
+        # raise an error, which C++ throws. The object has been destructed.
         fail: Callable[[BaseException, TracebackType], NoReturn],
+        # (2,) tuple of int: offsets of two words of the object. If they are equal, Python is not called.
         equal: tuple[int, ...] | None = None,
     ) -> None:
         self.address = _installed(_code_after(original, kind, function, fail, equal), kind, function, fail)
@@ -120,15 +112,14 @@ class TaggingTrampoline:
     """A virtual function that calls Python, and then the original one.
 
     It adds the object's tag to the original's third argument besides the object's address, a number below 2¹⁶.
-
-    Parameters
-    ----------
-    original, function, fail
-        As for `Trampoline`; when Python is called, no object exists yet.
     """
 
     def __init__(
-        self, original: int, function: Callable[..., None], fail: Callable[[BaseException, TracebackType], NoReturn]
+        self,
+        # As for `Trampoline`; when Python is called, no object exists yet
+        original: int,
+        function: Callable[..., None],
+        fail: Callable[[BaseException, TracebackType], NoReturn],
     ) -> None:
         self.address = _installed(_code_before(original, function, fail), function, fail)
 
