@@ -126,6 +126,8 @@ class _Part:
             types.indices, (part.first_run, part.kind, part.first_vertex, part.first_entry, part.offset)
         )
         self._st = types.floats(part.st)
+        # Whether each polynomial has one vertex, as planes have: loops would take longer to trace than to run.
+        self._are_single = len(part.kind) == len(part.block) and bool((np.diff(part.first_entry)[part.kind] == 1).all())
 
     def evaluate(
         self, padded: FloatBuffer, buffers: Sequence[FloatBuffer], padded_change: FloatBuffer | None = None
@@ -181,25 +183,33 @@ class _Part:
     def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
         """Loop over the vertices of each lane's polynomial, of which the numbers and parameters are given."""
         types = self._types
+        lane: Index = dr.arange(types.index, self._rows.count)
 
         def ends(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
             return types.fetch(types.index, table, index), types.fetch(types.index, table, index + 1)
 
-        def over_runs(run: Index, *state) -> tuple:
+        def at_entry(first_vertex: Index, entry: Index, *state) -> tuple:
+            vertex = first_vertex + types.fetch(types.index, self._offset, entry)
+            s, t = types.fetch(types.vector2, self._st, entry)
+            return add(vertex, s, t, *state)
+
+        def of_run(run: Index) -> tuple[Index, Index, Index]:
             kind, first_vertex = (types.fetch(types.index, each, run) for each in (self._kind, self._first_vertex))
-            first_entry, last_entry = ends(self._first_entry, kind)
+            return first_vertex, *ends(self._first_entry, kind)
 
-            def over_entries(entry: Index, *state) -> tuple:
-                vertex = first_vertex + types.fetch(types.index, self._offset, entry)
-                s, t = types.fetch(types.vector2, self._st, entry)
-                return entry + 1, *add(vertex, s, t, *state)
-
-            entries = dr.while_loop(
-                (first_entry, *state), lambda entry, *_: entry < last_entry, over_entries, label=f"{label}_of_run"
+        def over_runs(run: Index, *state) -> tuple:
+            first_vertex, first_entry, last_entry = of_run(run)
+            _, *found = dr.while_loop(
+                (first_entry, *state),
+                lambda entry, *_: entry < last_entry,
+                lambda entry, *state: (entry + 1, *at_entry(first_vertex, entry, *state)),
+                label=f"{label}_of_run",
             )
-            return run + 1, *entries[1:]
+            return run + 1, *found
 
-        first_run, last_run = ends(self._first_run, dr.arange(types.index, self._rows.count))
+        if self._are_single:
+            return at_entry(*of_run(lane)[:2], *start)
+        first_run, last_run = ends(self._first_run, lane)
         _, *found = dr.while_loop((first_run, *start), lambda run, *_: run < last_run, over_runs, label=label)
         return tuple(found)
 
