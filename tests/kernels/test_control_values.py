@@ -1,6 +1,5 @@
 """Values of a cage on a device: sparse weights times them, with derivatives, and what kernels look up."""
 
-import sys
 from functools import partial
 
 import drjit as dr
@@ -9,20 +8,11 @@ import pytest
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
-from mitsuba_subdivision.llvm import llvm_problem
 from scipy import sparse
 
 # Sums of some terms of order one.
 SINGLE, DOUBLE = 2e-6, 1e-13
 ROWS, COLUMNS = 40, 12
-
-
-@pytest.fixture(params=["Float", "Float64"])
-def float_type(request):
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
-    return getattr(sys.modules["drjit.llvm.ad"], request.param)
 
 
 @pytest.fixture

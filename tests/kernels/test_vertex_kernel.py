@@ -1,7 +1,6 @@
 """The kernel does what `VertexTable.apply` does, and its derivatives are those of that map."""
 
 import gc
-import sys
 import weakref
 
 import drjit as dr
@@ -11,20 +10,11 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import VertexKernel
-from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import bumpy
 
 # Float32 sums of up to some tens of terms of order one.
 SINGLE = 2e-6
 DOUBLE = 1e-13
-
-
-@pytest.fixture(params=["Float", "Float64"])
-def float_type(request):
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
-    return getattr(sys.modules["drjit.llvm.ad"], request.param)
 
 
 def tolerance(float_type):

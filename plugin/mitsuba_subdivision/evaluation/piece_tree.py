@@ -166,9 +166,7 @@ def _tip(scheme: Scheme, piece: Piece, piece_levels: int) -> _Tip:
     # The regular children's polynomials over the eigen-coordinates.
     rows: FloatArray = polynomials.matrix @ patch.eigen_children
     level_count = float32_levels(patch)
-    by_level = _by_level(rows, patch, basis.subdominant, np.arange(level_count))
-    by_level *= basis.subdominant ** np.repeat(np.arange(level_count), len(rows))[:, None, None]
-    by_level[:, 0, 0] = 1
+    by_level = level_polynomials(scheme, patch, level_count)
     piece_count = piece_levels * len(rows)
     rest: FloatArray = np.zeros((2, len(polynomials.powers), len(coordinates)))
     u, v = (int(np.flatnonzero((polynomials.powers == each).all(axis=1))[0]) for each in ((1, 0), (0, 1)))
@@ -184,6 +182,20 @@ def _tip(scheme: Scheme, piece: Piece, piece_levels: int) -> _Tip:
         frame, second_eigenvector = FrameKind.UNEVEN, rows[:, :, 1]
     found = np.concatenate([by_level[:piece_count], *blocks]) @ coordinates
     return _Tip(found, np.tile(second_eigenvector, (len(levels), 1)), piece_count, frame, level_count)
+
+
+def level_polynomials(scheme: Scheme, patch: IrregularPatch, level_count: int) -> FloatArray:
+    """Polynomials ``(c, m, K)`` of the regular children at the first levels, over the eigen-coordinates.
+
+    `LEVEL_PIECES` of each level follow each other.
+    """
+    rows: FloatArray = polynomial_basis(scheme).matrix @ patch.eigen_children
+    base = patch.basis.subdominant
+    found = _by_level(rows, patch, base, np.arange(level_count))
+    found *= base ** np.repeat(np.arange(level_count), len(rows))[:, None, None]
+    # The first eigenvector is constant.
+    found[:, 0, 0] = 1
+    return found
 
 
 def _by_level(rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:

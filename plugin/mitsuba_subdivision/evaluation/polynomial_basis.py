@@ -36,7 +36,19 @@ class PolynomialBasis:
 
     def monomials(self, uv: FloatArray) -> FloatArray:
         """``(s, m)`` values at ``(s, 2)`` parameters."""
-        return ((uv - self.centre)[:, None, :] ** self.powers).prod(axis=2)
+        return monomial_values(self.powers, uv - self.centre)[0].T
+
+
+def monomial_values(powers: IntArray, st: FloatArray) -> FloatArray:
+    """``(3, m, s)`` values of monomials and their two derivatives, at parameters ``(s, 2)`` from the middle.
+
+    Parameters come last: NumPy's loops are then long.
+    """
+    (a, b), (s, t) = powers.T, st.T
+    power_s, power_t = (np.vander(each, int(powers.max()) + 1, increasing=True).T for each in (s, t))
+    along_s, along_t = power_s[a], power_t[b]
+    # The factors of derivatives that vanish are zero, whatever the power.
+    return np.stack([along_s * along_t, a[:, None] * power_s[a - 1] * along_t, b[:, None] * along_s * power_t[b - 1]])
 
 
 @lru_cache(maxsize=16)

@@ -17,10 +17,10 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .divided_element import MOST_DEPTH, DividedElement, not_isolated
-from .equations import locate, times, times_powers
+from .equations import locate, times
 from .irregular_patch import IrregularPatch
 from .patch_pieces import Piece
-from .piece_tree import LEVEL_PIECES, PIECE_LEVELS
+from .piece_tree import LEVEL_PIECES, PIECE_LEVELS, level_polynomials
 from .polynomial_basis import polynomial_basis
 
 # Fewer samples of a piece have planes.
@@ -116,30 +116,25 @@ def _of_regular(scheme: Scheme, piece: Piece, uv: FloatArray) -> Sampled:
 
 
 def _of_tip(scheme: Scheme, piece: Piece, patch: IrregularPatch, uv: FloatArray) -> Sampled:
-    basis, uv = polynomial_basis(scheme), piece.domain(uv)
+    uv = piece.domain(uv)
     level, child, local = locate(scheme.domain, uv)
     number = LEVEL_PIECES * level + child
     # Samples at the point itself, and at deeper levels, have planes.
-    is_near = (level >= PIECE_LEVELS) | (scheme.domain.extent(uv) == 0)
-    number[is_near] = LEVEL_PIECES * PIECE_LEVELS
-    counts = np.bincount(number, minlength=LEVEL_PIECES * PIECE_LEVELS + 1)
-    counts[-1] = 0
-    in_planes = np.flatnonzero(counts[number] < FEW_SAMPLES)
+    has_piece = (level < PIECE_LEVELS) & (scheme.domain.extent(uv) > 0)
+    counts = np.bincount(number[has_piece], minlength=LEVEL_PIECES * PIECE_LEVELS)
+    has_piece[has_piece] = counts[number[has_piece]] >= FEW_SAMPLES
+    in_planes, in_pieces = np.flatnonzero(~has_piece), np.flatnonzero(has_piece)
     planes = others = _none(piece.stencils.shape[1])
     if len(in_planes):
         found = patch.rows(uv[in_planes], "stabilized", np.float64)
         rows = np.concatenate([found.rows[:1], found.tangents]).swapaxes(0, 1)
         at = np.arange(len(in_planes))
         planes = Polynomials(_times(rows, piece.coordinates), in_planes, at, np.zeros((len(at), 2)))
-    pieces, at = np.unique(number[counts[number] >= FEW_SAMPLES], return_inverse=True)
-    if len(pieces):
-        levels, children = np.divmod(pieces, LEVEL_PIECES)
-        rows = (basis.matrix @ patch.eigen_children)[children]
-        rows = times_powers(rows.swapaxes(0, 1), levels, patch.basis, 1.0).swapaxes(0, 1)
-        # The first eigenvector is constant, but for rounding.
-        rows[:, :, 0] = basis.powers.sum(axis=1) == 0
-        which = np.flatnonzero(counts[number] >= FEW_SAMPLES)
-        others = Polynomials(_times(rows, piece.coordinates), which, at, local[which] - basis.centre)
+    if len(in_pieces):
+        pieces, at = np.unique(number[in_pieces], return_inverse=True)
+        rows = level_polynomials(scheme, patch, PIECE_LEVELS)[pieces]
+        st = local[in_pieces] - polynomial_basis(scheme).centre
+        others = Polynomials(_times(rows, piece.coordinates), in_pieces, at, st)
     return planes, others
 
 

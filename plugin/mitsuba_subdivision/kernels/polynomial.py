@@ -16,6 +16,7 @@ class Monomials:
         self,
         powers: Sequence[Sequence[int]],  # (m, 2) sequence of int: of s and of t
     ) -> None:
+        self.powers = powers
         highest = max(b for _, b in powers)
         # Of each power of t, the monomials by their powers of s.
         self._columns: list[list[int | None]] = []
@@ -43,6 +44,24 @@ class Monomials:
             by_ss, _, _ = _horner([each[2] for each in along_s if each[2] is not None] or [None], t, 0)
             found += [by_ss, by_st, by_tt]
         return tuple(value * 0 if each is None else each for each in found)
+
+    def each(self, s: Float, t: Float) -> list[tuple[Float, Float | None, Float | None]]:
+        """The value of each monomial and its derivatives by s and t; None for those that are zero."""
+        return [
+            (
+                _power(s, a) * _power(t, b),
+                a * _power(s, a - 1) * _power(t, b) if a else None,
+                b * _power(s, a) * _power(t, b - 1) if b else None,
+            )
+            for a, b in self.powers
+        ]
+
+
+def _power(x: Float, exponent: int) -> Float:
+    found = 1.0
+    for _ in range(exponent):
+        found = found * x
+    return found
 
 
 def _horner(coefficients: list[Value], x: Float, derivatives: int) -> tuple[Value, Value, Value]:

@@ -108,8 +108,8 @@ class _Part:
     """Vertices on polynomials of the same monomials. A lane has a polynomial, and loops over its vertices."""
 
     def __init__(self, types: ArrayTypes, part: VertexPolynomials, controls: IndexBuffer, are_rounded: bool) -> None:
-        self._types, self._powers = types, part.powers.tolist()
-        self._monomials, precision = Monomials(self._powers), dr.type_v(types.float)
+        self._types, self._monomials = types, Monomials(part.powers.tolist())
+        precision = dr.type_v(types.float)
         # Where rounding is all that is left of tangents; in parts of the extent, and of the origin.
         self._rounding = types.floats((TANGENT_ROUNDING[precision] * part.tangent_weights)[part.block])
         self._least_extent = LEAST_EXTENT[precision] if are_rounded else 0
@@ -162,15 +162,14 @@ class _Part:
             normal: Vector3 = dr.gather(types.vector3, normals, vertex)
             by_u, by_v = UnitNormal(du, dv, bound).backward(normal)
             added = []
-            for (a, b), gradient in zip(self._powers, gradients, strict=True):
-                one, of_s, of_t = _monomial(a, b, s, t)
+            for (one, of_s, of_t), gradient in zip(self._monomials.each(s, t), gradients, strict=True):
                 own = dr.fma(p, one, gradient)
                 own = own if of_s is None else dr.fma(by_u, of_s, own)
                 added.append(own if of_t is None else dr.fma(by_v, of_t, own))
             return tuple(added)
 
         zero: Vector3 = dr.zeros(types.vector3, self._rows.count)
-        gradients = self._loop(tuple(types.vector3(zero) for _ in self._powers), add, "vertex_gradients")
+        gradients = self._loop(tuple(types.vector3(zero) for _ in self._monomials.powers), add, "vertex_gradients")
         self._rows.add_transposed(gradients, sums)
 
     def _coefficients(self, padded: FloatBuffer) -> tuple[list[Vector3], RoundingBound]:
@@ -260,18 +259,3 @@ class _Evaluation(dr.CustomOp):
 def coordinates_expected(count: int, control_count: int) -> str:
     """Message for ``count`` coordinates that do not fit ``control_count`` control points."""
     return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"
-
-
-def _monomial(a: int, b: int, s: Float, t: Float) -> tuple[Float, Float | None, Float | None]:
-    """A monomial ``s^a t^b`` and its two derivatives; None for those that are zero."""
-    one = _power(s, a) * _power(t, b)
-    of_s = a * _power(s, a - 1) * _power(t, b) if a else None
-    of_t = b * _power(s, a) * _power(t, b - 1) if b else None
-    return one, of_s, of_t
-
-
-def _power(x: Float, exponent: int) -> Float:
-    found = 1.0
-    for _ in range(exponent):
-        found = found * x
-    return found

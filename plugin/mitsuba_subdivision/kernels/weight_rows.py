@@ -22,10 +22,10 @@ class WeightRows:
         # (b, 4) int: of each block the index of its first control in `controls`, how far those of a patch are
         # apart, and how many they are; its first row of weights
         columns: np.ndarray,
-        # (w, ..) float: A row for each control point of a block, with a number for each vector that it makes
+        # (w, ..) float: a row for each control point of a block, with a number for each vector that it makes
         weights: np.ndarray,
         controls: IndexBuffer,  # Indices of control points
-        # (n,) int: of each lane. Lanes of a block are consecutive, so that they read the same weights.
+        # (n,) int: of each lane. Lanes of a block come together, if not all, so that they read the same weights.
         block: np.ndarray,
         patch: np.ndarray,
     ) -> None:

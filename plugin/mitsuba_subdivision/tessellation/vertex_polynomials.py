@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.divided_element import element_of
 from ..evaluation.normals import LEAST_EXTENT, unit_normals
-from ..evaluation.polynomial_basis import polynomial_basis
+from ..evaluation.polynomial_basis import monomial_values, polynomial_basis
 from ..evaluation.sampled_polynomials import PLANE_POWERS, Known, Polynomials, sampled_polynomials
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
@@ -23,8 +23,6 @@ from ..schemes.scheme import Scheme
 # Coefficients are computed for runs of patches with about so many weights, and vertices in runs of about so many
 # coefficients, whose arrays stay in a core's cache.
 WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 17, 1 << 18
-
-
 # Polynomials of so many patches follow each other.
 PATCHES_TOGETHER = 1 << 7
 
@@ -53,7 +51,8 @@ class VertexPolynomials:
     """
 
     powers: IntArray  # (m, 2) int64: of the monomials, about the middle of the domain
-    # (b, m, K) float64 for each size of one-rings: of blocks of classes of that size, one size after the other
+    # (b, m, K) float64 for each size of one-rings: of blocks of classes of that size, one size after the other, the
+    # smallest first
     weights: tuple[FloatArray, ...]
     # (b, 3) int64: of each block the index of the class's first control in `VertexTable.controls`, and its numbers of
     # patches, whose controls follow each other column by column, and of controls
@@ -75,19 +74,18 @@ class VertexPolynomials:
 
         Coefficients are relative to a control point of each patch.
         """
-        monomials = _monomials(self.powers, self.st)[:row_count]
-        # Blocks of one size follow each other, and so do their polynomials.
-        ends = np.cumsum([len(weights) for weights in self.weights])
-        size = np.searchsorted(ends, self.block, side="right")
+        monomials = monomial_values(self.powers, self.st)[:row_count]
+        # Ascending.
+        control_counts = self.blocks[self.block, 2]
         first_block = 0
-        for number, weights in enumerate(self.weights):
-            begin, end = np.searchsorted(size, [number, number + 1]).tolist()
+        for weights in self.weights:
+            begin, end = np.searchsorted(control_counts, [weights.shape[2], weights.shape[2] + 1]).tolist()
             step = max(1, WEIGHTS_AT_ONCE // weights[0].size)
             for first in range(begin, end, step):
                 polynomials = slice(first, min(first + step, end))
                 block = self.block[polynomials]
-                first_control, patch_count, control_count = self.blocks[block].T
-                at = first_control + self.patch[polynomials] + patch_count * np.arange(control_count[0])[:, None]
+                first_control, patch_count, _ = self.blocks[block].T
+                at = first_control + self.patch[polynomials] + patch_count * np.arange(weights.shape[2])[:, None]
                 own = points[controls[at]]
                 origin = own[0]
                 relative = own - origin
@@ -242,19 +240,7 @@ def _divided_runs(runs: VertexRuns, kind_of_part: IntArray) -> tuple[IntArray, I
 def _tangent_weights(powers: IntArray, weights: tuple[FloatArray, ...], block: IntArray, st: FloatArray) -> FloatArray:
     """`VertexPolynomials.tangent_weights`, from the block and the parameters of each entry."""
     magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])
-    slopes = (np.abs(_monomials(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0)
+    slopes = (np.abs(monomial_values(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0)
     found = np.zeros(len(magnitude))
     np.maximum.at(found, block, slopes)
     return found
-
-
-def _monomials(powers: IntArray, st: FloatArray) -> FloatArray:
-    """``(3, m, s)`` values of monomials and their two derivatives at ``(s, 2)`` parameters.
-
-    Parameters come last: NumPy's loops are then long.
-    """
-    (a, b), (s, t) = powers.T, st.T
-    power_s, power_t = (np.vander(each, int(powers.max()) + 1, increasing=True).T for each in (s, t))
-    along_s, along_t = power_s[a], power_t[b]
-    # The factors of derivatives that vanish are zero, whatever the power.
-    return np.stack([along_s * along_t, a[:, None] * power_s[a - 1] * along_t, b[:, None] * along_s * power_t[b - 1]])
