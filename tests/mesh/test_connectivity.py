@@ -116,18 +116,6 @@ def test_euler_characteristic():
     assert euler(extraordinary(6, closed=False)) == 1
 
 
-def test_turn_visits_every_face_around_an_interior_vertex_once(any_cage):
-    topology = any_cage.topology
-    for vertex in np.flatnonzero(~topology.is_border_vertex):
-        half_edge, visited = topology.vertex_half_edge[vertex], []
-        for _ in range(topology.vertex_face_count[vertex]):
-            assert topology.face_vertices[half_edge] == vertex
-            visited.append(topology.face[half_edge])
-            half_edge = topology.turn(half_edge)
-        assert half_edge == topology.vertex_half_edge[vertex]
-        assert sorted(visited) == sorted(topology.face[topology.face_vertices == vertex])
-
-
 def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(any_cage):
     t = any_cage.topology
     offsets, half_edges = t.vertex_fans

@@ -8,7 +8,7 @@ from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
 from mitsuba_subdivision.patches import channel
-from patches.closed_cages import bumpy, cage_of
+from patches.closed_cages import bumpy
 
 pytestmark = pytest.mark.core
 
@@ -68,23 +68,6 @@ def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
     found = surface.evaluate(*where)
     close(found.p, expected.p, size)
     close(found.n, expected.n, 1, NORMAL)
-
-
-@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
-def test_neighbours_agree_along_their_common_edge(scheme, np_rng):
-    surface = LimitSurface(bumpy(cage_of(scheme, "mixed torus")), scheme)
-    elements = surface.patches.elements
-    half_edges = np.flatnonzero(surface.patches.is_whole[elements.face])
-    half_edges = half_edges[surface.patches.is_whole[elements.face[elements.twin[half_edges]]]]
-    twins = elements.twin[half_edges]
-    along = np_rng.random(len(half_edges))
-    sides = []
-    for own, u in ((half_edges, along), (twins, 1 - along)):
-        face = elements.face[own]
-        uv = np.stack([u, np.zeros_like(u)], axis=1)
-        sides.append(surface.evaluate(face, uv, own - elements.face_offsets[face]))
-    close(sides[0].p, sides[1].p, np.abs(surface.cage.positions).max())
-    close(sides[0].n, sides[1].n, 1, NORMAL)
 
 
 @pytest.mark.parametrize("valence", [3, 5, 7])
