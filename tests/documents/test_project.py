@@ -28,8 +28,8 @@ def read(path):
     return (ROOT / path).read_text(encoding="utf-8")
 
 
-def workflow():
-    return yaml.safe_load(read(".github/workflows/tests.yml"))
+def workflow(name="tests"):
+    return yaml.safe_load(read(f".github/workflows/{name}.yml"))
 
 
 def classified(topic):
@@ -63,6 +63,27 @@ def test_the_steps_of_a_workflow_are_commands_of_the_repository():
     for command in commands:
         if command.startswith("python "):
             assert f"   {command}\n" in release
+
+
+def test_a_release_uploads_what_was_tried_once_a_maintainer_allows_it():
+    # YAML 1.1 reads the word "on" as true.
+    assert workflow("release")[True] == {"push": {"tags": ["v*"]}}
+    assert "workflow_call" in workflow()[True]
+    jobs = workflow("release")["jobs"]
+    assert jobs["tests"] == {"uses": "./.github/workflows/tests.yml"}
+    publish = jobs["publish"]
+    assert (publish["needs"], publish["if"]) == ("tests", "vars.PUBLISH == 'true'")
+    assert publish["permissions"] == {"id-token": "write"}
+    taken, _ = publish["steps"]
+    made = [step for step in workflow()["jobs"]["packages"]["steps"] if "upload-artifact" in step.get("uses", "")]
+    assert [step["with"] for step in made] == [{**taken["with"], "path": "dist/", "if-no-files-found": "error"}]
+
+
+def test_the_newest_mitsuba_is_tested_as_the_readme_says():
+    commands = [step.get("run", "") for step in workflow("nightly")["jobs"]["newest"]["steps"]]
+    assert any("pip install --upgrade --pre mitsuba drjit" in command for command in commands)
+    options = re.search(r"-m pytest (.*)", read("README.md"))[1]
+    assert any(f"python -m pytest {options} " in command for command in commands)
 
 
 def test_packages_are_pinned_as_the_text_says():
