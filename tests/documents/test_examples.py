@@ -329,6 +329,16 @@ def test_every_example_of_a_page_runs(page, folder):
         assert names["error"] < 0.03
 
 
+def test_pages_have_blocks_of_every_kind():
+    found = [block for page in PAGES for block in blocks(page)]
+    assert {block.language for block in found} == {"python", "sh", "xml", "bibtex"}
+    commands = [words for block in found if block.language == "sh" for words in block.commands]
+    assert len(commands) > 25
+    assert {words[1] for words in commands if words[0] == OURS} == {
+        "compare", "doctor", "figure", "info", "merge", "render", "tessellate"
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [

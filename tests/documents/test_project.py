@@ -17,6 +17,7 @@ else:
     import tomli as tomllib  # A package that pytest needs there.
 
 ROOT = Path(__file__).resolve().parents[2]
+GITHUB = ROOT / ".github"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 VERSION = mitsuba_subdivision.__version__
 # Systems by the names that images of workflows begin with, and by those of classifiers.
@@ -105,6 +106,13 @@ def test_the_changelog_and_the_citation_have_the_version_and_its_day():
     assert citation.get("repository-code") == PROJECT["urls"].get("Repository")
 
 
+def test_the_changelog_has_the_usual_headings():
+    heading = re.compile(r"^#+ .+$", flags=re.MULTILINE)
+    for version in read("CHANGELOG.md").split("\n## ")[1:]:
+        kinds = [line.removeprefix("### ") for line in heading.findall(version)]
+        assert kinds == [kind for kind in ("Added", "Changed", "Fixed") if kind in kinds] != []
+
+
 @pytest.fixture
 def long_description():
     """The module that makes the long description; hatchling loads it by its path."""
@@ -190,11 +198,31 @@ def test_the_checks_install_nothing_for_users_without_the_right(commands):
     assert "installed" not in done.stderr
 
 
+@pytest.mark.posix
+def test_the_checks_say_nothing_of_what_is_there(commands):
+    assert commands(dpkg="exit 0", id="echo 0", blender="exit 0", google_chrome="exit 0").stderr == ""
+
+
+@pytest.mark.posix
+def test_the_checks_say_that_other_systems_have_no_packages(commands):
+    assert "this system has no Debian packages" in commands(id="echo 0").stderr
+
+
 def test_checks_before_a_commit_are_those_of_the_script():
     hooks = yaml.safe_load(read(".pre-commit-config.yaml"))["repos"][0]["hooks"]
     tools = {"ruff check", "ruff format", "mypy"}
     assert {hook["name"] for hook in hooks} == tools
     assert [tool for tool in sorted(tools) if f".venv/bin/{tool}" not in read(".ci/run")] == []
+
+
+@pytest.mark.parametrize("path", sorted((GITHUB / "ISSUE_TEMPLATE").glob("[!c]*.yml")), ids=lambda path: path.stem)
+def test_an_issue_form_asks_for_something(path):
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert form["name"]
+    assert form["description"]
+    fields = [field for field in form["body"] if field["type"] != "markdown"]
+    assert any(field.get("validations", {}).get("required") for field in fields)
+    assert len({field["id"] for field in fields}) == len(fields)
 
 
 def test_the_documentation_is_built_elsewhere_as_here():

@@ -29,6 +29,7 @@ from reference.exact_samples import (
     SCHEMES,
     angle,
     bumpy,
+    bumpy_ball,
     curvature_error,
     exact_curvature,
     faces_of,
@@ -163,6 +164,13 @@ def test_tangents_at_the_extraordinary_point_run_along_the_edges(scheme, valence
     assert angle(at_point.dp_dv[0], near.dp_dv[1]) < 1e-3
 
 
+def test_normals_stay_finite_at_any_level(surface):
+    uv = np.ldexp([[1.0, 0.3]], [[-100], [-500], [-1000], [-1070]])
+    found = surface.evaluate(0, uv)
+    for values in (found.p, found.dp_du, found.dp_dv, found.n):
+        assert np.isfinite(values).all()
+
+
 @pytest.mark.parametrize(
     ("scheme", "name"),
     [
@@ -247,6 +255,16 @@ def _cubic_hat(t):
     return sum(c * np.maximum(t + 2 - k, 0) ** 3 for k, c in enumerate((1, -4, 6, -4, 1))) / 6
 
 
+def test_evaluation_commutes_with_affine_maps(exact, np_rng):
+    matrix, shift = np_rng.standard_normal((3, 3)), np_rng.standard_normal(3)
+    before = LimitSurface(exact.cage, exact.scheme).evaluate(0, exact.uv)
+    moved = exact.cage.with_positions(exact.cage.positions @ matrix.T + shift)
+    after = LimitSurface(moved, exact.scheme).evaluate(0, exact.uv)
+    assert np.abs(before.p @ matrix.T + shift - after.p).max() <= POINT * 10
+    normal = np.sign(np.linalg.det(matrix)) * before.n @ np.linalg.inv(matrix)
+    assert angle(normal, after.n).max() <= NORMAL
+
+
 @pytest.mark.parametrize("distance", [1e3, 1e6])
 def test_translation_changes_normals_by_no_more_than_rounding_the_cage_does(exact, distance):
     shift = distance * np.array([0.6, -0.48, 0.64])
@@ -283,6 +301,24 @@ def test_limit_stencil_of_a_position_sums_to_one_and_of_tangents_to_zero(scheme,
     found = limit_stencil(scheme, valence)
     assert found.position.sum() == pytest.approx(1, abs=STENCIL)
     assert np.abs(found.tangents.sum(axis=1)).max() <= STENCIL * valence
+
+
+@EVERY_SCHEME
+@pytest.mark.parametrize("valence", [3, 5, 12])
+def test_limit_stencil_agrees_with_evaluation(scheme, valence):
+    cage = bumpy_ball(scheme, valence)
+    faces = faces_of(cage)
+    ring = np.array(faces[:valence]) if scheme != "doo_sabin" else None
+    slots = {
+        "catmull_clark": lambda: [0, *ring[:, 1], *ring[:, 2]],
+        "loop": lambda: [0, *ring[:, 1]],
+        "doo_sabin": lambda: faces[0],
+    }[scheme]()
+    found = limit_stencil(scheme, valence)
+    points = cage.positions[slots]
+    sample = LimitSurface(cage, scheme).evaluate(0, [[0.0, 0.0]])
+    assert np.abs(found.position @ points - sample.p[0]).max() <= POINT
+    assert angle(np.cross(*(found.tangents @ points)), sample.n[0]) <= NORMAL
 
 
 @EVERY_SCHEME

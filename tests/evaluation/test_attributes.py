@@ -427,6 +427,14 @@ def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
         np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
 
 
+def test_a_constant_stays_one(np_rng):
+    cage = CAGES["polygons"][1]
+    indices = random_indices(cage, np_rng, "islands")
+    constant = np.full((indices.max() + 1, 1), 0.1)
+    surface = LimitSurface(tagged(cage, attributes={"one": Attribute(constant, "face_varying", indices)}))
+    assert (surface.evaluate_attribute("one", *random_locations(surface, np_rng)) == 0.1).all()
+
+
 # Doo-Sabin
 
 

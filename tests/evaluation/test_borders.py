@@ -9,11 +9,13 @@ import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
 from mitsuba_subdivision.evaluation import irregular_patch
+from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import (
     differences_to_refined,
     half_disc,
+    refined,
     sheet,
     spokes,
     tagged,
@@ -75,6 +77,16 @@ def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
     assert normals <= NORMAL
 
 
+@EVERY_CAGE
+def test_weights_of_points_sum_to_one_and_those_of_tangents_to_zero(scheme, cage, np_rng):
+    surface = LimitSurface(cage, scheme)
+    uv = np.concatenate([[[0, 0], [1, 0], [0, 1]], np_rng.random((12, 2)) / 2.0 ** np.arange(1, 13)[:, None]])
+    for patch_class in surface.patches.classes:
+        weights = element_stencils(surface.scheme, patch_class.signature, uv)
+        np.testing.assert_allclose(weights[0].sum(axis=1), 1, rtol=0, atol=WEIGHTS)
+        np.testing.assert_allclose(weights[1:].sum(axis=2), 0, rtol=0, atol=WEIGHTS)
+
+
 def at_corners(surface, rng):
     """Elements, parameters and corners: corners themselves, and places near them."""
     element = np.arange(surface.cage.face_count).repeat(4)
@@ -109,6 +121,35 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     for derivative in ("dp_du", "dp_dv"):
         np.testing.assert_allclose(getattr(found, derivative), getattr(expected, derivative), rtol=0, atol=WEIGHTS)
     assert angle(found.n, expected.n).max() <= NORMAL
+
+
+@EVERY_CAGE
+def test_refined_vertices_approach_the_surface(scheme, cage):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    limit = surface.tessellate(1).positions[: surface.patches.topology.vertex_count]
+    errors = []
+    finer = surface
+    for _ in range(4):
+        finer = refined(finer)
+        errors.append(np.abs(finer.cage.positions[: len(limit)] - limit).max())
+    # By 1/4 to 0.62 a level, the subdominant eigenvalue at high valence.
+    assert errors[3] <= 0.45 * errors[1] + POSITION
+    assert errors[1] < 0.1
+
+
+@EVERY_CAGE
+def test_a_tessellation_cracks_nowhere(scheme, cage):
+    surface = LimitSurface(with_bumps(cage), scheme)
+    found = surface.tessellate(3)
+    assert np.isfinite(found.positions).all()
+    assert np.isfinite(found.normals).all()
+    # Welded by their positions, bit by bit, triangles meet in pairs but on the cage's own border.
+    _, same = np.unique(found.positions, axis=0, return_inverse=True)
+    triangles = same.ravel()[found.triangles]
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert set(counts) <= {1, 2}
+    assert (counts == 1).sum() == 3 * (cage.topology.twin < 0).sum()
 
 
 def test_a_border_is_a_cubic_spline_between_its_corners():

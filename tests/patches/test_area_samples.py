@@ -92,6 +92,14 @@ def test_points_are_uniform_inside_elements(name):
 
 
 @pytest.mark.core
+def test_points_of_a_sheet_are_uniform():
+    found = LimitSurface(sheet(4, 3)).sample(COUNT, seed=3)
+    for axis, size in ((0, 4), (1, 3)):
+        assert stats.kstest(found.p[:, axis] / size, "uniform").pvalue > SIGNIFICANCE
+    np.testing.assert_array_equal(found.p[:, 2], 0)
+
+
+@pytest.mark.core
 def test_seeds_determine_points():
     surface = surface_named("hexagon")
     first, again, other = surface.sample(100, 7), surface.sample(100, 7), surface.sample(100, 8)
@@ -100,6 +108,16 @@ def test_seeds_determine_points():
     rng = np.random.default_rng(7)
     np.testing.assert_array_equal(surface.sample(100, rng).p, first.p)
     assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
+
+
+def test_samples_do_not_depend_on_the_unit_of_length():
+    cage = cube()
+    metres, millimetres = (LimitSurface(cage.with_positions(unit * cage.positions)) for unit in (1, 1024))
+    first, second = metres.sample(100, 3), millimetres.sample(100, 3)
+    np.testing.assert_array_equal(first.uv, second.uv)
+    cells, scaled = metres._sampling_cells(), millimetres._sampling_cells()
+    np.testing.assert_array_equal(cells.offsets, scaled.offsets)
+    np.testing.assert_allclose(1024**2 * cells.areas, scaled.areas, rtol=1e-12)
 
 
 def test_points_are_those_of_their_parameters():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from patches.closed_cages import bumpy, cage_of
 from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
@@ -41,6 +41,11 @@ def test_boxes_contain_the_surface_in_both_precisions(name, np_rng):
     assert_contained(surface_named(name), np_rng)
 
 
+@pytest.mark.parametrize("name", ["mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
+def test_boxes_contain_very_many_samples(name, np_rng):
+    assert_contained(surface_named(name), np_rng, 100_000)
+
+
 @pytest.mark.parametrize("name", ["cube", "loop valence 3", "doo_sabin mixed torus"])
 def test_boxes_contain_the_surface_far_from_the_origin(name, np_rng):
     surface = surface_named(name)
@@ -64,6 +69,11 @@ def test_a_minimum_inside_an_element_is_met_to_a_256th_of_its_square():
 @EVERY_SURFACE
 def test_boxes_are_tight(name):
     assert_tight(surface_named(name))
+
+
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
+def test_boxes_of_surfaces_that_bend_much_are_tight(scheme):
+    assert_tight(LimitSurface(bumpy(cage_of(scheme, "mixed torus"), size=1), scheme))
 
 
 def assert_tight(surface):
@@ -125,3 +135,11 @@ def test_a_collapsed_surface_has_boxes():
     bounds = LimitSurface(cage).bounds()
     assert (bounds.lower == 0).all()
     assert (bounds.upper == 0).all()
+
+
+def test_boxes_do_not_depend_on_the_numbering_of_faces():
+    cage = bumpy(extraordinary(5))
+    faces = cage.face_vertices.reshape(-1, 4)
+    turned = ControlCage(cage.positions, np.roll(faces[::-1], 1, axis=1))
+    bounds, others = LimitSurface(cage).bounds(), LimitSurface(turned).bounds()
+    np.testing.assert_allclose(bounds.lower, others.lower[::-1], rtol=0, atol=1e-12)

@@ -89,6 +89,13 @@ def test_scaling_and_turning():
     np.testing.assert_allclose(LimitSurface(moved).area(), 9 * LimitSurface(cage).area(), rtol=EXACT)
 
 
+def test_the_unit_of_length_changes_nothing():
+    """Powers of two scale all products exactly."""
+    cage = bumpy(cage_of("catmull_clark", "prism"))
+    small, large = (LimitSurface(cage.with_positions(unit * cage.positions)).area() for unit in (2.0**-30, 2.0**30))
+    assert large == 2.0**120 * small
+
+
 def test_holes_have_no_area():
     whole, holed = LimitSurface(cube()), LimitSurface(tagged(cube(), holes=[1, 2]))
     np.testing.assert_allclose(holed.area(), whole.area() * 4 / 6, rtol=EXACT)
