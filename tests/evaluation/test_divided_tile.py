@@ -42,7 +42,7 @@ def parts(scheme, signature):
         waiting = [
             (domain @ copy.inverse(), (child, of_child @ rows))
             for domain, (tile, rows) in waiting
-            if tile is not None
+            if not tile.is_piece
             for copy, (child, of_child) in zip(scheme.domain.children, tile.children, strict=True)
         ]
 
@@ -55,7 +55,7 @@ def test_pieces_and_corners_are_the_surface(name):
     uv = np.concatenate([scheme.domain.corners, scheme.domain.corners.mean(axis=0)[None]])
     for signature, points in zip(signatures, points_of_patches(surface), strict=True):
         for domain, (tile, rows) in parts(scheme, signature):
-            if tile is None:
+            if tile.is_piece:
                 found, at = basis.values(uv) @ rows, uv
             else:
                 found, at = tile.corners @ rows, scheme.domain.corners
@@ -70,7 +70,7 @@ def test_control_points_of_convex_rules_contain_the_surface(name):
     scheme, signatures = tables(surface_named(name))
     for signature in signatures:
         for _, (tile, _) in parts(scheme, signature):
-            if tile is None or tile.pieces is None:
+            if tile.is_piece or tile.pieces is None:
                 continue
             # Over control points, which are as many as eigenvectors.
             pieces = tile.pieces @ np.linalg.inv(tile.control_points)

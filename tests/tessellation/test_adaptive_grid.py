@@ -212,7 +212,7 @@ def test_a_surface_may_be_a_curve():
     cage = cube()
     surface = LimitSurface(cage.with_positions(cage.positions * [1, 0, 0]))
     table = table_of(surface)
-    assert table.grid.tiles.rates.min() >= 1
+    assert table.grid.tiles["rates"].min() >= 1
     assert_elements_are_covered(surface, table)
 
 

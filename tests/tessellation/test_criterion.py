@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.evaluation.bernstein import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
 from mitsuba_subdivision.tessellation.cones import NormalCone, TangentCone
-from mitsuba_subdivision.tessellation.criterion import least_product
+from mitsuba_subdivision.tessellation.criterion import BESIDE_OUTLINE, least_product
 from patches.closed_cages import bumpy
 from scipy.spatial import ConvexHull
 from tessellation.distances import distances
@@ -59,13 +60,13 @@ def test_no_edge_is_longer_than_asked(name):
 def test_rates_stay_below_the_highest(name):
     """No more segments lie on any edge of the cage than allowed, however small the error."""
     table = table_of(surface_named(name), 1e-9, max_rate=6)
-    tiles, rates = table.grid.tiles, table.grid.tiles.rates.max(axis=1)
+    tiles, rates = table.grid.tiles, table.grid.tiles["rates"].max(axis=1)
     # Around extraordinary vertices rings get smaller, but have no more segments.
-    assert rates[tiles.depth == 0].max(initial=0) <= 6
-    assert rates[tiles.depth > 0].max(initial=0) <= 3
-    assert (rates <= np.maximum(1, 6 >> tiles.halvings.astype(int))).all()
+    assert rates[tiles["depth"] == 0].max(initial=0) <= 6
+    assert rates[tiles["depth"] > 0].max(initial=0) <= 3
+    assert (rates <= np.maximum(1, 6 >> tiles["halvings"].astype(int))).all()
     if name == "loop mixed torus":
-        assert tiles.depth.max() > 15
+        assert tiles["depth"].max() > 15
 
 
 @pytest.mark.parametrize("name", ["cube", "rook", "loop mixed torus", "doo_sabin mixed torus", "half disc of 6"])
@@ -205,40 +206,12 @@ def test_rings_follow_a_close_look_at_an_extraordinary_vertex(valence):
         near = np.linalg.norm(positions - point.p[0], axis=1) < away
         corners = positions[table.triangles[near[table.triangles].all(axis=1)]]
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-        depths.append(table.grid.tiles.depth.max())
+        depths.append(table.grid.tiles["depth"].max())
         assert len(sides) > 100
         # A tenth of the distance, seen from twice as far at most.
         assert sides.max() <= 0.2 * away
         assert np.quantile(sides, 0.1) > 0.3 * np.median(sides)
     assert depths[1] >= depths[0] + 7
-
-
-def test_parts_said_to_curve_one_way_do(np_rng):
-    """Of bumps and saddles: second fundamental forms have no eigenvalue of the other sign but for slack."""
-    basis = BernsteinBasis(SQUARE, 3)
-    u, v = (basis.indices / 3).T
-    count, slack = 2000, 0.005
-    bending, twist = np_rng.normal(size=(3, count)) / 10, np_rng.normal(size=(2, count, len(u))) / 2000
-    height = bending[0, :, None] * u**2 + bending[1, :, None] * u * v + bending[2, :, None] * v**2 + twist[0]
-    coefficients = np.stack([u + twist[1], v + 0 * twist[1], height]).transpose(2, 0, 1)
-
-    def times(matrix, points):
-        return np.einsum("ab,bxt->axt", matrix, points)
-
-    by_u, by_v = basis.derivatives
-    first = [times(each, coefficients) for each in (by_u, by_v)]
-    second = [times(each, coefficients) for each in (by_u @ by_u, by_u @ by_v, by_v @ by_v)]
-    cone = NormalCone.of(*(TangentCone.of(each) for each in first))
-    found = cone.curves_one_way(second, np.full(count, slack))
-
-    values = basis.values(np_rng.random((50, 2)))
-    normal = np.cross(*(times(values, each) for each in first), axis=1)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    uu, uv, vv = ((normal * times(values, each)).sum(axis=1) for each in second)
-    low, high = np.linalg.eigvalsh(np.stack([uu, uv, uv, vv], axis=-1).reshape(*uu.shape, 2, 2)).transpose(2, 0, 1)
-    curves_one_way = (low.min(axis=0) >= -slack) | (high.max(axis=0) <= slack)
-    assert curves_one_way[found].all()
-    assert np.count_nonzero(found) > 0.3 * np.count_nonzero(curves_one_way)
 
 
 @pytest.mark.parametrize("measure", Measure)
@@ -280,30 +253,32 @@ def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound
 
 @pytest.mark.parametrize("direction", [None, np.array([0.6, 0.0, -0.8])], ids=["perspective", "orthographic"])
 def test_an_outline_in_view_is_noticed(direction, np_rng):
-    """Where one point and normal of a part face the sensor and others face away; and hardly where none do."""
+    """Where one point and normal of a part face the sensor and others face away; and hardly where none nearly do."""
     count, samples = 400, 60
     centre, half = np_rng.normal(size=(3, count)), 0.3 * np_rng.random((3, count))
     axis, angle = np_rng.normal(size=(3, count)), 0.5 * np_rng.random(count)
     axis /= np.linalg.norm(axis, axis=0)
     eye = np.array([0.0, -4, 1])
     cone = NormalCone(axis, np.sin(angle))
-    found = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone, np.ones(count, dtype=bool))
+    found = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone)
 
     points = centre + half * np_rng.uniform(-1, 1, (samples, 3, count))
     across = np.cross(np_rng.normal(size=(samples, 3, count)), axis[None], axis=1)
     normals = np.cos(angle) * axis + np.sin(angle) * across / np.linalg.norm(across, axis=1, keepdims=True)
     view = points - eye[:, None] if direction is None else np.broadcast_to(direction[:, None], points.shape)
     tilt = np.einsum("sit,uit->sut", normals, view).reshape(-1, count)
-    is_seen = (tilt.min(axis=0) < 0) & (tilt.max(axis=0) > 0)
-    assert found[is_seen].all()
-    assert np.count_nonzero(found) < 1.2 * np.count_nonzero(is_seen)
+    assert found[(tilt.min(axis=0) < 0) & (tilt.max(axis=0) > 0)].all()
+    view_length = 1 if direction is not None else np.linalg.norm(view, axis=1).max(axis=0)
+    margin = np.sin(BESIDE_OUTLINE) * view_length
+    is_near = (tilt.min(axis=0) < margin) & (tilt.max(axis=0) > -margin)
+    assert np.count_nonzero(found) < 1.2 * np.count_nonzero(is_near)
 
 
 def test_only_outlines_are_fine_where_only_they_are_asked_for():
     surface = LimitSurface(torus(8, 6))
     sensor = Sensor(np.array([0.0, -8, 5]), 2e-3)
     fine, at_outline = (
-        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.5, sensor, outline), 64) for outline in (None, sensor)
+        surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1, sensor, outline), 64) for outline in (None, sensor)
     )
     assert len(at_outline.triangles) < len(fine.triangles) / 2
     points, normals = fine.apply(surface.cage.positions)
@@ -356,7 +331,9 @@ def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():
             return np.where(np.abs(uv - 0.5).max(axis=1) < 1e-3, height, 0.0)
 
         criterion = Criterion(Measure.CHORD, 0.05, displacement=DisplacementBound(heights, 1.0))
-        return len(surface.adaptive_sampling(criterion, 64).triangles)
+        # No rate reproduces the bump's steep sides.
+        with without_warnings():
+            return len(surface.adaptive_sampling(criterion, 64).triangles)
 
     assert triangles(1.0) > 2 * triangles(0.0)
 

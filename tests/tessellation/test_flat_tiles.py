@@ -15,10 +15,9 @@ from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.stencil_table import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation import Criterion, Measure
-from mitsuba_subdivision.tessellation.flat_tiles import TileParts, _extents, _normals_to, are_flat
 from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
-from mitsuba_subdivision.tessellation.tile_rates import TileRates
-from mitsuba_subdivision.tessellation.tiles import Tiles
+from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to
+from mitsuba_subdivision.tessellation.tiles import whole_patches
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
@@ -37,7 +36,7 @@ FEW_SURFACES = ["cube", "rook", "loop mixed torus", "doo_sabin mixed torus", "da
 
 
 def tiles_of(surface, scheme, side=None):
-    """Tiles of a surface's irregular classes, as groups, and samples ``(s, t, 3)`` of them, or of their sides."""
+    """Tiles of irregular classes: kinds, control points, and samples ``(s, t, 3)`` of them, or of their sides."""
     patches, points = surface.patches, surface.cage.positions[surface.cage.cut_mesh.vertex]
     if patches.refined is not None:
         patches, points = patches.refined.table, patches.refined.matrix @ points
@@ -49,18 +48,18 @@ def tiles_of(surface, scheme, side=None):
     elements = divided_elements(scheme, [each.signature for each in patches.classes])
     for each, element in zip(patches.classes, elements, strict=True):
         tile, rows = part_of_tile(element, np.eye(element.control_count))
-        if tile is not None:
+        if not tile.is_piece:
             values = points[each.controls]
             samples = np.tensordot(element_stencils(scheme, each.signature, uv)[0], values, axes=(1, 1))
-            yield TileParts(tile, np.einsum("kj,tjd->kdt", rows, values), np.arange(len(values))), samples
+            yield tile, np.einsum("kj,tjd->kdt", rows, values), samples
 
 
 def sizes(samples, axes):
     return np.linalg.norm(np.ptp(samples @ axes.T, axis=0), axis=1)
 
 
-def extents(group, axes):
-    return _extents([group], np.repeat(axes[:, :, None], len(group.owner), axis=2))
+def extents(tile, values, axes):
+    return _extent(tile, values, np.repeat(axes[:, :, None], values.shape[2], axis=2))
 
 
 def assert_tight(found, axes, samples, loose=LOOSE):
@@ -78,7 +77,7 @@ def test_surfaces_are_hardly_smaller_than_their_extents(name, axis_count, np_rng
     surface, axes = surface_named(name), np_rng.normal(size=(axis_count, 3))
     groups = list(tiles_of(surface, surface.scheme))
     if groups:
-        assert_tight([extents(each, axes) for each, _ in groups], axes, [samples for _, samples in groups])
+        assert_tight([extents(*each, axes) for *each, _ in groups], axes, [samples for *_, samples in groups])
 
 
 @pytest.mark.parametrize("name", FEW_SURFACES)
@@ -87,18 +86,17 @@ def test_rules_that_are_not_convex_say_the_same(name, np_rng):
     scheme = copy.copy(surface.scheme)
     scheme.has_convex_rules = False
     groups = list(tiles_of(surface, scheme))
-    found = [extents(each, axes) for each, _ in groups]
-    assert_tight(found, axes, [samples for _, samples in groups], LOOSE_OF_ANY_RULES)
+    found = [extents(*each, axes) for *each, _ in groups]
+    assert_tight(found, axes, [samples for *_, samples in groups], LOOSE_OF_ANY_RULES)
 
 
 @pytest.mark.parametrize("unit", [1e-60, 1e60])
 def test_the_unit_and_the_origin_do_not_matter(unit, np_rng):
     surface, axes = surface_named("cube"), np_rng.normal(size=(1, 3))
-    ((group, samples),) = tiles_of(surface, surface.scheme)
-    values = group.values.copy()
+    ((tile, values, samples),) = tiles_of(surface, surface.scheme)
     # Of eigen-coordinates, the first one is a point.
-    values[: 1 if group.tile.is_self_similar else None] += FAR
-    assert_tight([extents(group._replace(values=unit * values), axes) / unit], axes, [samples])
+    values[: 1 if tile.is_self_similar else None] += FAR
+    assert_tight([extents(tile, unit * values, axes) / unit], axes, [samples])
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -106,9 +104,9 @@ def test_sides_are_hardly_smaller_than_their_hulls(name, np_rng):
     surface, axes = surface_named(name), np_rng.normal(size=(1, 3))
     for side in range(surface.scheme.domain.corner_count):
         groups = list(tiles_of(surface, surface.scheme, side))
-        hulls = [np.einsum("hk,kdt,d->ht", each.tile.side_hulls[side], each.values, axes[0]) for each, _ in groups]
+        hulls = [np.einsum("hk,kdt,d->ht", tile.side_hulls[side], values, axes[0]) for tile, values, _ in groups]
         if groups:
-            assert_tight([np.ptp(each, axis=0) for each in hulls], axes, [samples for _, samples in groups])
+            assert_tight([np.ptp(each, axis=0) for each in hulls], axes, [samples for *_, samples in groups])
 
 
 class Raised(CatmullClark):
@@ -142,10 +140,10 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
         64,
     )
     larger = 0
-    for group, samples in tiles_of(surface, scheme):
+    for tile, values, samples in tiles_of(surface, scheme):
         size = sizes(samples, np.eye(3))
-        tiles = Tiles.whole(np.zeros(len(size)), np.zeros((len(size), 4), dtype=bool))
-        found = are_flat(rates, tiles, [group])
+        tiles = whole_patches(np.zeros(len(size)), np.zeros((len(size), 4), dtype=bool))
+        found = rates.are_flat(tile, tiles, values)
         assert not found[size > rates.criterion.error].any()
         larger += np.count_nonzero(size > rates.criterion.error)
     assert larger

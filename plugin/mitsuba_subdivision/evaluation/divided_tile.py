@@ -3,10 +3,10 @@
 A *tile* is the domain of a patch, or one of the four copies of a tile's domain. Tiles are never turned: their
 parameters run as those of the patch, but for the middle copies of triangles, whose run backwards.
 
-A tile inside one polynomial piece has Bernstein coefficients. One that holds several pieces is divided: into the copies
-that these lie in and, around an extraordinary point, ring by ring: three copies are pieces of a level, and the fourth,
-which holds the point, is divided alike. Tiles of different patches that are divided alike are the same `DividedTile`,
-over control points of their own, and share its bounds.
+A tile inside one polynomial piece has Bernstein coefficients as its control points, and so have its copies. One that
+holds several pieces is divided: into the copies that these lie in and, around an extraordinary point, ring by ring:
+three copies are pieces of a level, and the fourth, which holds the point, is divided alike. Tiles of different patches
+that are divided alike are the same `DividedTile`, over control points of their own, and share its bounds.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from ..mesh.connectivity import IntArray
-from ..mesh.signature import Signature
+from ..mesh.one_ring import one_ring
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .bernstein import regular_bernstein, times
@@ -37,8 +37,8 @@ class DividedTile:
         self,
         scheme: Scheme,
         # The element that it covers; or the patch around an extraordinary point, from any level on, whose
-        # control points here are its eigen-coordinates
-        source: DividedElement | IrregularPatch,
+        # control points here are its eigen-coordinates; None for a piece
+        source: DividedElement | IrregularPatch | None,
         # How a patch around an extraordinary point is turned in the tile: `ParameterDomain.rotation` of this.
         # Elements are not turned.
         turn: int,
@@ -48,19 +48,16 @@ class DividedTile:
     @property
     def control_count(self) -> int:
         """K."""
+        if self._source is None:
+            return len(regular_bernstein(self._scheme).basis.indices)
         if isinstance(self._source, IrregularPatch):
             return len(self._source.basis.eigenvalues)
         return self._source.control_count
 
     @property
-    def signature(self) -> Signature:
-        """Of the one-ring that the control points are of."""
-        return self._source.structure.signature if isinstance(self._source, IrregularPatch) else self._source.signature
-
-    @property
-    def slots(self) -> IntArray | None:
-        """The vertices of the one-ring that are control points; None if all are."""
-        return self._source.structure.slots if isinstance(self._source, IrregularPatch) else None
+    def is_piece(self) -> bool:
+        """Whether it lies inside one polynomial piece."""
+        return self._source is None
 
     @property
     def is_self_similar(self) -> bool:
@@ -68,27 +65,28 @@ class DividedTile:
         return isinstance(self._source, IrregularPatch)
 
     @cached_property
-    def children(self) -> tuple[tuple[DividedTile | None, FloatArray], ...]:
+    def children(self) -> tuple[tuple[DividedTile, FloatArray], ...]:
         """The parts in the copies of the tile, in the order of `ParameterDomain.children`; see `part_of_tile`."""
         scheme, source, turn = self._scheme, self._source, self._turn
+        if source is None:
+            return tuple((self, rows) for rows in regular_bernstein(scheme).basis.halves)
         if isinstance(source, DividedElement):
             return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
         # The same tile, of the next level, and three pieces.
-        found: list[tuple[DividedTile | None, FloatArray]] = [(self, transition(source, 1))]
-        found += [(None, _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
+        found = [(self, transition(source, 1))]
+        found += [(_tile(scheme, None, 0), _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
         return tuple(found[own] for own in _own_copies(scheme.domain, turn))
 
     @cached_property
     def corners(self) -> FloatArray:
         """``(m, K)`` points of the surface at the tile's corners."""
-        at, found = regular_bernstein(self._scheme).basis.corners, []
-        for number, corner in enumerate(at):
+        found, every = [], np.eye(self.control_count)
+        if self.is_piece:
+            return every[regular_bernstein(self._scheme).basis.corners]
+        for number in range(self._scheme.domain.corner_count):
             tile, rows = self.children[number]
-            if tile is self:
-                # The extraordinary point.
-                found.append(np.eye(1, len(rows))[0])
-            else:
-                found.append((rows if tile is None else tile.corners @ rows)[corner if tile is None else number])
+            # Eigen-coordinates begin with the extraordinary point.
+            found.append(every[0] if tile is self else (tile.corners @ rows)[number])
         return np.array(found)
 
     @property
@@ -97,6 +95,25 @@ class DividedTile:
         if isinstance(self._source, IrregularPatch):
             return self._source.basis.vectors
         return np.eye(self.control_count)
+
+    @cached_property
+    def control_faces(self) -> IntArray:
+        """``(4, f)`` rows of `control_points` at the ends of one diagonal, then of the other, of the one-ring's faces.
+
+        Of triangles, two sides. At a dart, where one vertex of the ring is left out as it equals another, so are its
+        faces. None of a piece.
+        """
+        if self._source is None:
+            return np.empty((4, 0), dtype=np.int64)
+        structure = self._source.structure if isinstance(self._source, IrregularPatch) else self._source
+        t = one_ring(structure.signature.smoothed).topology
+        a, b, c, d = t.face_vertices[t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4]
+        vertices = np.stack([a, c, b, d])
+        if isinstance(self._source, IrregularPatch) and self._source.structure.slots is not None:
+            number = np.full(t.vertex_count, -1)
+            number[self._source.structure.slots] = np.arange(len(self._source.structure.slots))
+            vertices = number[vertices]
+        return vertices[:, (vertices >= 0).all(axis=0)]
 
     def one_ring_points(self, points: FloatArray) -> FloatArray:
         """Control points of one-rings ``(n, d, t)``, from those of tiles ``(K, d, t)``: the same but for tips."""
@@ -148,9 +165,11 @@ class DividedTile:
         Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the tiles that are left, with
         their control points.
         """
+        every, m = np.eye(self.control_count), self._scheme.domain.corner_count
+        if self.is_piece:
+            return [every if side is None else every[regular_bernstein(self._scheme).basis.sides[side]]], []
         if not divisions:
-            return [], [(self, np.eye(self.control_count))]
-        basis, m = regular_bernstein(self._scheme).basis, self._scheme.domain.corner_count
+            return [], [(self, every)]
         # Copies of a domain at its corners come first, and share the sides that meet there.
         copies = range(4) if side is None else (side, (side + 1) % m)
         # Around an extraordinary point, one part is left, but along a semi-sharp crease many.
@@ -158,9 +177,6 @@ class DividedTile:
         pieces: list[FloatArray] = []
         rest: list[tuple[DividedTile, FloatArray]] = []
         for tile, rows in (self.children[number] for number in copies):
-            if tile is None:
-                pieces.append(rows if side is None else rows[basis.sides[side]])
-                continue
             inner, left = tile._divided(fewer, side)
             pieces += [own @ rows for own in inner]
             rest += [(each, own @ rows) for each, own in left]
@@ -170,15 +186,14 @@ class DividedTile:
 def part_of_tile(
     element: DividedElement,
     stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the tile
-) -> tuple[DividedTile | None, FloatArray]:
+) -> tuple[DividedTile, FloatArray]:
     """The part of a tile that an element covers; the same tile for equal ones.
 
     Returns
     -------
-    tile : DividedTile or None
-        None for a piece.
+    tile : DividedTile
     rows : (n, K) float64
-        Over the control points of the tile: those of the part or, for a piece, its Bernstein coefficients.
+        Its control points over those of the tile that it is part of.
     """
     scheme, piece = element.scheme, element.piece
     if piece is None:
@@ -187,13 +202,13 @@ def part_of_tile(
             return part_of_tile(child, of_child @ stencils)
         return _tile(scheme, element, 0), stencils
     if piece.patch is None:
-        return None, regular_bernstein(scheme).of_controls @ piece.stencils @ stencils
+        return _tile(scheme, None, 0), regular_bernstein(scheme).of_controls @ piece.stencils @ stencils
     return _tile(scheme, piece.patch, element.turn), piece.coordinates @ stencils
 
 
 # Tiles take some 20 kB each.
 @lru_cache(maxsize=4096)
-def _tile(scheme: Scheme, source: DividedElement | IrregularPatch, turn: int) -> DividedTile:
+def _tile(scheme: Scheme, source: DividedElement | IrregularPatch | None, turn: int) -> DividedTile:
     return DividedTile(scheme, source, turn)
 
 

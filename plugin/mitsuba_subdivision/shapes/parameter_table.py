@@ -291,8 +291,9 @@ PARAMETERS = (
     _limit("max_edge", "largest length of the triangles' edges, in world units"),
     _rate(
         "max_rate",
-        f"Adaptive tessellation: most segments along an edge of the control cage, 1 to {HIGHEST_RATE}. Around "
-        "extraordinary vertices, rings get as small as the limit needs, with at most half as many segments along each",
+        f"Adaptive tessellation: most segments along an edge of the control cage, 1 to {HIGHEST_RATE}; rounded down to "
+        "a power of two. Around extraordinary vertices, rings get as small as the limit needs, with at most half as "
+        "many segments along each",
         64,
     ),
     Parameter(

@@ -515,8 +515,8 @@ class LimitSurface:
         ----------
         criterion : Criterion
         max_rate : int
-            Most segments along an edge of the cage, 1 to 1,024. Around extraordinary vertices, rings get as small as
-            the criterion requires, with half as many segments at most along each.
+            Most segments along an edge of the cage, 1 to 1,024; rounded down to a power of two. Around extraordinary
+            vertices, rings get as small as the criterion requires, with half as many segments at most along each.
         control_points : (n, 3) float64, optional
             Positions for the criterion; by default the cage's.
 

@@ -11,9 +11,8 @@ from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .adaptive_grid import AdaptiveGrid
 from .criterion import Criterion
-from .patch_frames import PatchFrames
+from .patch_frames import UNIT, PatchFrames
 from .tile_choice import choose_tiles
-from .tiles import UNIT
 from .uniform import checked_rate
 from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
 from .vertex_table import VertexTable
@@ -64,7 +63,7 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     refined = patches.refined
     table = patches if refined is None else refined.table
     tile, parameters = grid.vertex_parameters()
-    corner = grid.tiles.corner[tile]
+    corner = grid.tiles["corner"][tile]
     # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
     patch_class, patch, _ = table.patch_at(corner if refined is None else table.topology.face_offsets[corner])
     uv = parameters / UNIT

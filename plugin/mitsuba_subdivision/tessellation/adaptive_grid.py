@@ -1,4 +1,9 @@
-"""Numbering, locations and triangles of an adaptive tessellation."""
+"""Numbering, locations and triangles of an adaptive tessellation.
+
+Tiles of different sizes and rates meet along lines: edges of elements, spokes of polygons, and lines inside patches. A
+side of a tile has a power of two of segments, so that of two rows of samples on a line one contains the other. Each
+tile has all samples that lie on its sides, whichever tiles they come from: there are no cracks.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +17,22 @@ from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.ragged import chunks_of
 from ..schemes.domain import FloatArray
-from .patch_frames import PatchFrames
-from .spans import Spans, SpanVertices, cut_into_spans, first_of_each
+from .patch_frames import EDGE, UNIT, PatchFrames
 from .stitching import SideSamples, inner_counts, inner_steps, stitched
-from .tile_sides import at_vertices
-from .tiles import UNIT, Tiles
+from .tiles import Tiles, corner_points, sizes
+
+# Bits of positions along lines, and of numbers.
+BITS, MOST_BITS = EDGE.bit_length(), 63
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveGrid:
-    """An adaptive tessellation: vertices where spans begin come first, then those inside spans, then those in tiles."""
+    """An adaptive tessellation: vertices on the sides of tiles come first, then those inside tiles."""
 
     frames: PatchFrames
-    spans: Spans  # All sides of the tiles
+    tiles: Tiles  # In the order of the elements
+    side: IndexArray  # (n,) int32: ``m`` times the tile, plus the corner at which its side begins, of each sample
+    along: FloatArray  # (n,) float64: position of each sample along its side, in [0, 1): exact, as a dyadic fraction
     topology: Topology  # Of the elements; its edges and vertices identify the tessellation's vertices
     keeps_corner: NDArray[np.bool_] | None  # (t, m) bool or None: as for `stitched`
 
@@ -35,22 +43,18 @@ class AdaptiveGrid:
         is_pair = (t.vertex_face_count <= 2) & ~t.is_border_vertex
         # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and both
         # would have the same triangle.
-        keeps = at_vertices(is_pair[t.face_vertices], tiles, frames) if is_pair.any() else None
-        has_more = (tiles.depth == 0) & frames.meets_twice[t.face[tiles.corner]]
+        keeps = _at_vertices(is_pair, tiles, frames) if is_pair.any() else None
+        has_more = (tiles["depth"] == 0) & frames.meets_twice[t.face[tiles["corner"]]]
         if keeps is not None:
             has_more |= keeps.any(axis=1)
         if has_more.any():
             # Enough segments that no inner edge joins two points of the sides.
             least = np.where(has_more, 3 if m == 3 else 2, 1).astype(np.int32)
-            tiles = replace(tiles, rates=np.maximum(tiles.rates, least[:, None]))
+            tiles = tiles.copy()
+            tiles["rates"] = np.maximum(tiles["rates"], least[:, None])
         else:
             keeps = None
-        return cls(frames, cut_into_spans(tiles, frames), t, keeps)
-
-    @property
-    def tiles(self) -> Tiles:
-        """The tiles, in the order of the elements."""
-        return self.spans.tiles
+        return cls(frames, tiles, *_samples_on_sides(tiles, frames), t, keeps)
 
     def cut(self, topology: Topology) -> AdaptiveGrid:
         """See `Grid.cut`."""
@@ -66,66 +70,63 @@ class AdaptiveGrid:
     def _corner_count(self) -> int:
         return self.frames.domain.corner_count
 
+    def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
+        """Numbers of the samples on sides, and the first of each number; of the same points, as `PatchFrames.names`."""
+        name, at = np.empty(len(self.side), dtype=np.int64), np.empty((2, len(self.side)), dtype=np.int32)
+        for block in chunks_of(len(self.side)):
+            corner = self.tiles["corner"][self.side[block] // self._corner_count]
+            points = self._on_sides(self.side[block], self.along[block]).astype(np.int32)
+            name[block], at[:, block] = self.frames.names(corner, points, edge, vertex)
+        # Most tessellations use few bits of the positions.
+        used = int(np.bitwise_or.reduce(at, axis=None)) | EDGE
+        shift = (used & -used).bit_length() - 1
+        x, y = at >> shift
+        bits = BITS - shift
+        return _ranked(_joined(name, x.astype(np.int64) << bits | y, 2 * bits))
+
     @cached_property
-    def _numbers(self) -> SpanVertices:
-        return self.spans.numbered(self.topology.edge, self.topology.face_vertices)
+    def _numbers(self) -> tuple[IndexArray, IndexArray]:
+        return self._numbered(self.topology.edge, self.topology.face_vertices)
 
     @property
     def _inner_counts(self) -> IntArray:
-        return inner_counts(self.tiles.rates, self._corner_count)
+        return inner_counts(self.tiles["rates"], self._corner_count)
 
     @cached_property
     def vertex_count(self) -> int:
         """Vertices of the tessellation."""
-        return self._numbers.vertex_count + int(self._inner_counts.sum())
+        return len(self._numbers[1]) + int(self._inner_counts.sum())
 
     def copies(self) -> IntArray:
         """`VertexTable.copies`: vertices on the second side of each crease, and those on the first."""
-        own, shared = self._numbers, self.spans.numbered(self.frames.edge, self.frames.vertex)
-        if shared.vertex_count == own.vertex_count:
-            return np.empty((2, 0), dtype=np.int64)
-        # The first of each set of copies.
-        at = shared.point[own.of_point]
-        first_point = first_of_each(at)[at]
-        at = self.spans.at[own.of_span]
-        lengths, first = self.spans.rate[own.of_span] - 1, own.first_inside
-        inside = [ragged.ranges(begins, lengths) for begins in (first, first[first_of_each(at)[at]])]
-        pairs = np.stack([np.append(np.arange(len(first_point)), inside[0]), np.append(first_point, inside[1])])
+        shared, first_of_shared = self._numbered(self.frames.edge, self.frames.vertex)
+        number, first = self._numbers
+        original = number[first_of_shared][shared[first]]
+        pairs = np.stack([np.arange(len(first)), original])
         return pairs[:, pairs[0] != pairs[1]]
 
     def _sample_vertices(self) -> IndexArray:
         """Vertices of all samples, those along sides and then those inside tiles."""
-        spans, numbers = self.spans, self._numbers
-        inside = np.arange(numbers.vertex_count, self.vertex_count, dtype=np.int32)
-        found, begin = np.empty(int(spans.rate.sum(dtype=np.int64)) + len(inside), dtype=np.int32), 0
-        for block in chunks_of(len(spans.rate)):
-            rate = spans.rate[block]
-            step, span = ragged.index_in_row(rate), block.start + np.repeat(np.arange(len(rate)), rate)
-            own = slice(begin, begin + len(step))
-            along = numbers.first_inside[numbers.span[span]] + np.where(
-                spans.is_backward[span], spans.rate[span] - 1 - step, step - 1
-            )
-            found[own] = np.where(step == 0, numbers.point[span], along)
-            begin += len(step)
-        found[begin:] = inside
-        return found
+        number, first = self._numbers
+        return np.concatenate([number, np.arange(len(first), self.vertex_count, dtype=np.int32)])
 
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
-        found, vertices = self._sample_triangles(), self._sample_vertices()
-        for block in chunks_of(len(found)):
-            found[block] = vertices[found[block]]
-        return found.view(np.uint32)
+        return self._sample_vertices().take(self._sample_triangles()).view(np.uint32)
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` element of each triangle."""
-        return self.frames.topology.face[self.tiles.corner][self._tile()].astype(np.uint32)
+        return self.frames.topology.face[self.tiles["corner"]][self._tile()].astype(np.uint32)
+
+    @cached_property
+    def _side_counts(self) -> IntArray:
+        """``(t, m)`` segments on each side of each tile."""
+        m = self._corner_count
+        return np.bincount(self.side, minlength=m * len(self.tiles)).astype(np.int32).reshape(-1, m)
 
     def _triangle_counts(self) -> IntArray:
         """``(t,)`` triangles of each tile, by Euler's formula."""
-        begins = np.arange(0, len(self.tiles) * self._corner_count, self._corner_count, dtype=np.int32)
-        along_sides = np.add.reduceat(self.spans.rate, np.searchsorted(self.spans.side, begins), dtype=np.int32)
-        found: IntArray = along_sides + 2 * self._inner_counts - 2
+        found: IntArray = self._side_counts.sum(axis=1) + 2 * self._inner_counts - 2
         return found
 
     def _tile(self) -> IndexArray:
@@ -137,38 +138,41 @@ class AdaptiveGrid:
 
         Made at each call: few ask for them more than once, and they would take memory as long as the grid lives.
         """
-        spans, m = self.spans, self._corner_count
-        inner_begin, begin = (
-            ragged.offsets(counts, np.int32) for counts in (self._inner_counts, self._triangle_counts())
-        )
+        m = self._corner_count
+        on_sides = ragged.offsets(self._side_counts.sum(axis=1))
+        inside, begin = (ragged.offsets(counts) for counts in (self._inner_counts, self._triangle_counts()))
         found = np.empty((int(begin[-1]), 3), dtype=np.int32)
-        side_count, side_begin = int(spans.rate.sum(dtype=np.int64)), 0
         for own in chunks_of(len(self.tiles), m):
-            of_tiles = slice(*np.searchsorted(spans.side, np.array([m * own.start, m * own.stop], dtype=np.int32)))
-            span, along = spans.samples(of_tiles)
-            counts = np.bincount(spans.side[span] - m * own.start, minlength=m * (own.stop - own.start))
-            sides = SideSamples(ragged.offsets(counts), spans.along_sides(span, along), m)
+            along = self.along[on_sides[own.start] : on_sides[own.stop]]
             keeps = None if self.keeps_corner is None else self.keeps_corner[own]
-            triangles = stitched(self.tiles.rates[own], sides, keeps)
-            is_inner = triangles >= len(span)
-            triangles += np.where(is_inner, side_count - len(span) + inner_begin[own.start], side_begin).astype(
-                np.int32
-            )
+            triangles = stitched(self.tiles["rates"][own], SideSamples(self._side_counts[own], along), keeps)
+            is_inner = triangles >= len(along)
+            first_inner = len(self.side) - len(along) + inside[own.start]
+            triangles += np.where(is_inner, first_inner, on_sides[own.start]).astype(np.int32)
             found[begin[own.start] : begin[own.stop]] = triangles
-            side_begin += len(span)
+        return found
+
+    def _on_sides(self, side: IntArray, along: FloatArray) -> FloatArray:
+        """``(2, n)`` points on sides of tiles, in their patches, in parts of `UNIT`."""
+        found, m = np.empty((2, len(side))), self._corner_count
+        for block in chunks_of(len(side)):
+            tile, corner = np.divmod(side[block], m)
+            corners, own = corner_points(self.tiles[tile], self.frames.domain), np.arange(len(tile))
+            begin, end = corners[:, own, corner], corners[:, own, (corner + 1) % m]
+            found[:, block] = begin + (end - begin) * along[block]
         return found
 
     def _inner_parameters(self) -> tuple[IndexArray, FloatArray]:
-        """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in units of 1 / `UNIT`."""
+        """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in parts of `UNIT`."""
         tile = np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._inner_counts)
-        steps = inner_steps(self.tiles.rates, self._corner_count) / self.tiles.rates[tile]
+        steps = inner_steps(self.tiles["rates"], self._corner_count) / self.tiles["rates"][tile]
         return tile, self._in_patch(tile, steps.T)
 
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
-        """``(2, n)`` parameters in patches, in units of 1 / `UNIT`, from parameters in tiles."""
-        found = np.where(self.tiles.is_flipped[tile], 1 - uv, uv)
-        found += self.tiles.origin[tile].T
-        found *= self.tiles.size[tile]
+        """``(2, n)`` parameters in patches, in parts of `UNIT`, from parameters in tiles."""
+        found = np.where(self.tiles["is_flipped"][tile], 1 - uv, uv)
+        found += self.tiles["origin"][tile].T
+        found *= sizes(self.tiles)[tile]
         return found
 
     def vertex_parameters(self) -> tuple[IndexArray, FloatArray]:
@@ -180,19 +184,11 @@ class AdaptiveGrid:
         parameters : (2, n) float64
             In the tile's patch, in parts of `UNIT`.
         """
-        numbers, spans = self._numbers, self.spans
-        inside = spans.rate[numbers.of_span] - 1
-        span = np.repeat(numbers.of_span, inside)
-        step = ragged.index_in_row(inside) + 1
-        along = np.where(spans.is_backward[span], spans.rate[span] - step, step) / spans.rate[span]
-        del inside, step
-        along = np.concatenate([np.zeros(len(numbers.of_point)), along])
-        of_lines = np.concatenate([numbers.of_point, span])
+        _, first = self._numbers
         tile, parameters = self._inner_parameters()
-        return (
-            np.concatenate([spans.side[of_lines] // self._corner_count, tile]),
-            np.concatenate([self.spans.along(of_lines, along), parameters], axis=1),
-        )
+        on_sides = self._on_sides(self.side[first], self.along[first])
+        tile = np.concatenate([self.side[first] // self._corner_count, tile])
+        return tile, np.concatenate([on_sides, parameters], axis=1)
 
     def _seen(self, tile: IntArray, turn: IntArray, parameters: FloatArray) -> FloatArray:
         """``(n, 2)`` parameters in elements, seen from the corner after so many turns; of patches that are whole."""
@@ -202,16 +198,16 @@ class AdaptiveGrid:
             at = np.flatnonzero(turn == corner)
             if len(at):
                 uv[at] = domain.rotation(corner).inverse()(uv[at])
-        return uv * self.frames.scale[self.frames.topology.face[self.tiles.corner[tile]]][:, None]
+        return uv * self.frames.scale[self.frames.topology.face[self.tiles["corner"][tile]]][:, None]
 
     def _nearest_corner(self, tile: IntArray, parameters: FloatArray) -> tuple[IntArray, IntArray]:
         """The turn to the nearest corner of each patch, and the half-edge that begins there."""
         t, domain = self.frames.topology, self.frames.domain
-        is_whole = self.frames.is_whole[t.face[self.tiles.corner[tile]]]
+        is_whole = self.frames.is_whole[t.face[self.tiles["corner"][tile]]]
         corners = domain.corners * UNIT
         far = [np.maximum(*np.abs(parameters - corner[:, None])) for corner in corners]
         turn = np.where(is_whole, np.argmin(far, axis=0), 0)
-        corner = self.tiles.corner[tile]
+        corner = self.tiles["corner"][tile]
         for step in range(1, domain.corner_count):
             corner = np.where(turn >= step, t.next[corner], corner)
         return turn, corner
@@ -230,8 +226,7 @@ class AdaptiveGrid:
         tile, triangles = self._tile(), self._sample_triangles()
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
-        span, along = self.spans.samples()
-        samples = np.concatenate([self.spans.along(span, along), self._inner_parameters()[1]], axis=1)
+        samples = np.concatenate([self._on_sides(self.side, self.along), self._inner_parameters()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
@@ -240,3 +235,77 @@ class AdaptiveGrid:
         tile, parameters = self.vertex_parameters()
         turn, corner = self._nearest_corner(tile, parameters)
         return corner.astype(np.int64), self._seen(tile, turn, parameters)
+
+
+def _at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) -> NDArray[np.bool_]:
+    """``(t, m)`` whether corners of tiles lie at vertices that are marked."""
+    t, m = frames.topology, frames.domain.corner_count
+    points = corner_points(tiles, frames.domain).reshape(2, -1)
+    name, _ = frames.names(np.repeat(tiles["corner"], m), points, t.edge, t.face_vertices)
+    is_vertex = name < t.vertex_count
+    is_vertex[is_vertex] = marked[name[is_vertex]]
+    return is_vertex.reshape(-1, m)
+
+
+def _samples_on_sides(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, FloatArray]:
+    """Samples on the sides of all tiles: `AdaptiveGrid.side` and `AdaptiveGrid.along`."""
+    keys, way = _lines(tiles, frames)
+    wanted = np.maximum(
+        tiles["rates"][:, [0, 1, 0, 1] if frames.domain.corner_count == 4 else [0, 0, 0]], tiles["sides"]
+    )
+    counts = 1 << np.ceil(np.log2(wanted.ravel())).astype(np.int32)
+    points = ragged.index_in_row(counts + 1)
+    points *= np.repeat(way // counts, counts + 1)
+    points += np.repeat(keys, counts + 1)
+    points.sort()
+    points = points[np.append(True, points[1:] != points[:-1])]
+    # Where the samples of each side begin and end in those of its line.
+    begin, end = (np.searchsorted(points, each).astype(np.int32) for each in (keys, keys + way))
+    counts = np.abs(end - begin)
+    side = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    along = ragged.index_in_row(counts) * np.repeat(np.sign(way), counts)
+    along += np.repeat(begin, counts)
+    along = points[along]
+    along -= np.repeat(keys, counts)
+    return side, along / np.repeat(way, counts)
+
+
+def _lines(tiles: Tiles, frames: PatchFrames) -> tuple[IntArray, IndexArray]:
+    """Where the sides of tiles begin, in the order of all lines and positions along these, and how far they lead."""
+    m = frames.domain.corner_count
+    name = np.empty(m * len(tiles), dtype=np.int64)
+    level, begin, way = np.empty((3, m * len(tiles)), dtype=np.int32)
+    for block in chunks_of(len(tiles), m):
+        corners = corner_points(tiles[block], frames.domain)
+        quarter = (np.roll(corners, -1, axis=2) - corners) // 4
+        corner, positions = np.repeat(tiles["corner"][block], m), []
+        axis = np.tile([0, 1, 2] if m == 3 else [0, 1, 0, 1], len(corners[0]))
+        for steps in (1, 2):
+            names, (x, y) = frames.names(corner, (corners + steps * quarter).reshape(2, -1), frames.edge, frames.vertex)
+            # Lines inside are along u, along v or, in triangles, along the diagonal. Others have a name of their own.
+            axis = np.where(names >= frames.first_inside, axis, 0)
+            positions.append(np.where(axis == 0, x, y))
+        own = slice(m * block.start, m * block.stop)
+        name[own], way[own] = 3 * names + axis, 4 * (positions[1] - positions[0])
+        begin[own] = 2 * positions[0] - positions[1]
+        level[own] = np.select([axis == 0, axis == 2], [y, x], x + y if m == 3 else x)
+    line = _ranked(_joined(name, level, BITS))[0].astype(np.int64)
+    line <<= BITS
+    line |= begin
+    return line, way
+
+
+def _ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
+    """Number integers from 0 on, in their order and equal ones alike; and the first index of each number."""
+    order, begins = ragged.sorted_order(keys)
+    number = np.empty(len(keys), dtype=np.int32)
+    number[order] = np.cumsum(begins, dtype=np.int32) - 1
+    return number, order[begins]
+
+
+def _joined(high: IntArray, low: IntArray, bits: int) -> NDArray[np.int64]:
+    """``(n,)`` integers ordered and equal as pairs are; `low` has `bits` bits."""
+    if int(high.max(initial=0)).bit_length() + bits > MOST_BITS:
+        # There are fewer of them than numbers of 31 bits.
+        high, low, bits = _ranked(high)[0], _ranked(low)[0], 31
+    return high.astype(np.int64) << bits | low

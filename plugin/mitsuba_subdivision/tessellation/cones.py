@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..schemes.domain import FloatArray
 
@@ -80,18 +79,3 @@ class NormalCone:
     def along(self, vectors: FloatArray, longest: FloatArray) -> FloatArray:
         """``(.., t)`` largest extent of vectors ``(b, .., 3, t)`` along a normal, with their largest squared length."""
         return np.abs(dot(vectors, self.axis)).max(axis=0) + self.sine * np.sqrt(longest)
-
-    def curves_one_way(self, second: list[FloatArray], slack: FloatArray) -> NDArray[np.bool_]:
-        """``(.., t)`` whether second derivatives ``(b, .., 3, t)`` lead to the same side of every tangent plane.
-
-        Along unit vectors of parameters, they may lead to the other side by ``slack``, ``(.., t)``.
-        """
-        uu, uv, vv = second
-        along_u, along_v = dot(uu, self.axis), dot(vv, self.axis)
-        side = np.sign(along_u.sum(axis=0))
-        cosine, least = np.sqrt(1 - self.sine**2), []
-        for vectors, along in ((uu, along_u), (vv, along_v)):
-            across = np.sqrt(np.maximum(0, dot(vectors, vectors) - along**2))
-            least.append((cosine * side * along - self.sine * across).min(axis=0) + slack)
-        mixed = self.along(uv, dot(uv, uv).max(axis=0))
-        return (least[0] > 0) & (least[1] > 0) & (least[0] * least[1] > mixed**2)

@@ -25,7 +25,7 @@ TRIANGLE_ERROR = 0.227
 # in shadows: at 64 tenths of a pixel, a teapot's handle ended elsewhere.
 COARSE = 8.0
 # Normals this nearly perpendicular to the view are beside a silhouette: coarse triangles there might stick out beyond
-# it, except for triangles of convex parts, which lie inside.
+# it.
 BESIDE_OUTLINE = np.radians(4)
 
 # In place of zero, where it would divide. Not NumPy's finfo: where Dr.Jit computes without subnormals, NumPy before 2.3
@@ -62,9 +62,7 @@ class Sensor:
         eye = self.eye[:, None]
         return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=-2)
 
-    def may_see_outline(
-        self, lower: FloatArray, upper: FloatArray, cone: NormalCone, is_convex: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
         """``(.., t)`` whether a normal in a cone may be nearly perpendicular to the view of a point in a box."""
         if self.direction is not None:
             view, spread = self.direction[:, None], np.zeros(lower[..., 0, :].shape)
@@ -77,8 +75,7 @@ class Sensor:
                     np.where(radius < distance, np.arcsin(radius / distance), np.pi),
                 )
         tilt = np.arcsin(np.clip(np.abs(dot(cone.axis, view)), 0, 1))
-        beside = np.where(is_convex, 0, BESIDE_OUTLINE)
-        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + beside) | (cone.sine >= 1)
+        return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + BESIDE_OUTLINE) | (cone.sine >= 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,38 +113,14 @@ class Criterion:
         if not self.error >= 0:
             raise ValueError(f"an error of {self.error}; expected a number from 0 on")
 
-    @property
-    def is_everywhere_alike(self) -> bool:
-        """Whether the limit depends neither on positions nor on normals."""
-        return self.sensor is None and self.outline is None
-
-    def limit(
-        self,
-        lower: FloatArray,
-        upper: FloatArray,
-        cone: NormalCone,
-        second: list[FloatArray] | None = None,
-        parts_across: int = 1,
-    ) -> FloatArray:
-        """``(.., t)`` the limit in parts of the surface in boxes ``(.., 3, t)``, with normals in cones.
-
-        Parameters
-        ----------
-        second : three (b, .., 3, t) float, optional
-            Bernstein coefficients of the derivatives by uu, uv and vv, if these are known.
-        parts_across : int
-            Number of parts side by side in a tile.
-        """
+    def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
+        """``(.., t)`` the limit in parts of the surface in boxes ``(.., 3, t)``, with normals in cones."""
         found = np.full(cone.sine.shape, float(self.error))
         if self.sensor is not None:
             extent = 0.0 if self.displacement is None else self.displacement.extent
             found *= self.sensor.pixel_size(lower - extent, upper + extent)
         if self.outline is not None:
-            is_convex = np.zeros(cone.sine.shape, dtype=bool)
-            if second is not None:
-                # If the surface curves the other way, triangles across a tile stick out within the limit.
-                is_convex = cone.curves_one_way(second, found / (2 * SQUARE_ERROR * parts_across**2))
-            found[~self.outline.may_see_outline(lower, upper, cone, is_convex)] *= COARSE
+            found[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
         return found
 
     def form(

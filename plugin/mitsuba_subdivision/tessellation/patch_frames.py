@@ -12,6 +12,11 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 
+# Parameters of patches in integers are multiples of this part of a patch: corners of tiles are divided by 16 at most.
+UNIT = 1 << 28
+# An edge of an element, along which a patch of a polygon reaches half way, in the same parts.
+EDGE = 2 * UNIT
+
 
 @dataclass(frozen=True, eq=False)
 class PatchFrames:
@@ -54,6 +59,64 @@ class PatchFrames:
         found[t.face[one[is_again]]] = True
         found[t.face[twin[is_again][twin[is_again] >= 0]]] = True
         return found & self.is_whole
+
+    def names(
+        self,
+        corner: IntArray,  # (n,) the corners that patches begin at
+        points: IndexArray,  # (2, n) int32: of these, in parts of `UNIT`
+        edge: IndexArray,  # (n_h,) int32: numbers of edges and vertices, as `edge` and `vertex`
+        vertex: IndexArray,
+    ) -> tuple[NDArray[np.int64], IndexArray]:
+        """Names of points: equal where points are the same, and lie on edges and vertices of equal numbers.
+
+        A point lies inside a patch, on an edge of its element, at the end of one, or on a spoke of a polygon, which
+        joins the middle of an edge to the centre: two patches at corners of the polygon meet there.
+
+        Returns
+        -------
+        name : (n,) int64
+            Of the vertex, edge, spoke, centre or inside; the last ones from `first_inside` on.
+        at : (2, n) int32
+            The position inside or, first, along the edge or spoke, in parts of `UNIT`.
+        """
+        t, (u, v), at = self.topology, points, points.copy()
+        on_edge = self.first_inside - t.face_count - 2 * t.half_edge_count
+        on_spoke, at_centre = on_edge + t.half_edge_count, on_edge + 2 * t.half_edge_count
+        name = self.first_inside + corner.astype(np.int64)
+        if self.domain.corner_count == 3:
+            sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
+        else:
+            sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
+        is_whole, half_edge, found = self.is_whole[t.face[corner]], corner, []
+        for distance, along in sides:
+            on = np.flatnonzero((distance == 0) & is_whole)
+            found.append((on, half_edge[on], 2 * along[on]))
+            half_edge = t.next[half_edge]
+        others = np.flatnonzero(~is_whole)
+        if len(others):
+            u, v, own, before = u[others], v[others], corner[others], t.prev[corner[others]]
+            for beyond, along, spoke in ((u, v, own), (v, u, before)):
+                on = np.flatnonzero(beyond == UNIT)
+                name[others[on]], at[0, others[on]], at[1, others[on]] = on_spoke + spoke[on], along[on], 0
+            on = np.flatnonzero((u == UNIT) & (v == UNIT))
+            name[others[on]], at[:, others[on]] = at_centre + t.face[own[on]], 0
+            for distance, position, line in ((v, u, own), (u, EDGE - v, before)):
+                on = np.flatnonzero(distance == 0)
+                found.append((others[on], line[on], position[on]))
+        for on, half_edge, position in found:
+            name[on], at[1, on] = on_edge + edge[half_edge], 0
+            at[0, on] = np.where(self.is_backward[half_edge], EDGE - position, position)
+        # The end of each edge is the beginning of the next one.
+        for on, half_edge, position in found:
+            begins = np.flatnonzero(position == 0)
+            name[on[begins]], at[0, on[begins]] = vertex[half_edge[begins]], 0
+        return name, at
+
+    @cached_property
+    def first_inside(self) -> int:
+        """Names of points inside patches begin here, after those of vertices, edges, spokes and centres."""
+        t = self.topology
+        return max(self.vertex.max(initial=-1), t.vertex_count - 1) + 1 + 2 * t.half_edge_count + t.face_count
 
     @classmethod
     def of(

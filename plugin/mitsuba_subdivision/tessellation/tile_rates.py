@@ -1,35 +1,36 @@
-"""Rates of tiles in one piece, by bounds of what a criterion limits."""
+"""Whether tiles are flat, and how many segments they need, by bounds of what a criterion limits."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from math import isqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
+from ..evaluation.divided_tile import DividedTile
 from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .cones import NormalCone, TangentCone, cross, dot
 from .criterion import TINY, Criterion, Measure, least_product, rounded_up
-from .memory import require_memory_for_triangles
-from .patch_frames import PatchFrames
-from .tiles import UNIT, Tiles
+from .patch_frames import UNIT, PatchFrames
+from .tiles import Tiles, sizes
 
-# Parts of tiles are looked at so many at once, whose derivatives stay in a core's cache.
-PARTS_AT_ONCE = 1 << 11
-# Tiles of fewer cells are not divided: four parts have at least so many.
-FEWEST_DIVIDED = 5
 # Samples of a displacement along each side of a tile.
 HEIGHT_SAMPLES = 9
+# Relative area of triangles that rounding may flip.
+FOLDED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class TileRates:
-    """Rates of tiles for a criterion."""
+    """Rates of tiles for a criterion.
+
+    Tiles are asked about kind by kind, with their control points: ``(K, 3, t)`` float64, Bernstein coefficients of
+    pieces.
+    """
 
     scheme: Scheme
     frames: PatchFrames  # Of the patches that the tiles are parts of
@@ -44,111 +45,85 @@ class TileRates:
     def domain(self) -> ParameterDomain:
         return self.scheme.domain
 
-    def limit(self, tiles: Tiles, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(t,)`` `Criterion.limit`, less what a displacement takes of it."""
-        limit = self.criterion.limit(lower, upper, cone)
-        if self.criterion.displacement is not None and self.criterion.measure is Measure.CHORD:
-            limit = limit - np.ptp(self._heights(tiles), axis=(0, 1))
-        return limit
-
-    def are_within(
-        self,
-        tiles: Tiles,
-        # (3, t) float64: boxes of the hulls
-        lower: FloatArray,
-        upper: FloatArray,
-        axis: FloatArray,  # (3, t) float64: across which surfaces are hoped to be flat; unit vectors, or zero
-        extent: FloatArray,  # (t,) float64: of the hulls, along these axes
-    ) -> NDArray[np.bool_]:
-        """``(t,)`` whether two triangles approximate tiles with these hulls within the tolerance."""
-        limit = self.limit(tiles, lower, upper, NormalCone.of_any(len(tiles)))
-        size = np.linalg.norm(upper - lower, axis=0)
-        if self.criterion.measure is Measure.EDGE:
-            return size <= limit
-        return np.where(axis.any(axis=0), extent, size) <= limit
-
-    def rated(
-        self,
-        tiles: Tiles,
-        coefficients: FloatArray,  # (b, 3, t) float64: Bernstein coefficients over the tiles
-        triangle_count: int,  # Of all tiles before
-    ) -> list[Tiles]:
-        """Choose the rates of tiles in pieces, and divide those in four where that saves triangles.
-
-        Rates are those that the limit needs, and may exceed the highest; see `clipped`.
-
-        Raises MemoryError if there would be too many triangles.
-        """
-        axis = axis_across(coefficients[self.basis.corners])
-        extent = np.ptp(dot(coefficients, axis), axis=0)
-        is_flat = self.are_within(tiles, coefficients.min(axis=0), coefficients.max(axis=0), axis, extent)
-        if self.criterion.measure is Measure.CHORD:
-            # A tile that is folded in its plane reaches beyond its corners, and no triangle covers that.
-            is_flat[is_flat] = self.normal_sines(coefficients[..., is_flat], axis[:, is_flat]) < 1
-        found = [replace(tiles[is_flat], sides=self._along_sides(tiles[is_flat], coefficients[..., is_flat]))]
-        tiles, coefficients = tiles[~is_flat], coefficients[..., ~is_flat]
-        forms = self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
-        rates = self._rates(forms)
-        # Divided tiles have fewer triangles.
-        require_memory_for_triangles(triangle_count + int(self._costs(tiles, rates).sum()))
-        # Bounds of parts are tighter than those of the whole. For the same limit a part that is half as large needs
-        # half as many segments: its form is a quarter.
-        is_small = (rates.max(axis=1) > 1) & (self._cells(tiles, rates) < FEWEST_DIVIDED)
-        small = tiles[is_small], coefficients[..., is_small]
-        rates[is_small] = self._rates(
-            4 * self._forms(small[1], _parts(self.basis, 1)) + self._form_of_displacement(*small)
-        )
-        while len(tiles):
-            tried = np.flatnonzero(self._cells(tiles, rates) >= FEWEST_DIVIDED)
-            of_parts = self._forms(coefficients[..., tried], _parts(self.basis, 2))
-            of_parts += self._form_of_displacement(tiles[tried], coefficients[..., tried]) / 16
-            rates[tried] = self._rates(16 * of_parts)
-            of_children = 4 * of_parts.reshape(4, 4, *of_parts.shape[1:])
-            # All first children, all second ones and so on.
-            children = Tiles.joined([tiles[tried].child(number, self.domain) for number in range(4)])
-            child_rates = self._rates(of_children.swapaxes(0, 1).swapaxes(1, 2).reshape(4, 3, -1))
-            cost = self._costs(children, child_rates).reshape(4, -1).sum(axis=0)
-            is_better = cost < self._costs(tiles[tried], rates[tried])
-            keeps = np.full(len(tiles), True)
-            keeps[tried[is_better]] = False
-            kept = replace(tiles[keeps], rates=rates[keeps])
-            kept = replace(kept, sides=self._along_sides(kept, coefficients[..., keeps]))
-            found.append(self._without_pairs(kept))
-            divided = coefficients[..., tried[is_better]]
-            tiles, rates = children[np.tile(is_better, 4)], child_rates[np.tile(is_better, 4)]
-            coefficients = np.concatenate([times(half, divided) for half in self.basis.halves], axis=2)
-            if self.criterion.displacement is not None:
-                # Parts show more of a displacement than the whole did.
-                rates = self._rates(
-                    self._forms(coefficients, _parts(self.basis, 0)) + self._form_of_displacement(tiles, coefficients)
-                )
-        return found
-
-    def normal_sines(self, coefficients: FloatArray, axis: FloatArray) -> FloatArray:
-        """Sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles or their pieces.
-
-        One where normals are not known to lead to one side of the planes across the axes.
-        """
-        found = np.empty(axis.shape[1])
-        for begin in range(0, len(found), PARTS_AT_ONCE):
-            tiles = slice(begin, begin + PARTS_AT_ONCE)
-            own = np.ascontiguousarray(coefficients[..., tiles])
-            tangents = [TangentCone.of(times(derivative, own)) for derivative in self.basis.derivatives]
-            found[tiles] = NormalCone.of(*tangents).around(axis[:, tiles]).sine
-        return found
-
     def most(self, tiles: Tiles) -> IntArray:
-        """``(t,)`` the highest rates that tiles may have."""
-        return np.maximum(1, self.max_rate >> tiles.halvings.astype(np.int64))
+        """``(t,)`` the highest rates that tiles may have: powers of two, as sides have."""
+        found: IntArray = np.maximum(1, (1 << self.max_rate.bit_length() - 1) >> tiles["halvings"])
+        return found
 
     def clipped(self, tiles: Tiles) -> Tiles:
         """The tiles, with no higher rates than these."""
-        most = self.most(tiles)[:, None]
-        return replace(
-            tiles,
-            rates=np.minimum(tiles.rates, most).astype(np.int32),
-            sides=np.minimum(tiles.sides, most).astype(np.int16),
-        )
+        found, most = tiles.copy(), self.most(tiles)[:, None]
+        found["rates"], found["sides"] = np.minimum(tiles["rates"], most), np.minimum(tiles["sides"], most)
+        return found
+
+    def triangle_counts(self, tiles: Tiles) -> IntArray:
+        """``(t,)`` triangles of tiles with their rates, clipped; but for those that other rates next door add."""
+        cells: IntArray = np.minimum(tiles["rates"], self.most(tiles)[:, None]).prod(axis=1, dtype=np.int64)
+        return cells * (self.domain.corner_count - 2)
+
+    def are_flat(self, kind: DividedTile, tiles: Tiles, values: FloatArray) -> NDArray[np.bool_]:
+        """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along features."""
+        corners, ring = times(kind.corners, values), kind.one_ring_points(values)
+        lower, upper = ring.min(axis=0), ring.max(axis=0)
+        limit = self.criterion.limit(lower, upper, NormalCone.of_any(len(tiles)))
+        if self.criterion.measure is Measure.EDGE:
+            return _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles))) <= limit
+        moved = np.zeros(len(tiles))
+        if self.criterion.displacement is not None:
+            moved = np.ptp(self._heights(tiles), axis=(0, 1))
+        # A tile that is folded, or has no normal, is tested by its size only.
+        fits = (np.linalg.norm(upper - lower, axis=0) <= limit - moved) & self.scheme.has_convex_rules
+        axis = axis_across(corners)
+        extent = np.where(axis.any(axis=0), _extent(kind, values, axis[None]), np.inf)
+        found = fits | (extent <= limit - moved)
+        at = np.flatnonzero(found & ~fits)
+        at = at[_are_folded(kind, values[..., at], axis[:, at])]
+        found[at] = self._normal_sines(kind, values[..., at], axis[:, at]) < 1
+        if self.criterion.outline is not None:
+            # A border may be a silhouette for any normals.
+            at = np.flatnonzero(~found & ~tiles["sides"].any(axis=1) & np.isfinite(extent))
+            cone = NormalCone(axis[:, at], self._normal_sines(kind, values[..., at], axis[:, at]))
+            coarse = self.criterion.limit(lower[:, at], upper[:, at], cone)
+            found[at] = (cone.sine < 1) & (extent[at] <= coarse - moved[at])
+        for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+            at = np.flatnonzero(found & ~fits & (tiles["sides"][:, side] > 0))
+            if not len(at):
+                continue
+            hull = kind.side_hulls[side]
+            if hull is None:
+                found[at] = False
+            else:
+                curve, across = times(hull, values[..., at]), _normals_to(end[:, at] - begin[:, at])
+                found[at] = np.hypot(*(np.ptp(dot(curve, way), axis=0) for way in across)) <= limit[at]
+        return found
+
+    def rated(self, tiles: Tiles, coefficients: FloatArray) -> Tiles:
+        """Pieces with the rates that the limit needs, which may exceed the highest; see `clipped`."""
+        forms = self._forms(coefficients)
+        if self.criterion.displacement is not None:
+            forms += self._form_of_displacement(tiles, coefficients)
+        if self.domain.corner_count == 3:
+            rates = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
+        else:
+            rates = least_product(forms)
+        found = tiles.copy()
+        found["rates"], found["sides"] = rates, self._along_sides(tiles, coefficients)
+        return found
+
+    def _normal_sines(self, kind: DividedTile, values: FloatArray, axis: FloatArray) -> FloatArray:
+        """Sines of half the angles of cones about axes ``(3, t)`` that contain all normals of tiles.
+
+        One where normals are not known to lead to one side of the planes across the axes. Nearer to an extraordinary
+        point than the pieces, normals turn less than on these.
+        """
+        if kind.pieces is None or not len(axis.T):
+            return np.ones(axis.shape[1])
+        coefficients = times(kind.pieces.reshape(-1, kind.control_count), values)
+        # (b, p, 3, t)
+        coefficients = coefficients.reshape(*kind.pieces.shape[:2], 3, -1).swapaxes(0, 1)
+        tangents = [TangentCone.of(np.tensordot(each, coefficients, 1)) for each in self.basis.derivatives]
+        found: FloatArray = NormalCone.of(*tangents).around(axis).sine.max(axis=0)
+        return found
 
     def _heights(self, tiles: Tiles) -> FloatArray:
         """``(n, n, t)`` heights of the displacement over tiles, by v and by u."""
@@ -159,17 +134,17 @@ class TileRates:
         if self.domain.corner_count == 3:
             # What is outside lies in the next element; the samples are mirrored at the diagonal.
             u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
-        flipped, size = tiles.is_flipped, tiles.size / UNIT
-        uv = [size * (origin + np.where(flipped, 1 - t, t)) for origin, t in zip(tiles.origin.T, (u, v), strict=True)]
-        corner = np.broadcast_to(tiles.corner, uv[0].shape).ravel().astype(np.int64)
-        scale = self.frames.scale[self.frames.topology.face[tiles.corner]]
-        found = displacement.heights(corner, np.stack([(each * scale).ravel() for each in uv], axis=1))
+        flipped, size = tiles["is_flipped"], sizes(tiles) / UNIT
+        u, v = (
+            size * (origin + np.where(flipped, 1 - t, t)) for origin, t in zip(tiles["origin"].T, (u, v), strict=True)
+        )
+        corner = np.broadcast_to(tiles["corner"], u.shape).ravel().astype(np.int64)
+        scale = self.frames.scale[self.frames.topology.face[tiles["corner"]]]
+        found = displacement.heights(corner, np.stack([(u * scale).ravel(), (v * scale).ravel()], axis=1))
         return found.reshape(HEIGHT_SAMPLES, HEIGHT_SAMPLES, -1)
 
     def _form_of_displacement(self, tiles: Tiles, coefficients: FloatArray) -> FloatArray:
-        """``(1, 3, t)`` what the displacement adds to the forms of tiles; zero without one."""
-        if self.criterion.displacement is None or not len(tiles):
-            return np.zeros((1, 3, len(tiles)))
+        """``(1, 3, t)`` what the displacement adds to the forms of tiles."""
         any_normal = NormalCone.of_any(len(tiles))
         limit = self.criterion.limit(coefficients.min(axis=0), coefficients.max(axis=0), any_normal)
         a, b, c = self.criterion.form_of_displacement(self._heights(tiles)) / np.maximum(
@@ -179,69 +154,54 @@ class TileRates:
             return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
         return np.stack([a, b, c])[None]
 
-    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> NDArray[np.int16]:
-        """`Tiles.sides`: as many segments as keep curves along feature edges to the limit."""
-        sides = np.zeros_like(tiles.sides)
-        _, _, _, uu, uv, vv = _parts(self.basis, 0)[:, :, 0]
+    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> IndexArray:
+        """Least segments on sides: as many segments as keep curves along feature edges to the limit."""
+        sides = np.zeros_like(tiles["sides"])
+        _, _, uu, uv, vv = self.basis.two_derivatives
         along = [uu, uu - 2 * uv + vv, vv] if self.domain.corner_count == 3 else [uu, vv, uu, vv]
         for side, (second, own) in enumerate(zip(along, self.basis.sides, strict=True)):
-            on = np.flatnonzero(tiles.sides[:, side])
+            on = np.flatnonzero(tiles["sides"][:, side])
+            if not len(on):
+                continue
             of_tile = coefficients[..., on]
             limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), NormalCone.of_any(len(on)))
             needed = self.criterion.segments(times(second[own], of_tile), limit)
-            sides[on, side] = np.minimum(needed, np.iinfo(sides.dtype).max)
+            sides[on, side] = needed
         return sides
 
-    def _forms(
-        self,
-        coefficients: FloatArray,  # (b, 3, t) float64
-        maps: FloatArray,  # (6, b, p, b) float64: as `_parts`
-    ) -> FloatArray:
-        """``(p, 3, t)`` `Criterion.form` over its bound, of parts of tiles."""
-        found = np.empty((maps.shape[2], 3, coefficients.shape[2]))
-        size, length = maps.shape[-1], max(1, PARTS_AT_ONCE // maps.shape[2])
-        criterion, corner_count, parts_across = self.criterion, self.domain.corner_count, isqrt(maps.shape[2])
-        for begin in range(0, coefficients.shape[2], length):
-            tiles = slice(begin, begin + length)
-            own = coefficients[..., tiles]
-            derivatives = list(times(maps[1:].reshape(-1, size), own).reshape(5, size, -1, 3, own.shape[2]))
-            tangents = TangentCone.of(derivatives[0]), TangentCone.of(derivatives[1])
-            cone = NormalCone.of(*tangents)
-            if criterion.is_everywhere_alike:
-                limit = np.full(cone.sine.shape, criterion.error)
-            else:
-                points = times(maps[0].reshape(-1, size), own).reshape(derivatives[0].shape)
-                limit = criterion.limit(points.min(axis=0), points.max(axis=0), cone, derivatives[2:], parts_across)
-            form = criterion.form(derivatives, tangents, cone, corner_count)
-            found[..., tiles] = (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
-        return found
+    def _forms(self, coefficients: FloatArray) -> FloatArray:
+        """``(4, 3, t)`` `Criterion.form` over its bound, of pieces, by each of their copies' bounds."""
+        criterion, (b, _, count) = self.criterion, coefficients.shape
+        found = times(_of_copies(self.basis).reshape(-1, b), coefficients).reshape(6, b, 4, 3, count)
+        points, derivatives = found[0], list(found[1:])
+        tangents = TangentCone.of(derivatives[0]), TangentCone.of(derivatives[1])
+        cone = NormalCone.of(*tangents)
+        limit = criterion.limit(points.min(axis=0), points.max(axis=0), cone)
+        form = criterion.form(derivatives, tangents, cone, self.domain.corner_count)
+        # For the same limit a copy, which is half as large, needs half as many segments: its form is a quarter.
+        return 4 * (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
 
-    def _rates(self, forms: FloatArray) -> IndexArray:
-        """``(t, 2)`` segments along u and v for forms ``(f, 3, t)`` that are to be one at most."""
-        if self.domain.corner_count == 3:
-            found = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
-        else:
-            found = least_product(forms)
-        return found.astype(np.int32)
 
-    def _without_pairs(self, tiles: Tiles) -> Tiles:
-        """The tiles, with triangles of two segments divided: their only inner lines join the middles of the sides."""
-        is_pair = (np.minimum(tiles.rates[:, 0], self.most(tiles)) == 2) & (self.domain.corner_count == 3)
-        children = [tiles[is_pair].child(number, self.domain) for number in range(4)]
-        return Tiles.joined([tiles[~is_pair], *(replace(each, rates=-(-each.rates // 2)) for each in children)])
+def _extent(kind: DividedTile, values: FloatArray, axes: FloatArray) -> FloatArray:
+    """``(t,)`` size of the surface over tiles along axes ``(d, 3, t)``, no less than it is; infinite if unknown."""
+    if kind.hull is None:
+        return np.full(values.shape[2], np.inf)
+    found: FloatArray = np.linalg.norm([np.ptp(times(kind.hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
+    return found
 
-    def cost(self, tiles: Tiles) -> int:
-        """Triangles of some tiles, but for those of other rates next door."""
-        return int(self._costs(tiles, tiles.rates).sum())
 
-    def _costs(self, tiles: Tiles, rates: IntArray) -> IntArray:
-        """Likewise of each tile with these rates."""
-        return self._cells(tiles, rates) * (1 if self.domain.corner_count == 3 else 2)
+def _are_folded(kind: DividedTile, values: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+    """``(t,)`` whether control faces of some one-rings face opposite ways, seen along axes ``(3, t)``; true of pieces.
 
-    def _cells(self, tiles: Tiles, rates: IntArray) -> IntArray:
-        """``(t,)`` cells of tiles with these rates, clipped."""
-        cells: IntArray = np.minimum(rates, self.most(tiles)[:, None]).astype(np.int64).prod(axis=1)
-        return cells
+    Such a surface has silhouettes along its folds, and not only along edges of the cage.
+    """
+    if kind.is_piece:
+        return np.ones(axis.shape[1], dtype=bool)
+    points = kind.one_ring_points(values)
+    (a, c, b, d), (x, y) = kind.control_faces, (dot(points, along) for along in _normals_to(axis))
+    areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
+    found: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
+    return found
 
 
 def axis_across(corners: FloatArray) -> FloatArray:
@@ -254,14 +214,18 @@ def axis_across(corners: FloatArray) -> FloatArray:
     return axis / np.where(length > 0, length, 1)
 
 
-@lru_cache(maxsize=16)
-def _parts(basis: BernsteinBasis, level: int) -> FloatArray:
-    """``(6, b, 4^level, b)`` maps from coefficients to those over parts, and of derivatives u, v, uu, uv, vv.
+def _normals_to(way: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors ``(3, t)`` orthogonal to each of some vectors and to each other; any two for zero vectors."""
+    length = np.linalg.norm(way, axis=0)
+    way = np.where(length > 0, way / np.where(length > 0, length, 1), np.array([[0.0], [0], [1]]))
+    # Across the way and the axis that it is least along.
+    first = cross(way, np.eye(3)[np.argmin(np.abs(way), axis=0)].T)
+    first /= np.linalg.norm(first, axis=0)
+    return first, cross(way, first)
 
-    The parts are the copies of the domain, or the copies of these, and so on.
-    """
-    parts = np.eye(len(basis.indices))[None]
-    maps = np.concatenate([parts, basis.two_derivatives])
-    for _ in range(level):
-        parts = (basis.halves @ parts[:, None]).reshape(-1, *parts.shape[1:])
-    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, parts))
+
+@lru_cache(maxsize=16)
+def _of_copies(basis: BernsteinBasis) -> FloatArray:
+    """``(6, b, 4, b)`` maps from coefficients to those over the copies of the domain, and of their derivatives."""
+    maps = np.concatenate([np.eye(len(basis.indices))[None], basis.two_derivatives])
+    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, basis.halves))

@@ -1,97 +1,78 @@
-"""Tiles: the parts of patches that an adaptive tessellation has a grid for, each with rates of its own."""
+"""Tiles: the parts of patches that an adaptive tessellation has a grid for, each with rates of its own.
+
+A tile is a copy of its patch's domain, ``2^depth`` times smaller. Tiles are structured arrays, of `tile_type`.
+"""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import ParameterDomain
+from .patch_frames import UNIT
 
 # Rings around extraordinary points are at most so deep: single precision tells nothing nearer apart.
 DEEPEST = 24
-# Parameters of patches in integers: corners of tiles lie at multiples of this part of a patch.
-UNIT = 1 << DEEPEST
+
+Tiles = NDArray[np.void]
 
 
-@dataclass(frozen=True, eq=False)
-class Tiles:
-    """Parts of patches, each with a grid of its own.
+def tile_type(corner_count: int) -> np.dtype[np.void]:
+    """What a tile over a domain of so many corners consists of."""
+    return np.dtype(
+        [
+            # Corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`
+            ("corner", np.int32),
+            ("depth", np.int32),
+            # Where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``
+            ("origin", np.int32, 2),
+            # Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is
+            # then at ``origin + 1``.
+            ("is_flipped", np.bool_),
+            # How often an edge of the cage is halved to a tile's side; around extraordinary points, an edge of a ring
+            ("halvings", np.int32),
+            # Segments along u and v; over triangles both are the same
+            ("rates", np.int32, 2),
+            # Least segments on each side: more than the rates where an outline may run along a border of the mesh,
+            # which the boundary of the cage and the sides of creases are. 0 inside.
+            ("sides", np.int32, corner_count),
+        ]
+    )
 
-    A tile is a copy of its patch's domain, ``2^depth`` times smaller.
-    """
 
-    # (t,) int32: corner of its element that a tile's patch begins at, a half-edge of `PatchTable.elements`
-    corner: IndexArray
-    depth: NDArray[np.int8]  # (t,) int8
-    # (t, 2) int32: where the tile lies in its patch's domain: its least u and v, in units of ``2^-depth``
-    origin: IndexArray
-    # (t,) bool: whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0,
-    # 0) is then at ``origin + 1``.
-    is_flipped: NDArray[np.bool_]
-    # (t,) int8: how often an edge of the cage is halved to a tile's side; around extraordinary points, an edge of a
-    # ring
-    halvings: NDArray[np.int8]
-    rates: IndexArray  # (t, 2) int32: segments along u and v; over triangles both are the same
-    # (t, m) int16: least segments on each side: more than the rates where an outline may run along a border of the
-    # mesh, which the boundary of the cage and the sides of creases are. 0 inside. Spans have them instead, see
-    # `Spans`.
-    sides: NDArray[np.int16]
+def whole_patches(corners: IntArray, is_border: NDArray[np.bool_]) -> Tiles:
+    """One tile for each patch that begins at these corners; and which sides ``(t, m)`` are borders."""
+    found = np.zeros(len(corners), dtype=tile_type(is_border.shape[1]))
+    found["corner"], found["rates"], found["sides"] = corners, 1, is_border
+    return found
 
-    def __len__(self) -> int:
-        return len(self.corner)
 
-    def __getitem__(self, chosen: NDArray | slice) -> Tiles:
-        return Tiles(*(each[chosen] for each in self._arrays))
+def child(tiles: Tiles, number: int, domain: ParameterDomain) -> Tiles:
+    """One of the four copies of each tile, in the order of `ParameterDomain.children`."""
+    found, m = tiles.copy(), domain.corner_count
+    is_middle = m == 3 and number == 3
+    # Where the copy begins, in units of half a tile, from the tile's corner (0, 0).
+    step = np.array([0, 0] if is_middle else domain.corners[number], dtype=np.int32)
+    found["origin"] = 2 * tiles["origin"] + np.where(tiles["is_flipped"][:, None], 1 - step, step)
+    found["depth"] += 1
+    found["halvings"] += 1
+    found["is_flipped"] ^= is_middle
+    # A copy at a corner shares the sides that meet there.
+    shared = [side for side in range(m) if not is_middle and side in (number, (number - 1) % m)]
+    found["sides"] = 0
+    found["sides"][:, shared] = -(-tiles["sides"][:, shared] // 2)
+    return found
 
-    @property
-    def _arrays(self) -> tuple[NDArray, ...]:
-        return self.corner, self.depth, self.origin, self.is_flipped, self.halvings, self.rates, self.sides
 
-    @property
-    def size(self) -> IndexArray:
-        """``(t,)`` length of each tile's sides in its patch, in parts of `UNIT`."""
-        return np.int32(UNIT) >> self.depth.astype(np.int32)
+def sizes(tiles: Tiles) -> IndexArray:
+    """``(t,)`` length of each tile's sides in its patch, in parts of `UNIT`."""
+    return np.int32(UNIT) >> tiles["depth"]
 
-    @classmethod
-    def joined(cls, parts: list[Tiles]) -> Tiles:
-        """All tiles of some lists."""
-        return cls(*(np.concatenate(each) for each in zip(*(part._arrays for part in parts), strict=True)))
 
-    def child(self, number: int, domain: ParameterDomain) -> Tiles:
-        """One of the four copies of each tile, in the order of `ParameterDomain.children`."""
-        is_middle = domain.corner_count == 3 and number == 3
-        # Where the copy begins, in units of half a tile, from the tile's corner (0, 0).
-        step = np.array(
-            [(0, 0), (1, 0), (0, 1), (0, 0)] if domain.corner_count == 3 else [(0, 0), (1, 0), (1, 1), (0, 1)],
-            dtype=np.int32,
-        )
-        step = np.where(self.is_flipped[:, None], 1 - step[number], step[number])
-        # A copy at a corner shares the sides that meet there.
-        corner, m = np.arange(domain.corner_count), domain.corner_count
-        own_sides = ((corner == number) | (corner == (number - 1) % m)) & (not is_middle)
-        return Tiles(
-            self.corner,
-            self.depth + 1,
-            2 * self.origin + step,
-            self.is_flipped ^ is_middle,
-            self.halvings + 1,
-            self.rates,
-            np.where(own_sides, -(-self.sides // 2), 0),
-        )
-
-    @classmethod
-    def whole(cls, corners: IntArray, is_border: NDArray[np.bool_]) -> Tiles:
-        """One tile for each patch that begins at these corners; and which sides are borders."""
-        count = len(corners)
-        return cls(
-            np.asarray(corners, dtype=np.int32),
-            np.zeros(count, dtype=np.int8),
-            np.zeros((count, 2), dtype=np.int32),
-            np.zeros(count, dtype=bool),
-            np.zeros(count, dtype=np.int8),
-            np.ones((count, 2), dtype=np.int32),
-            is_border.astype(np.int16),
-        )
+def corner_points(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
+    """``(2, t, m)`` corners in their patches, in parts of `UNIT`, counter-clockwise from the tile's (0, 0)."""
+    steps = domain.corners.T.astype(np.int32)[:, None]
+    steps = np.where(tiles["is_flipped"][:, None], 1 - steps, steps)
+    found: IndexArray = (tiles["origin"].T[..., None] + steps) * sizes(tiles)[:, None]
+    return found

@@ -1,17 +1,11 @@
-"""The order of tiles along Morton's curve, and the blocks in which they are chosen."""
+"""Tessellations do not depend on the blocks in which they are made."""
 
 import numpy as np
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.tessellation import tile_choice
-from mitsuba_subdivision.tessellation.tile_choice import _interleaved
 from tessellation.test_adaptive_grid import table_of
-
-
-def test_bits_with_zeros_between_them_are_binary_digits_read_in_base_four(np_rng):
-    values = np.append(np_rng.integers(1 << 26, size=200), [0, 1, (1 << 26) - 1])
-    assert _interleaved(values).tolist() == [int(f"{value:b}", 4) for value in values.tolist()]
 
 
 def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
@@ -21,11 +15,11 @@ def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
     whole_patches = tile_choice._whole_patches
 
     def counted(*arguments):
-        for tiles, *block in whole_patches(*arguments):
-            sizes.append(len(tiles))
-            yield tiles, *block
+        for part in whole_patches(*arguments):
+            sizes.append(len(part.tiles))
+            yield part
 
-    monkeypatch.setattr(tile_choice, "PATCHES_AT_ONCE", most)
+    monkeypatch.setattr(tile_choice, "MOST_WAITING", 2 * most)
     monkeypatch.setattr(tile_choice, "TILES_AT_ONCE", most)
     monkeypatch.setattr(tile_choice, "_whole_patches", counted)
     np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)
