@@ -70,12 +70,12 @@ def test_control_points_of_convex_rules_contain_the_surface(name):
     scheme, signatures = tables(surface_named(name))
     for signature in signatures:
         for _, (tile, _) in parts(scheme, signature):
-            if tile.is_piece or tile.pieces is None:
+            if tile.is_piece:
                 continue
             # Over control points, which are as many as eigenvectors.
-            pieces = tile.pieces @ np.linalg.inv(tile.control_points)
-            assert pieces.min() > -ROUNDING
-            assert np.abs(pieces.sum(axis=2) - 1).max() < ROUNDING
+            hull = tile.hull @ np.linalg.inv(tile.control_points)
+            assert hull.min() > -ROUNDING
+            assert np.abs(hull.sum(axis=1) - 1).max() < ROUNDING
 
 
 @pytest.mark.core

@@ -120,14 +120,17 @@ class DividedTile:
         return times(self.control_points, points) if self.is_self_similar else points
 
     @cached_property
-    def pieces(self) -> FloatArray | None:
-        """``(p, b, K)`` Bernstein coefficients of pieces on which all normals are, or nearly those.
+    def tangents(self) -> FloatArray | None:
+        """``(2, b, p, K)`` Bernstein coefficients of derivatives by u and v, on pieces with all normals, or nearly all.
 
         Nearer to extraordinary points than these, normals turn less than on them. None where parts are left after some
         divisions that hold neither pieces nor one extraordinary point.
         """
         pieces, rest = self._divided(DIVISIONS_OF_NORMALS)
-        return np.stack(pieces) if all(tile.is_self_similar for tile, _ in rest) else None
+        if not all(tile.is_self_similar for tile, _ in rest):
+            return None
+        found: FloatArray = np.tensordot(regular_bernstein(self._scheme).basis.derivatives, np.stack(pieces), (2, 1))
+        return found
 
     @cached_property
     def hull(self) -> FloatArray | None:

@@ -73,15 +73,12 @@ class AdaptiveGrid:
     def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Numbers of the samples on sides, and the first of each number; of the same points, as `PatchFrames.names`."""
         name, at = np.empty(len(self.side), dtype=np.int64), np.empty((2, len(self.side)), dtype=np.int32)
+        points = self._on_sides(self.side, self.along)
         for block in chunks_of(len(self.side)):
-            corner = self.tiles["corner"][self.side[block] // self._corner_count]
-            points = self._on_sides(self.side[block], self.along[block]).astype(np.int32)
-            name[block], at[:, block] = self.frames.names(corner, points, edge, vertex)
-        # Most tessellations use few bits of the positions.
-        used = int(np.bitwise_or.reduce(at, axis=None)) | EDGE
-        shift = (used & -used).bit_length() - 1
-        x, y = at >> shift
-        bits = BITS - shift
+            corner, own = self.tiles["corner"][self.side[block] // self._corner_count], points[:, block]
+            name[block], at[:, block] = self.frames.names(corner, own.astype(np.int32), edge, vertex)
+        shift = _unused_bits(at)
+        (x, y), bits = at >> shift, BITS - shift
         return _ranked(_joined(name, x.astype(np.int64) << bits | y, 2 * bits))
 
     @cached_property
@@ -99,7 +96,10 @@ class AdaptiveGrid:
 
     def copies(self) -> IntArray:
         """`VertexTable.copies`: vertices on the second side of each crease, and those on the first."""
-        shared, first_of_shared = self._numbered(self.frames.edge, self.frames.vertex)
+        frames = self.frames
+        if not frames.has_copies:
+            return np.empty((2, 0), dtype=np.int64)
+        shared, first_of_shared = self._numbered(frames.edge, frames.vertex)
         number, first = self._numbers
         original = number[first_of_shared][shared[first]]
         pairs = np.stack([np.arange(len(first)), original])
@@ -155,10 +155,10 @@ class AdaptiveGrid:
     def _on_sides(self, side: IntArray, along: FloatArray) -> FloatArray:
         """``(2, n)`` points on sides of tiles, in their patches, in parts of `UNIT`."""
         found, m = np.empty((2, len(side))), self._corner_count
+        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
         for block in chunks_of(len(side)):
-            tile, corner = np.divmod(side[block], m)
-            corners, own = corner_points(self.tiles[tile], self.frames.domain), np.arange(len(tile))
-            begin, end = corners[:, own, corner], corners[:, own, (corner + 1) % m]
+            own = side[block]
+            begin, end = corners[:, own], corners[:, own + np.where(own % m == m - 1, 1 - m, 1)]
             found[:, block] = begin + (end - begin) * along[block]
         return found
 
@@ -249,29 +249,38 @@ def _at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) -
 
 def _samples_on_sides(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, FloatArray]:
     """Samples on the sides of all tiles: `AdaptiveGrid.side` and `AdaptiveGrid.along`."""
-    keys, way = _lines(tiles, frames)
+    line, begin, way = _lines(tiles, frames)
     wanted = np.maximum(
         tiles["rates"][:, [0, 1, 0, 1] if frames.domain.corner_count == 4 else [0, 0, 0]], tiles["sides"]
     )
     counts = 1 << np.ceil(np.log2(wanted.ravel())).astype(np.int32)
+    step = way // counts
+    shift = _unused_bits(begin | step)
+    keys = line.astype(np.int64) << (BITS - shift) | begin >> shift
     points = ragged.index_in_row(counts + 1)
-    points *= np.repeat(way // counts, counts + 1)
+    points *= np.repeat(step >> shift, counts + 1)
     points += np.repeat(keys, counts + 1)
-    points.sort()
-    points = points[np.append(True, points[1:] != points[:-1])]
     # Where the samples of each side begin and end in those of its line.
-    begin, end = (np.searchsorted(points, each).astype(np.int32) for each in (keys, keys + way))
+    number, first = _ranked(points)
+    end = np.cumsum(counts + 1, dtype=np.int32) - 1
+    begin, end, points = number[end - counts], number[end], points[first]
     counts = np.abs(end - begin)
     side = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-    along = ragged.index_in_row(counts) * np.repeat(np.sign(way), counts)
-    along += np.repeat(begin, counts)
-    along = points[along]
+    at = ragged.index_in_row(counts) * np.repeat(np.sign(way), counts)
+    at += np.repeat(begin, counts)
+    along = points[at]
     along -= np.repeat(keys, counts)
-    return side, along / np.repeat(way, counts)
+    return side, along / np.repeat(way >> shift, counts)
 
 
-def _lines(tiles: Tiles, frames: PatchFrames) -> tuple[IntArray, IndexArray]:
-    """Where the sides of tiles begin, in the order of all lines and positions along these, and how far they lead."""
+def _unused_bits(positions: IndexArray) -> int:
+    """How many of the lowest bits are zero in all positions: most tessellations use few."""
+    used = int(np.bitwise_or.reduce(positions, axis=None)) | EDGE
+    return (used & -used).bit_length() - 1
+
+
+def _lines(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, IndexArray, IndexArray]:
+    """On which lines the sides of tiles lie: their numbers, the positions where sides begin, and how far they lead."""
     m = frames.domain.corner_count
     name = np.empty(m * len(tiles), dtype=np.int64)
     level, begin, way = np.empty((3, m * len(tiles)), dtype=np.int32)
@@ -289,10 +298,8 @@ def _lines(tiles: Tiles, frames: PatchFrames) -> tuple[IntArray, IndexArray]:
         name[own], way[own] = 3 * names + axis, 4 * (positions[1] - positions[0])
         begin[own] = 2 * positions[0] - positions[1]
         level[own] = np.select([axis == 0, axis == 2], [y, x], x + y if m == 3 else x)
-    line = _ranked(_joined(name, level, BITS))[0].astype(np.int64)
-    line <<= BITS
-    line |= begin
-    return line, way
+    shift = _unused_bits(level)
+    return _ranked(_joined(name, level >> shift, BITS - shift))[0], begin, way
 
 
 def _ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:

@@ -34,6 +34,7 @@ class PatchFrames:
     vertex: IndexArray
     # (n_h,) bool: whether positions along the edge of a half-edge are counted from its end
     is_backward: NDArray[np.bool_]
+    has_copies: bool  # Whether edges or vertices of the topology have the same number
 
     @cached_property
     def meets_twice(self) -> NDArray[np.bool_]:
@@ -87,11 +88,13 @@ class PatchFrames:
             sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
         else:
             sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
-        is_whole, half_edge, found = self.is_whole[t.face[corner]], corner, []
-        for distance, along in sides:
+        is_whole, found = self.is_whole[t.face[corner]], []
+        for number, (distance, along) in enumerate(sides):
             on = np.flatnonzero((distance == 0) & is_whole)
-            found.append((on, half_edge[on], 2 * along[on]))
-            half_edge = t.next[half_edge]
+            half_edge = corner[on]
+            for _ in range(number):
+                half_edge = t.next[half_edge]
+            found.append((on, half_edge, 2 * along[on]))
         others = np.flatnonzero(~is_whole)
         if len(others):
             u, v, own, before = u[others], v[others], corner[others], t.prev[corner[others]]
@@ -131,14 +134,16 @@ class PatchFrames:
         every = np.arange(t.half_edge_count, dtype=np.int32)
         lower = np.where(t.twin < 0, every, np.minimum(every, t.twin))
         if patches.scheme.element == "vertex":
-            return cls(t, patches.scheme.domain, is_whole, scale, t.edge, t.face_vertices, lower != every)
+            return cls(t, patches.scheme.domain, is_whole, scale, t.edge, t.face_vertices, lower != every, False)
         edge, is_backward = lower, lower != every
         start, border = t.face_vertices, np.flatnonzero(t.twin < 0)
-        if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
+        has_copies = not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex)))
+        if has_copies:
             start = control_of_vertex.astype(np.int32)[start]
         one, other = start[border].astype(np.int64), start[t.next[border]]
         ends = np.minimum(one, other) * (int(control_of_vertex.max()) + 1) + np.maximum(one, other)
         _, first, same = np.unique(ends, return_index=True, return_inverse=True)
         edge[border] = border[first[same]]
         is_backward[border] = start[border] != start[edge[border]]
-        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward)
+        has_copies |= len(first) < len(border)
+        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)

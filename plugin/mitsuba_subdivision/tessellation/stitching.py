@@ -101,13 +101,13 @@ def stitched(
     """
     m, counts = sides.counts.shape[1], inner_counts(rates, sides.counts.shape[1])
     first_inner = len(sides.along) + ragged.starts(counts)
-    found = [*_across(rates, sides, np.flatnonzero(counts == 0)), *_inside(rates, first_inner, m)]
-    tiles = np.flatnonzero(counts)
-    is_cut = np.zeros(sides.counts.shape, dtype=bool)
-    if m == 3:
-        # From a corner to the first inner sample is further than any side of the lattice.
-        is_cut[tiles] = True if keeps_corner is None else ~keeps_corner[tiles]
-    found += _around_inner(rates, sides, tiles, first_inner, is_cut)
+    found, tiles = _across(rates, sides, np.flatnonzero(counts == 0)), np.flatnonzero(counts)
+    if len(tiles):
+        is_cut = np.zeros(sides.counts.shape, dtype=bool)
+        if m == 3:
+            # From a corner to the first inner sample is further than any side of the lattice.
+            is_cut[tiles] = True if keeps_corner is None else ~keeps_corner[tiles]
+        found += _around_inner(rates, sides, tiles, first_inner, is_cut) + _inside(rates, first_inner, m)
     triangles, tile = (np.concatenate(each, dtype=np.int32) for each in zip(*found, strict=True))
     return triangles.take(np.argsort(tile, kind="stable"), axis=0)
 

@@ -122,13 +122,13 @@ def _whole_patches(
         every = np.eye(element.control_count)
         kind, rows = part_of_tile(element, every)
         of_class = patch_class.corners if refined is None else refined.corners(patch_class)
+        tiles = whole_patches(of_class, sides_on(features, frames, of_class))
         for begin in range(0, len(of_class), TILES_AT_ONCE):
             block = slice(begin, begin + TILES_AT_ONCE)
             controls = patch_class.controls[block].T
             values = np.stack([axis.take(controls, mode="clip") for axis in coordinates], axis=1)
             values = values if rows is every else times(rows, values)
-            tiles = whole_patches(of_class[block], sides_on(features, frames, of_class[block]))
-            yield _Part(kind, tiles, values)
+            yield _Part(kind, tiles[block], values)
 
 
 def _chosen(rates: TileRates, patches: Iterable[_Part]) -> Iterator[Tiles]:
@@ -153,8 +153,9 @@ def _chosen(rates: TileRates, patches: Iterable[_Part]) -> Iterator[Tiles]:
                     del waiting[kind]
                 done, undecided = _decided(rates, taken)
                 triangle_count += int(rates.triangle_counts(done).sum())
-                # Divided tiles have fewer triangles.
-                require_memory_for_triangles(triangle_count + int(rates.triangle_counts(undecided.tiles).sum()))
+                if taken.kind.is_piece:
+                    # Divided tiles have fewer triangles.
+                    require_memory_for_triangles(triangle_count + int(rates.triangle_counts(undecided.tiles).sum()))
                 yield done
                 for divided in _divided(rates, undecided) if len(undecided.tiles) else ():
                     waiting.setdefault(divided.kind, []).append(divided)

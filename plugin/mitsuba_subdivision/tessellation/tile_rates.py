@@ -73,16 +73,17 @@ class TileRates:
             moved = np.ptp(self._heights(tiles), axis=(0, 1))
         # A tile that is folded, or has no normal, is tested by its size only.
         fits = (np.linalg.norm(upper - lower, axis=0) <= limit - moved) & self.scheme.has_convex_rules
-        axis = axis_across(corners)
-        extent = np.where(axis.any(axis=0), _extent(kind, values, axis[None]), np.inf)
+        axis, extent = axis_across(corners), np.full(len(tiles), np.inf)
+        at = np.flatnonzero(~fits & axis.any(axis=0))
+        extent[at] = _extent(kind, values.take(at, axis=2), axis[None].take(at, axis=2))
         found = fits | (extent <= limit - moved)
         at = np.flatnonzero(found & ~fits)
-        at = at[_are_folded(kind, values[..., at], axis[:, at])]
-        found[at] = self._normal_sines(kind, values[..., at], axis[:, at]) < 1
+        at = at[_are_folded(kind, ring.take(at, axis=2), axis.take(at, axis=1))]
+        found[at] = self._normal_sines(kind, values.take(at, axis=2), axis.take(at, axis=1)) < 1
         if self.criterion.outline is not None:
             # A border may be a silhouette for any normals.
             at = np.flatnonzero(~found & ~tiles["sides"].any(axis=1) & np.isfinite(extent))
-            cone = NormalCone(axis[:, at], self._normal_sines(kind, values[..., at], axis[:, at]))
+            cone = NormalCone(axis[:, at], self._normal_sines(kind, values.take(at, axis=2), axis[:, at]))
             coarse = self.criterion.limit(lower[:, at], upper[:, at], cone)
             found[at] = (cone.sine < 1) & (extent[at] <= coarse - moved[at])
         for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
@@ -116,13 +117,11 @@ class TileRates:
         One where normals are not known to lead to one side of the planes across the axes. Nearer to an extraordinary
         point than the pieces, normals turn less than on these.
         """
-        if kind.pieces is None or not len(axis.T):
+        if kind.tangents is None or not len(axis.T):
             return np.ones(axis.shape[1])
-        coefficients = times(kind.pieces.reshape(-1, kind.control_count), values)
-        # (b, p, 3, t)
-        coefficients = coefficients.reshape(*kind.pieces.shape[:2], 3, -1).swapaxes(0, 1)
-        tangents = [TangentCone.of(np.tensordot(each, coefficients, 1)) for each in self.basis.derivatives]
-        found: FloatArray = NormalCone.of(*tangents).around(axis).sine.max(axis=0)
+        shape = kind.tangents.shape
+        derivatives = times(kind.tangents.reshape(-1, shape[3]), values).reshape(*shape[:3], *values.shape[1:])
+        found: FloatArray = NormalCone.of(*map(TangentCone.of, derivatives)).around(axis).sine.max(axis=0)
         return found
 
     def _heights(self, tiles: Tiles) -> FloatArray:
@@ -190,15 +189,14 @@ def _extent(kind: DividedTile, values: FloatArray, axes: FloatArray) -> FloatArr
     return found
 
 
-def _are_folded(kind: DividedTile, values: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
-    """``(t,)`` whether control faces of some one-rings face opposite ways, seen along axes ``(3, t)``; true of pieces.
+def _are_folded(kind: DividedTile, ring: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+    """``(t,)`` whether control faces of one-rings ``(n, 3, t)`` face opposite ways, along axes; true of pieces.
 
     Such a surface has silhouettes along its folds, and not only along edges of the cage.
     """
     if kind.is_piece:
         return np.ones(axis.shape[1], dtype=bool)
-    points = kind.one_ring_points(values)
-    (a, c, b, d), (x, y) = kind.control_faces, (dot(points, along) for along in _normals_to(axis))
+    (a, c, b, d), (x, y) = kind.control_faces, (dot(ring, along) for along in _normals_to(axis))
     areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
     found: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
     return found
