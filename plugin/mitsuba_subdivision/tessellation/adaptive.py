@@ -20,32 +20,16 @@ from .vertex_table import VertexTable
 
 def adaptive_table(
     patches: PatchTable,
-    control_of_vertex: IntArray,
+    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
+    # (n, 3) float64: control points for which the criterion is met. The table can be applied to others.
     control_points: FloatArray,
     criterion: Criterion,
-    max_rate: int,
-    cage_name: str,
+    max_rate: int,  # Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`
+    cage_name: str,  # For a warning
 ) -> VertexTable:
     """Prepare the adaptive tessellation of a cage's patches.
 
-    Raises ValueError if ``max_rate`` is anything else. Raises MemoryError if the tessellation would not fit into
-    memory.
-
-    Parameters
-    ----------
-    control_of_vertex : (n_v,) int64
-        0-based control point at each mesh vertex.
-    control_points : (n, 3) float64
-        Control points for which the criterion is met. The table can be applied to others.
-    max_rate : int
-        Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`.
-    cage_name : str
-        For a warning.
-
-    Warns
-    -----
-    CageWarning
-        As `choose_tiles`.
+    Raises ValueError if ``max_rate`` is anything else. Raises MemoryError, and warns, as `choose_tiles` does.
     """
     max_rate = checked_rate(max_rate, "max_rate")
     if max_rate > HIGHEST_RATE:

@@ -45,34 +45,19 @@ class _Part(NamedTuple):
 
 def choose_tiles(
     patches: PatchTable,
-    frames: PatchFrames,
-    control_points: FloatArray,
-    control_of_vertex: IntArray,
+    frames: PatchFrames,  # Of these
+    control_points: FloatArray,  # (n, 3) float64
+    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
     criterion: Criterion,
+    # Most segments along an edge of the cage, rounded down to a power of two; around extraordinary points, along each
+    # ring
     max_rate: int,
-    cage_name: str,
+    cage_name: str,  # For a warning
 ) -> Tiles:
-    """Divide the patches of a cage into tiles, and choose their rates.
+    """Divide the patches of a cage into tiles, in the order of the elements, and choose their rates.
 
-    Returns Tiles: in the order of the elements. Raises MemoryError if their triangles would not fit into memory.
-
-    Parameters
-    ----------
-    frames : PatchFrames
-        Of these.
-    control_points : (n, 3) float64
-    control_of_vertex : (n_v,) int64
-        0-based control point at each mesh vertex.
-    max_rate : int
-        Most segments along an edge of the cage, rounded down to a power of two; around extraordinary points, along each
-        ring.
-    cage_name : str
-        For a warning.
-
-    Warns
-    -----
-    CageWarning
-        Where ``max_rate`` does not let the criterion hold; not if it is for outlines.
+    Raises MemoryError if their triangles would not fit into memory. Warns where ``max_rate`` does not let the criterion
+    hold; not if it is for outlines.
     """
     points = control_points[control_of_vertex]
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
