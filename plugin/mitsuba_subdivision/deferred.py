@@ -7,18 +7,14 @@ import sys
 from collections.abc import Callable, Mapping
 
 
-def deferred(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
+def deferred(
+    package: str,  # Its `__name__`
+    modules: Mapping[str, str],  # The module, within the package, of each name
+) -> Callable[[str], object]:
     """Make the ``__getattr__`` of a package, which imports a name's module when the name is first used.
 
     A scene then waits for the modules only that it needs. No name may be that of a module of the package: importing
     that module would then replace the name.
-
-    Parameters
-    ----------
-    package : str
-        Its ``__name__``.
-    modules : dict of str to str
-        The module, within the package, of each name.
     """
 
     def __getattr__(name: str) -> object:

@@ -89,21 +89,17 @@ class Diagnosis:
         for name, packages in self.extras.items():
             listed = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
             lines.append((f"extra {name}", listed))
-        verdict = (
-            "everything that this machine should support works" if self.healthy else "there are PROBLEMS, listed above"
-        )
+        all_works, some_fails = "everything that this machine should support works", "there are PROBLEMS, listed above"
+        verdict = all_works if self.healthy else some_fails
         width = max(len(name) for name, _ in lines)
         return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
 
 
-def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
-    """Collect versions, and render a small surface in each variant, each in its own process.
-
-    Parameters
-    ----------
-    variants : dict of str to bool, optional
-        Names of variants, and whether one that the machine has no device for is a problem. By default `VARIANTS`.
-    """
+def diagnose(
+    # Names of variants, and whether one that the machine has no device for is a problem. By default `VARIANTS`.
+    variants: dict[str, bool] | None = None,
+) -> Diagnosis:
+    """Collect versions, and render a small surface in each variant, each in its own process."""
     from . import __version__
 
     versions = {DISTRIBUTION: __version__, "Python": platform.python_version(), **{n: _version(n) for n in PACKAGES}}
@@ -111,18 +107,12 @@ def diagnose(variants: dict[str, bool] | None = None) -> Diagnosis:
     return Diagnosis(versions, platform.platform(), select_llvm(), version_without_package(), tried, _extras())
 
 
-def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> VariantReport:
-    """Render a small surface in a separate process, so that a crash is reported.
-
-    Parameters
-    ----------
-    variant : str
-        Variant of Mitsuba.
-    needed : bool
-        Whether it is a problem if the machine has no device for it.
-    seconds : float
-        After which the process is ended.
-    """
+def try_variant(
+    variant: str,
+    needed: bool = True,  # Whether it is a problem if the machine has no device for it
+    seconds: float = SECONDS,  # After which the process is ended
+) -> VariantReport:
+    """Render a small surface in a separate process, so that a crash is reported."""
     start = time.monotonic()
     command = [sys.executable, "-c", _CHILD, variant]
     try:

@@ -58,11 +58,9 @@ class Inspection:
     warnings: tuple[str, ...]  # What will look odd
 
     def __str__(self) -> str:
+        counts = f"{self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces"
         rows = [
-            (
-                "cage",
-                f"{self.name}: {self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces",
-            ),
+            ("cage", f"{self.name}: {counts}"),
             ("box", " to ".join("({:g}, {:g}, {:g})".format(*corner) for corner in self.bounding_box)),
             ("faces", _listed(self.face_sizes, "{:,} of {} corners")),
             ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
@@ -85,14 +83,11 @@ class Inspection:
         return f"{self.boundary_edge_count:,} edges in {self.boundary_loop_count:,} {loops}, rule {self.boundary}"
 
 
-def inspect(surface: LimitSurface, rate: int = 8) -> Inspection:
-    """Inspect a cage under a scheme. Raises ValueError if the rate is below 1.
-
-    Parameters
-    ----------
-    rate : int
-        Segments per edge of the tessellation whose size is predicted, at least 1.
-    """
+def inspect(
+    surface: LimitSurface,
+    rate: int = 8,  # Segments per edge of the tessellation whose size is predicted, at least 1
+) -> Inspection:
+    """Inspect a cage under a scheme. Raises ValueError if the rate is below 1."""
     if rate < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
     cage = surface.cage

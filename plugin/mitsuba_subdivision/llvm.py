@@ -102,9 +102,7 @@ def loaded_version() -> int | None:
     """Major version of the library that Dr.Jit has loaded, None if its LLVM backend is inactive. Imports Dr.Jit."""
     import drjit as dr
 
-    if not dr.has_backend(dr.JitBackend.LLVM):
-        return None
-    return int(dr.detail.llvm_version()[0])
+    return int(dr.detail.llvm_version()[0]) if dr.has_backend(dr.JitBackend.LLVM) else None
 
 
 def llvm_problem() -> str | None:
@@ -125,10 +123,7 @@ def llvm_problem() -> str | None:
 
 @functools.cache
 def require_llvm() -> None:
-    """Check that kernels of LLVM variants run: with a library that is too old, the first one ends the process.
-
-    Raises RuntimeError if they do not; the message is that of `llvm_problem`.
-    """
+    """Raise RuntimeError with `llvm_problem`, if any: with too old a library, the first kernel ends the process."""
     problem = llvm_problem()
     if problem:
         raise RuntimeError(problem)
@@ -136,17 +131,12 @@ def require_llvm() -> None:
 
 def warn_if_unusable() -> None:
     """Warn if Dr.Jit has loaded an LLVM library that aborts the process. Imports Dr.Jit."""
-    if loaded_version() is not None:
-        problem = llvm_problem()
-        if problem:
-            warnings.warn(problem, RuntimeWarning, stacklevel=3)
+    if loaded_version() is not None and (problem := llvm_problem()):
+        warnings.warn(problem, RuntimeWarning, stacklevel=3)
 
 
 def version_without_package() -> int | None:
-    """Major version of the library that Dr.Jit loads in a program that imports Mitsuba before this package.
-
-    In a process of its own. None if Dr.Jit finds no library.
-    """
+    """Major version of the library that Dr.Jit loads in a process that imports Mitsuba first; None if it finds none."""
     environment = dict(os.environ)
     if not select_llvm().reason.startswith(ENVIRONMENT_VARIABLE):
         environment.pop(ENVIRONMENT_VARIABLE, None)

@@ -19,27 +19,18 @@ OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 
 def mitsuba_mesh(
     name: str,
-    triangles: NDArray[np.integer],
+    triangles: NDArray[np.integer],  # (m, 3)
+    # (n, k) each: `vertex_positions`, and if the mesh has them `vertex_normals`, `vertex_texcoords`, and attributes of
+    # vertices or faces, `vertex_NAME` or `face_NAME`
     buffers: Mapping[str, NDArray],
     *,
     bsdf: mi.BSDF | None = None,
     emitter: mi.Emitter | None = None,
     interior: mi.Medium | None = None,
+    # Whether vertices get the averages of the normals of their triangles. Without normals, triangles are flat.
     averages_normals: bool = False,
 ) -> mi.Mesh:
-    """Make a mesh of the current variant.
-
-    Parameters
-    ----------
-    triangles : (m, 3) int
-    buffers : dict of str to (n, k) array
-        ``vertex_positions``, and if the mesh has them ``vertex_normals``, ``vertex_texcoords``, and attributes of
-        vertices or faces, ``vertex_NAME`` or ``face_NAME``.
-    bsdf, emitter, interior : mi.Object, optional
-        Loaded; the last is the medium inside.
-    averages_normals : bool
-        Whether vertices get the averages of the normals of their triangles. Without normals, triangles are flat.
-    """
+    """Make a mesh of the current variant."""
     import mitsuba as mi
 
     properties = mi.Properties()

@@ -19,15 +19,12 @@ OPENEXR_THREADS = 2
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
 
 
-def variant_module(mi: ModuleType | str) -> ModuleType:
+def variant_module(
+    mi: ModuleType | str,  # `mitsuba` with a variant set, a variant such as `mitsuba.llvm_ad_rgb`, or its name
+) -> ModuleType:
     """Where a variant's types and functions are.
 
     Raises ValueError if it is something else, there is no such variant, or none is set.
-
-    Parameters
-    ----------
-    mi : module or str
-        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name.
     """
     import mitsuba
 

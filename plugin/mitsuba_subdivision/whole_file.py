@@ -48,16 +48,14 @@ def whole_file(path: Path) -> Iterator[Path]:
         _unfinished.discard(beside)
 
 
-def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
+def require_writable(
+    path: Path,
+    inputs: Iterable[Path] = (),  # Files that the work reads
+) -> None:
     """Check that a file can be written to a path, before its contents are computed; create its folder.
 
     Raises OSError if ``path`` is a folder, or protected from writing, or the folder cannot be made or written to.
     Raises ValueError if ``path`` is one of the inputs.
-
-    Parameters
-    ----------
-    inputs : iterable of Path, optional
-        Files that the work reads; ``path`` must not be one of them.
     """
     for other in inputs:
         if path.exists() and other.exists() and path.samefile(other):
@@ -83,10 +81,7 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Create a folder and its parents unless they exist.
-
-    Raises OSError if the path is a file, or the folder cannot be made.
-    """
+    """Create a folder and its parents unless they exist. Raises OSError if that cannot be, as where there is a file."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:

@@ -18,21 +18,12 @@ _PIXELS_AT_ONCE = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """Values of an expression over a part of the plane of texture coordinates.
+    """Values of an expression over a part of the plane of texture coordinates."""
 
-    Parameters
-    ----------
-    values : (h, w, k) float32
-        The first row is the uppermost.
-    to_uv : (3, 3) float64
-        From texture coordinates, whose v points up, to those of the picture, which are from 0 to 1.
-    wrap : str
-        Mitsuba's name.
-    """
-
-    values: NDArray[np.float32]
+    values: NDArray[np.float32]  # (h, w, k): the first row is the uppermost
+    # (3, 3): from texture coordinates, whose v points up, to those of the picture, which are from 0 to 1
     to_uv: NDArray[np.float64]
-    wrap: str
+    wrap: str  # Mitsuba's name
 
 
 # Values (h, w, k) of a picture's channel, and from texture coordinates to those of the picture; or None.

@@ -9,7 +9,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
-from .materialx_nodes import constant, is_constant, node
+from .materialx_nodes import LUMINANCE, constant, is_constant, node
 from .stage_warnings import StageWarnings
 from .surface_models import COSINE_82, NEUTRAL, conductor, conductor_reflectance, schlick_reflectance, with_shape
 from .textures import Textures
@@ -35,7 +35,6 @@ _DEEPEST = 24
 _ROULETTE = 3
 # Difference of reflectances that nobody sees at an edge.
 _VISIBLE = 0.05
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class Bsdfs:
@@ -82,8 +81,7 @@ def interior(material: MaterialContents | None) -> SceneNode:
     extinction = -np.log(color) / _first(material.inputs["depth"])
     # Mitsuba takes colours up to 1, and a factor.
     most = max(float(extinction.max()), 1e-6)
-    medium = {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}
-    return {"interior": medium}
+    return {"interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}}
 
 
 def absorbs(material: MaterialContents) -> bool:
@@ -125,10 +123,8 @@ class _Values:
         if isinstance(given, PrimvarContents) and varying:
             return given
         if varying:
-            self.notes.add(
-                "primvars that vary over a mesh are ignored within expressions; their fallbacks are used",
-                self._shape.name,
-            )
+            what = "primvars that vary over a mesh are ignored within expressions; their fallbacks are used"
+            self.notes.add(what, self._shape.name)
         return with_shape(given, {name: self._shape.constants[name] for name in names & set(self._shape.constants)})
 
     def color(self, given: Input) -> SceneNode:
@@ -238,19 +234,17 @@ class _Surface:
         ratio = self._ratio()
         if ratio is not None:
             # The ratio of its widths is 1 - 0.9 anisotropic.
-            found["anisotropic"] = values.number(
-                node("divide", "float", in1=node("invert", "float", in_=ratio, amount=1.0), in2=0.9)
-            )
+            rest = node("invert", "float", in_=ratio, amount=1.0)
+            found["anisotropic"] = values.number(node("divide", "float", in1=rest, in2=0.9))
         if not self._is("coat", 0):
-            found["clearcoat"] = values.number(
-                node("multiply", "float", in1=inputs["coat"], in2=self._reflectance("coat_ior") / _COAT)
-            )
+            factor = self._reflectance("coat_ior") / _COAT
+            found["clearcoat"] = values.number(node("multiply", "float", in1=inputs["coat"], in2=factor))
             found["clearcoat_gloss"] = self._gloss()
         if not self._is("sheen", 0):
-            color = values.mean(inputs["sheen_color"])
-            brightness = float(np.broadcast_to(color, (3,)) @ _LUMINANCE)
+            color = np.broadcast_to(values.mean(inputs["sheen_color"]), (3,))
+            brightness = float(color @ LUMINANCE)
             found["sheen"] = values.number(node("multiply", "float", in1=inputs["sheen"], in2=brightness))
-            if np.ptp(np.broadcast_to(color, (3,))) > 0:
+            if np.ptp(color) > 0:
                 self._leave("colours of sheen only set its brightness; it is white")
         return found
 
@@ -285,7 +279,7 @@ class _Surface:
     def _glass(self) -> SceneNode:
         if not self._is("thin", 0):
             return self._sheet(1.0)
-        eta = float(self._values.mean(self._inputs["ior"]).ravel()[0])
+        eta = _first(self._values.mean(self._inputs["ior"]))
         found: SceneNode = {
             "int_ior": float(np.clip(eta, 1 / _MOST_ETA, _MOST_ETA)) if abs(eta - 1) > _MIRROR else 1 + _MIRROR,
             "ext_ior": 1.0,
@@ -319,10 +313,9 @@ class _Surface:
 
     def _reflectance(self, name: str) -> float:
         """What an index of refraction reflects head-on."""
-        eta = float(self._values.mean(self._inputs[name]).ravel()[0])
+        eta = max(_first(self._values.mean(self._inputs[name])), 0.0)
         if not is_constant(self._inputs[name]):
             self._leave("textures of indices of refraction are replaced by their means")
-        eta = max(eta, 0.0)
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
@@ -332,7 +325,7 @@ class _Surface:
             self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
             self._leave("textures of specular weights and colours are replaced by their means")
-        factor = float(self._values.mean(self._inputs["specular"]).ravel()[0]) * float(color @ _LUMINANCE)
+        factor = _first(self._values.mean(self._inputs["specular"])) * float(color @ LUMINANCE)
         root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
         return float((1 + root) / (1 - root))
 
@@ -342,7 +335,7 @@ class _Surface:
             return None
         ratio = node("invert", "float", in_=self._inputs["anisotropy"], amount=1.0)
         ratio = node("max", "float", in1=ratio, in2=0.02)
-        quarters = float(self._values.mean(self._inputs["rotation"]).ravel()[0]) * 4
+        quarters = _first(self._values.mean(self._inputs["rotation"])) * 4
         if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
             self._leave("rotations of anisotropy are rounded to quarter turns")
         return node("divide", "float", in1=1.0, in2=ratio) if round(quarters) % 2 else ratio

@@ -14,34 +14,17 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class TextureContents:
-    """An image that an input of a material reads, ``scale * image + bias``.
+    """An image that an input of a material reads, ``scale * image + bias``."""
 
-    Parameters
-    ----------
-    file : str
-        Path; ``a.usdz[b.png]`` for a file in an archive.
-    channel : str
-        "rgb", "r", "g", "b" or "a"; within a `NodeContents` also "rg" and "rgba".
-    color_space : "auto", "raw" or "sRGB"
-    wrap : str
-        Mitsuba's name: "repeat", "clamp" or "mirror".
-    to_uv : (3, 3) float64
-        From texture coordinates to those of the picture, whose v points up.
-    texcoords : str
-        Name of the primvar that has the texture coordinates.
-    fallback : list of 4 floats
-        Where there is no such file.
-    """
-
-    file: str
-    channel: str
-    color_space: str
-    wrap: str
+    file: str  # Path; `a.usdz[b.png]` for a file in an archive
+    channel: str  # "rgb", "r", "g", "b" or "a"; within a `NodeContents` also "rg" and "rgba"
+    color_space: str  # "auto", "raw" or "sRGB"
+    wrap: str  # Mitsuba's name: "repeat", "clamp" or "mirror"
     scale: list[float]
     bias: list[float]
-    to_uv: NDArray
-    texcoords: str
-    fallback: list[float]
+    to_uv: NDArray  # (3, 3) float64: from texture coordinates to those of the picture, whose v points up
+    texcoords: str  # Name of the primvar that has the texture coordinates
+    fallback: list[float]  # Four numbers, where there is no such file
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,21 +37,12 @@ class PrimvarContents:
 
 @dataclass(frozen=True, eq=False)
 class NodeContents:
-    """A node of a shading network: what MaterialX computes of its inputs.
+    """A node of a shading network: what MaterialX computes of its inputs."""
 
-    Parameters
-    ----------
-    category : str
-        Such as "multiply"; see `materialx_nodes.OPERATIONS`.
-    type : str
-        Of its output: "float", "color3", "vector2" and so on.
-    inputs : dict of str to Input
-        All that the category has, but for those of the surface itself, such as its normal. A string is an option; that
-        of the category "texcoord" names the primvar.
-    """
-
-    category: str
-    type: str
+    category: str  # Such as "multiply"; see `materialx_nodes.OPERATIONS`
+    type: str  # Of its output: "float", "color3", "vector2" and so on
+    # All that the category has, but for those of the surface itself, such as its normal. A string is an option; that of
+    # the category "texcoord" names the primvar.
     inputs: dict[str, Input]
 
 
@@ -95,18 +69,10 @@ def leaves(given: Input) -> list[TextureContents | PrimvarContents | NodeContent
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """What a surface looks like, in the terms that all models of surfaces share.
+    """What a surface looks like, in the terms that all models of surfaces share."""
 
-    Parameters
-    ----------
-    name : str
-        Path of the prim.
-    inputs : dict of str to Input
-        By the names of `surface_models.NEUTRAL`, those that are not neutral.
-    """
-
-    name: str
-    inputs: dict[str, Input]
+    name: str  # Path of the prim
+    inputs: dict[str, Input]  # By the names of `surface_models.NEUTRAL`, those that are not neutral
 
     @property
     def is_emissive(self) -> bool:
@@ -139,36 +105,17 @@ class MaterialContents:
 
 @dataclass(frozen=True, eq=False)
 class ShapeContents:
-    """A mesh, or those faces of a mesh that have one material.
+    """A mesh, or those faces of a mesh that have one material."""
 
-    Parameters
-    ----------
-    name : str
-        Path of the prim.
-    cage : CageContents
-        In the prim's own space. Without a scheme, it is a polygon mesh.
-    to_world : (4, 4) float64
-        To the world, or to the space of the group that the shape belongs to.
-    normals : (n_h, 3) float64 or None
-        Of a polygon mesh, at its face corners; None for facets.
-    material : int or None
-        Index of a material.
-    constants : dict of str to list of floats
-        Attributes with one value for the whole mesh.
-    radiance : list of 3 floats or None
-        If the mesh is a light.
-    shown_faces : (n,) int or None
-        Faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon meshes and
-        of large surfaces have the other faces as holes.
-    """
-
-    name: str
-    cage: CageContents
-    to_world: NDArray
-    normals: NDArray | None = None
-    material: int | None = None
-    constants: dict[str, list[float]] = field(default_factory=dict)
-    radiance: list[float] | None = None
+    name: str  # Path of the prim
+    cage: CageContents  # In the prim's own space. Without a scheme, it is a polygon mesh.
+    to_world: NDArray  # (4, 4) float64: to the world, or to the space of the group that the shape belongs to
+    normals: NDArray | None = None  # (n_h, 3) float64: of a polygon mesh, at its face corners; None for facets
+    material: int | None = None  # Index of a material
+    constants: dict[str, list[float]] = field(default_factory=dict)  # Attributes with one value for the whole mesh
+    radiance: list[float] | None = None  # Three numbers, if the mesh is a light
+    # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
+    # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
 
 
@@ -183,36 +130,18 @@ class InstanceContents:
 
 @dataclass(frozen=True, eq=False)
 class LightContents:
-    """A light.
+    """A light."""
 
-    Parameters
-    ----------
-    name : str
-        Path of the prim.
-    kind : str
-        "distant", "rect", "disk", "sphere", "point", "spot", "cylinder" or "dome".
-    to_world : (4, 4) float64
-    emission : list of 3 floats
-        Colour times intensity.
-    is_normalized : bool
-        Whether the emission is that of the whole light: its area does not change its power.
-    size : list of floats
-        Angle in degrees, width and height, radius, or length and radius. Of a spot, its radius, and the angle and the
-        softness of its cone.
-    texture : str or None
-        Path of a picture that multiplies the radiance.
-    pole : "y", "z" or "scene"
-        Pole axis of a dome's image; "scene" for the stage's up axis.
-    """
-
-    name: str
-    kind: str
-    to_world: NDArray
-    emission: list[float]
-    is_normalized: bool = False
+    name: str  # Path of the prim
+    kind: str  # "distant", "rect", "disk", "sphere", "point", "spot", "cylinder" or "dome"
+    to_world: NDArray  # (4, 4) float64
+    emission: list[float]  # Three numbers: colour times intensity
+    is_normalized: bool = False  # Whether the emission is that of the whole light: its area does not change its power
+    # Angle in degrees, width and height, radius, or length and radius. Of a spot, its radius, and the angle and the
+    # softness of its cone.
     size: list[float] = field(default_factory=list)
-    texture: str | None = None
-    pole: str = "y"
+    texture: str | None = None  # Path of a picture that multiplies the radiance
+    pole: str = "y"  # Pole axis of a dome's image: "y", "z", or "scene" for the stage's up axis
 
     @property
     def is_usable(self) -> bool:
@@ -224,36 +153,23 @@ class LightContents:
 
 @dataclass(frozen=True, eq=False)
 class CameraContents:
-    """A camera, which looks along -z with y up.
+    """A camera, which looks along -z with y up."""
 
-    Parameters
-    ----------
-    name : str
-        Path of the prim.
-    to_world : (4, 4) float64
-    aperture, offset : list of 2 floats
-        Of the film, horizontal and vertical, in the same unit as the focal length; for orthographic cameras, in the
-        world's.
-    lens_radius, focus_distance : float
-        In the world's units; 0 without depth of field.
-    shutter : list of 2 floats
-        When it opens and closes, in time codes after the time.
-    conform_policy : str
-        How the aperture fits a picture of another aspect ratio; see `sensors.film_window`.
-    """
-
-    name: str
-    to_world: NDArray
+    name: str  # Path of the prim
+    to_world: NDArray  # (4, 4) float64
     is_perspective: bool
+    # Two numbers each: of the film, horizontal and vertical, in the same unit as the focal length; for orthographic
+    # cameras, in the world's
     aperture: list[float]
     offset: list[float]
     focal_length: float
     near: float
     far: float
+    # In the world's units; 0 without depth of field
     lens_radius: float
     focus_distance: float
-    shutter: list[float]
-    conform_policy: str = "expandAperture"
+    shutter: list[float]  # When it opens and closes, in time codes after the time
+    conform_policy: str = "expandAperture"  # For pictures of another aspect ratio; see `sensors.film_window`
 
     @property
     def is_usable(self) -> bool:

@@ -88,7 +88,7 @@ def with_copies(
             of_cage.setdefault((id(shape.cage), id(shape.shown_faces)), []).append(shape)
     many = [each for each in of_cage.values() if len(each) >= LEAST_INSTANCES]
     for alike in many:
-        needed = np.concatenate([rates.get(each, _ONE) for each in alike])
+        needed = np.concatenate([rates.get(each, np.ones(1, np.int64)) for each in alike])
         placed.append(_Copies(f"/copies{alike[0].name}", alike[0], np.stack([each.to_world for each in alike]), needed))
     if not placed:
         return contents, {}
@@ -115,9 +115,6 @@ def with_copies(
     alone = [shape for shape in contents.shapes if not any(shape in alike for alike in many)]
     kept: dict[str, Any] = {} if len(contents.instances) < LEAST_INSTANCES else {"groups": [], "instances": []}
     return replace(contents, shapes=[*alone, *found], **kept), found
-
-
-_ONE = np.ones(1, np.int64)
 
 
 def _of_instances(contents: SceneContents, rates: Mapping[ShapeContents, IntArray]) -> list[_Copies]:

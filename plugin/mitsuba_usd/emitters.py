@@ -57,12 +57,8 @@ def _rect(light: LightContents, _up: str, textures: Textures) -> SceneNode:
         # The image is upright for a viewer that looks at the light.
         upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
         emission = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
-    matrix = light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])
-    return {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f(matrix.tolist()),
-        "emitter": {"type": "area", "radiance": emission},
-    }
+    matrix = mi.ScalarTransform4f((light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])).tolist())
+    return {"type": "rectangle", "to_world": matrix, "emitter": {"type": "area", "radiance": emission}}
 
 
 def _disk(light: LightContents, _up: str, _textures: Textures) -> SceneNode:
@@ -162,12 +158,11 @@ def are_lamps_in_the_way(lights: list[LightContents], points: NDArray[np.float64
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = np.linalg.norm(points - middle, axis=1).max()
+    sources = [each for each in lights if each.kind != "dome" or each.texture is not None]
     for lamp in (each for each in lights if each.kind in _WITH_SHAPES):
         place = lamp.to_world[:3, 3]
-        for other in (each for each in lights if each is not lamp):
+        for other in (each for each in sources if each is not lamp):
             if other.kind == "dome":
-                if other.texture is None:
-                    continue
                 return True
             start, start_radius = other.to_world[:3, 3], _bounding_radius(other)
             if other.kind == "distant":

@@ -35,27 +35,21 @@ _FOLDERS = ("stdlib", "pbrlib", "bxdf", "cmlib", "nprlib")
 MISSING = 'MaterialX materials are ignored, as the package materialx is missing; pip install "mitsuba-subdivision[usd]"'
 
 
-def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
+def with_documents(
+    stage: Usd.Stage,
+    name: str,  # Beginning of messages
+) -> Usd.Stage:
     """The stage, or if it refers to MaterialX documents, one of copies of its layers that has them.
 
-    Parameters
-    ----------
-    name : str
-        Beginning of messages.
-
-    Warns
-    -----
-    CageWarning
-        About each document that cannot be read.
+    Warns about each document that cannot be read.
     """
     from pxr import Sdf, Usd
 
-    is_able = Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None
-    if is_able or not has_materialx():
+    if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None or not has_materialx():
         return stage
     copies = _Copies(name)
     root = copies.identifier(stage.GetRootLayer())
-    return stage if not copies.layers else Usd.Stage.Open(Sdf.Layer.Find(root))
+    return Usd.Stage.Open(Sdf.Layer.Find(root)) if copies.layers else stage
 
 
 class _Copies:
@@ -143,9 +137,8 @@ def _beside(path: str, document: str) -> str:
         # What is not there, as the pattern of a picture's tiles, may come back as it is.
         return found if found != path else posixpath.normpath(posixpath.join(posixpath.dirname(document), path))
     package, inner = Ar.SplitPackageRelativePathInner(document)
-    return str(
-        Ar.JoinPackageRelativePath([package, posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))])
-    )
+    found = posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))
+    return str(Ar.JoinPackageRelativePath([package, found]))
 
 
 class _Material:
@@ -179,8 +172,7 @@ class _Material:
         material = UsdShade.ConnectableAPI.Get(self._stage, self._path)
         for each in shader.getInputs():
             given = self._add_input(material, each, self._path, self._source)
-            if given is not None:
-                prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
+            prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
         return out.GetAttr().GetPath()
 
     def _add_nodes(self, graph: Any, path: Sdf.Path) -> None:
@@ -206,13 +198,10 @@ class _Material:
         name = "" if definition is None else definition.getName()
         implementation = None if definition is None else definition.getImplementation()
         if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
-            graph = UsdShade.NodeGraph.Define(self._stage, path)
-            connectable = graph.ConnectableAPI()
+            connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
             own = {each.getName() for each in node.getInputs()}
-            for each in definition.getActiveInputs():
-                if each.getName() not in own:
-                    self._add_input(connectable, each, parent, container)
-            for each in node.getInputs():
+            others = [each for each in definition.getActiveInputs() if each.getName() not in own]
+            for each in (*others, *node.getInputs()):
                 self._add_input(connectable, each, parent, container)
             self._add_nodes(implementation, path)
             return path
@@ -225,7 +214,7 @@ class _Material:
         return path
 
     def _add_input(self, connectable: Any, given: MaterialX.Input, parent: Sdf.Path, container: Any) -> Any:
-        """Add an input with its value or connection; None if it is of a type that USD lacks."""
+        """Add an input with its value or connection."""
         port = connectable.CreateInput(_prim_name(given.getName()), _sdf_type(given.getType()))
         if not self._connect(port.GetAttr(), given, parent, container):
             self._set(port.GetAttr(), given)
@@ -274,10 +263,8 @@ class _Material:
         elif kind == "string":
             attribute.Set(text)
         elif kind in _TYPES:
-            value = given.getValue()
-            attribute.Set(
-                value if isinstance(value, (bool, int, float)) else type(attribute.GetTypeName().defaultValue)(*value)
-            )
+            value, type_of_usd = given.getValue(), type(attribute.GetTypeName().defaultValue)
+            attribute.Set(value if isinstance(value, (bool, int, float)) else type_of_usd(*value))
         space = given.getActiveColorSpace()
         if space and kind in ("filename", "color3", "color4"):
             attribute.SetColorSpace(space)

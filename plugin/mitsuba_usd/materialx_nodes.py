@@ -23,7 +23,7 @@ CHANNELS = {
     "boolean": 1, "integer": 1, "float": 1, "vector2": 2, "vector3": 3, "color3": 3, "vector4": 4, "color4": 4,
 }  # fmt: skip
 # Luminance of linear Rec. 709.
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 class Sampling(Protocol):
@@ -108,10 +108,10 @@ def _converted(n: _Arguments) -> Values:
     """Of another width: repeated, cut off, or with an alpha of 1, or with zeros."""
     values, width = n.value_in, n.width
     there = values.shape[-1]
-    if there == 1 and n.kind != "color4":
-        return np.broadcast_to(values, (*values.shape[:-1], width))
+    if there == 1 and n.kind == "color4":
+        return _stacked((values, values, values, np.ones_like(values)))
     if there == 1:
-        return _stacked((np.broadcast_to(values, (*values.shape[:-1], 3)), np.ones_like(values)))
+        return np.broadcast_to(values, (*values.shape[:-1], width))
     if there >= width:
         return values[..., :width]
     rest = np.zeros((*values.shape[:-1], width - there), dtype=values.dtype)
@@ -140,7 +140,7 @@ def _smooth_step(n: _Arguments) -> Values:
 
 
 def _luminance(n: _Arguments) -> Values:
-    coefficients = n.inputs.get("lumacoeffs", _LUMINANCE)
+    coefficients = n.inputs.get("lumacoeffs", LUMINANCE)
     luma = np.sum(n.value_in[..., :3] * coefficients, axis=-1, keepdims=True)
     return _with_alpha(np.broadcast_to(luma, (*luma.shape[:-1], 3)), n.value_in)
 
@@ -304,11 +304,8 @@ def node(
     """
     given = {"in" if name == "in_" else name: value for name, value in inputs.items()}
     if category not in SAMPLED and all(map(is_constant, given.values())):
-        values = operation(
-            category,
-            kind,
-            {name: value if isinstance(value, str) else constant(value) for name, value in given.items()},
-        )
+        numbers = {name: value if isinstance(value, str) else constant(value) for name, value in given.items()}
+        values = operation(category, kind, numbers)
         return _plain(np.broadcast_to(values, (CHANNELS[kind],)) if values.shape[-1] == 1 else values)
     simple = _SIMPLER.get(category)
     found = None if simple is None else simple(kind, given)

@@ -116,9 +116,8 @@ def _sphere(number: Number) -> Polygons:
 
 def _cylinder(number: Number) -> Polygons:
     radius, half = number("radius", 1.0), number("height", 2.0) / 2
-    return _revolved(
-        [_line((0, -half), (radius, -half)), _line((radius, -half), (radius, half)), _line((radius, half), (0, half))]
-    )
+    lower, upper = (radius, -half), (radius, half)
+    return _revolved([_line((0, -half), lower), _line(lower, upper), _line(upper, (0, half))])
 
 
 def _cone(number: Number) -> Polygons:

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.progress import counted
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.variants import SceneNode
-from numpy.typing import NDArray
 
 from .bsdfs import Bsdfs, interior, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
@@ -76,7 +74,8 @@ class SceneEntries:
         for each in contents.instances:
             group = groups[each.group]
             if group is not None:
-                self._add(each.name, self._instance(group, each.to_world))
+                to_world = mi.ScalarTransform4f(each.to_world.tolist())
+                self._add(each.name, {"type": "instance", "group": {"type": "ref", "id": group}, "to_world": to_world})
         for light in one_environment(contents.lights, self._notes):
             entry = emitter(light, contents.up, self._textures)
             is_clear = self._has_clear_lamps and "emitter" in entry
@@ -91,13 +90,6 @@ class SceneEntries:
             key = f"{base}_{number}"
         self.scene[key] = entry
         return key
-
-    def _instance(self, group: str, to_world: NDArray[np.float64]) -> SceneNode:
-        return {
-            "type": "instance",
-            "group": {"type": "ref", "id": group},
-            "to_world": mi.ScalarTransform4f(to_world.tolist()),
-        }
 
     def _shape(self, shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None if it cannot be used, with a warning."""

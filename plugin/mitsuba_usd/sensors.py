@@ -44,9 +44,8 @@ def sensor(
     common["to_world"] = mi.ScalarTransform4f(matrix.tolist())
     if camera.lens_radius > 0:
         # A thin lens has no principal point: the film is a window of a larger one, whose middle is on the axis.
-        halves = [
-            round(2 * size * camera.offset[axis] / (wide, high)[axis]) for axis, size in enumerate((width, height))
-        ]
+        sides = zip(size, camera.offset, (wide, high), strict=True)
+        halves = [round(2 * pixels * offset / length) for pixels, offset, length in sides]
         full = width + abs(halves[0]), height + abs(halves[1])
         window = {
             "width": full[0],

@@ -73,7 +73,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
         lengths = np.linalg.norm(turned, axis=1, keepdims=True)
         vertices["vertex_normals"] = turned / np.where(lengths > 0, lengths, 1)
     for name, attribute in data.items():
-        vertices[f"vertex_{name}"] = _at_vertices(attribute, vertex)
+        vertices[f"vertex_{name}"] = attribute.values[vertex if attribute.indices is None else attribute.indices]
     return PolygonMesh(shape.name, triangles, vertices)
 
 
@@ -86,7 +86,3 @@ def _triangles(cage: CageContents) -> IntArray:
     index = ragged.index_in_row(counts)
     start = np.repeat(first, counts)
     return np.stack([start, start + index + 1, start + index + 2], axis=1)
-
-
-def _at_vertices(attribute: Attribute, vertex: IntArray) -> NDArray:
-    return attribute.values[vertex if attribute.indices is None else attribute.indices]

@@ -40,18 +40,10 @@ TENTHS = 0.1
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """What the render settings of a stage say about the picture's frame.
-
-    Parameters
-    ----------
-    camera : str or None
-        Path of the camera.
-    conform_policy : str
-        One of `CONFORM_POLICIES`.
-    """
+    """What the render settings of a stage say about the picture's frame."""
 
     resolution: list[int] | None = None
-    camera: str | None = None
+    camera: str | None = None  # Its path
     conform_policy: str = CONFORM_POLICIES[0]
     has_motion_blur: bool = True
     has_depth_of_field: bool = True

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pxr import Usd, UsdShade
 
 SURFACE = "UsdPreviewSurface"
-# Occlusion is what a path tracer computes itself.
 # Inputs of the nodes of its networks.
 _INPUTS = {
     "UsdUVTexture": {"file", "st", "wrapS", "wrapT", "fallback", "scale", "bias", "sourceColorSpace"},
@@ -36,20 +35,14 @@ _DEEPEST = 16
 
 
 class MaterialReader:
-    """Reads materials, each once.
-
-    Attributes
-    ----------
-    materials : list of MaterialContents
-        Of those that are equal, the first.
-    """
+    """Reads materials, each once."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time = time
         self._notes = notes
         self._networks = NetworkReader(time, notes)
         self._numbers: dict[str, int | None] = {}
-        self.materials: list[MaterialContents] = []
+        self.materials: list[MaterialContents] = []  # Of those that are equal, the first
 
     def bound(self, prim: Usd.Prim) -> int | None:
         """Number of the material bound to a prim; None if there is none or it is not supported."""
@@ -111,6 +104,7 @@ class MaterialReader:
         """Model and inputs of a surface shader; None if it is of no known model."""
         kind = surface.GetShaderId() or ""
         if kind == SURFACE:
+            # Occlusion is what a path tracer computes itself.
             note_unknown_inputs(surface, {*PREVIEW, "normal", "occlusion", *MODELS[SURFACE].left}, self._notes)
             inputs = {name: self._input(surface, name) for name in (*PREVIEW, "normal", *MODELS[SURFACE].left)}
             # The only word among numbers.
@@ -162,7 +156,7 @@ class MaterialReader:
         found = np.asarray(self._value(shader, name, usual), dtype=np.float64)
         if found.shape != (4,):
             raise TypeError(f"{name} is {found.tolist()}; expected four numbers")
-        return [float(each) for each in found]
+        return found.tolist()
 
     def _word(self, shader: UsdShade.Shader, name: str, known: Collection[str], usual: str) -> str:
         """Value of an input that is one of some words; the usual one, with a note, in place of others."""

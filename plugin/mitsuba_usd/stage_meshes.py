@@ -82,10 +82,8 @@ class ShapeReader:
                 cages[choice] = reader.contents(is_local=True, choice=choice)
             cage = cages[choice]
             if cage.texcoords is not None and not all(map(UsdGeom.PrimvarsAPI(prim).HasPrimvar, choice.texcoords)):
-                self._notes.add(
-                    f'texture coordinates "{choice.texcoords[0]}" are missing; the first others of the mesh are used',
-                    prim.GetPath(),
-                )
+                what = f'texture coordinates "{choice.texcoords[0]}" are missing; the first others of the mesh are used'
+                self._notes.add(what, prim.GetPath())
             normals = read_normals(reader, cage) if cage.scheme is None else None
             shown = None
             if len(materials) > 1:
@@ -103,9 +101,8 @@ class ShapeReader:
             return
         time = self._code.GetValue()
         if time not in mesh.GetPointsAttr().GetBracketingTimeSamples(time):
-            self._notes.add(
-                "velocities of meshes are ignored; their points are interpolated between samples", mesh.GetPath()
-            )
+            what = "velocities of meshes are ignored; their points are interpolated between samples"
+            self._notes.add(what, mesh.GetPath())
 
     def _materials_of_faces(self, mesh: UsdGeom.Mesh, reader: MeshReader) -> tuple[list[int | None], IntArray]:
         """Materials of a mesh, and for each face the index of its own among them."""
@@ -134,9 +131,8 @@ class ShapeReader:
         contents = self._materials.materials[material]
         names = contents.texcoords()
         if len(names) > 1:
-            self._notes.add(
-                "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set", contents.name
-            )
+            what = "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set"
+            self._notes.add(what, contents.name)
         return PrimvarChoice(tuple(names[:1]), tuple(sorted(contents.primvars())))
 
     def _shape(
@@ -153,9 +149,8 @@ class ShapeReader:
         if contents and contents.texcoords() and cage.texcoords is None:
             # Of those that are there and do not fit, there is a message already.
             if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(contents.texcoords()[0]):
-                self._notes.add(
-                    "prims without texture coordinates have the colour of their texture at (0, 0)", prim.GetPath()
-                )
+                what = "prims without texture coordinates have the colour of their texture at (0, 0)"
+                self._notes.add(what, prim.GetPath())
             cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
         names = COLORS if contents is None else contents.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
@@ -182,11 +177,9 @@ class ShapeReader:
             indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._code))
             values = values[indices] if ((indices >= 0) & (indices < len(values))).all() else np.zeros(0)
         if values.dtype.kind == "f" and values.size in (1, 3) and np.isfinite(values).all():
-            return list(values.astype(np.float64).ravel().tolist())
-        self._notes.add(
-            "constant primvars are ignored unless they have one value of one or three finite numbers",
-            primvar.GetAttr().GetPath(),
-        )
+            return values.astype(np.float64).ravel().tolist()
+        what = "constant primvars are ignored unless they have one value of one or three finite numbers"
+        self._notes.add(what, primvar.GetAttr().GetPath())
         return []
 
 

@@ -103,8 +103,7 @@ class NetworkReader:
         """Default of an input without a value or connection."""
         geometry = declared.getDefaultGeomPropString()
         if geometry:
-            is_uv = geometry == "UV0"
-            return NodeContents("texcoord", "vector2", {"name": "st"}) if is_uv else None
+            return NodeContents("texcoord", "vector2", {"name": "st"}) if geometry == "UV0" else None
         text = declared.getValueString()
         return numbers(text, declared.getType()) if text or declared.getType() in ("string", "filename") else None
 
@@ -133,16 +132,14 @@ class NetworkReader:
         if key not in self._known:
             # A network that leads to itself has no value.
             self._known[key] = 0.0
-            name = shader.GetShaderId() or ""
+            name, path = shader.GetShaderId() or "", shader.GetPath()
             # Shaders of USD's own have definitions, too.
             definition = library().getNodeDef(name) or library().getNodeDef(f"ND_{name}")
             if definition is None:
-                self._leave(f'"{shader.GetShaderId() or shader.GetPrim().GetTypeName()}"', shader.GetPath())
+                self._leave(f'"{name or shader.GetPrim().GetTypeName()}"', path)
             else:
                 self._note_unknown_inputs(shader, definition)
-                self._known[key] = self._made(
-                    definition, output, lambda each: self._input(shader, each), shader.GetPath()
-                )
+                self._known[key] = self._made(definition, output, lambda each: self._input(shader, each), path)
         return self._known[key]
 
     def _note_unknown_inputs(self, shader: UsdShade.Shader, definition: MaterialX.NodeDef) -> None:
@@ -174,7 +171,7 @@ class NetworkReader:
             return NodeContents("texcoord", "vector2", {"name": "st"})
         implementation = definition.getImplementation()
         is_known = category in OPERATIONS or category in SAMPLED or category in _SPECIAL
-        if isinstance(implementation, MaterialX.NodeGraph) and category not in ("convert",) and not is_known:
+        if isinstance(implementation, MaterialX.NodeGraph) and not is_known:
             return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, prim)
         # Slopes are those along texture coordinates.
         unused = {"texcoord"} if category == "heighttonormal" else set()
@@ -258,7 +255,7 @@ class NetworkReader:
             return replace(texture, texcoords=where.name)
         found = leaves(where)
         names = {str(each.inputs["name"]) for each in found if isinstance(each, NodeContents)}
-        if len(names) == 1 and len(found) == sum(isinstance(each, NodeContents) for each in found):
+        if len(names) == 1 and all(isinstance(each, NodeContents) for each in found):
             matrix_or_none = _affine_map(where)
             if matrix_or_none is not None:
                 return replace(texture, to_uv=matrix_or_none, texcoords=names.pop())
@@ -284,20 +281,17 @@ class NetworkReader:
         if picture is None or scale is None or is_constant(picture):
             return None
         if is_constant(scale):
-            both = constant(scale, 2)
-            factor = [2 * both[0], 2 * both[1], 2.0]
-            offset = [-both[0], -both[1], -1.0]
-            if isinstance(picture, TextureContents):
-                turned = affine(picture, factor, offset)
-                if turned is not None:
-                    return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0])
-            scaled = node("multiply", "vector3", in1=picture, in2=[float(each) for each in factor])
-            return node("add", "vector3", in1=scaled, in2=[float(each) for each in offset])
+            x, y = constant(scale, 2).tolist()
+            factor, offset = [2 * x, 2 * y, 2.0], [-x, -y, -1.0]
+            turned = affine(picture, factor, offset) if isinstance(picture, TextureContents) else None
+            if turned is not None:
+                return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0])
+            scaled = node("multiply", "vector3", in1=picture, in2=factor)
+            return node("add", "vector3", in1=scaled, in2=offset)
         centred = node("add", "vector3", in1=node("multiply", "vector3", in1=picture, in2=2.0), in2=-1.0)
         parts = [node("extract", "float", in_=scale, index=float(k)) for k in (0, 1)]
-        return node(
-            "multiply", "vector3", in1=centred, in2=node("combine3", "vector3", in1=parts[0], in2=parts[1], in3=1.0)
-        )
+        factors = node("combine3", "vector3", in1=parts[0], in2=parts[1], in3=1.0)
+        return node("multiply", "vector3", in1=centred, in2=factors)
 
 
 _SPECIAL: dict[str, Callable[..., Input | None]] = {

@@ -125,9 +125,8 @@ class StageScenes:
             return [0.0]
         opens, closes = first.camera.shutter if first.camera else (0.0, 0.0)
         if opens >= closes:
-            found = "there is no camera"
-            if first.camera:
-                found = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
+            times = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
+            found = times if first.camera else "there is no camera"
             raise CageError(
                 f"{self.name}: {found}; expected a camera whose shutter opens before it closes, and render settings "
                 "without disableMotionBlur"
@@ -164,9 +163,8 @@ class StageScenes:
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes, self.name)
         if rest is not None and (turns or follows_sensor):
-            needed = texels_for_pictures(
-                contents, [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
-            )
+            sensors = [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
+            needed = texels_for_pictures(contents, sensors)
         if rest is None or not is_one_picture:
             contents, parameters = self._with_copies(contents, notes)
         else:
@@ -220,7 +218,8 @@ class StageScenes:
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes = LoadedShapes(self._with_copies(first, StageWarnings())[1])
-        rest = self._rest(first, points)
+        # Its camera has notes in `_sensor`.
+        rest = with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings(), self.name)
         if self._needed is None:
             self._needed = self._texels_for_frames(first, rest)
         before: tuple[SceneContents, SceneNode, LoadedScene] | None = None
@@ -248,10 +247,6 @@ class StageScenes:
             notes.warn(self.name, self._warned)
             before = given, seen, load_quietly({**made.scene, **rest, "sensor": seen}, filter_name)
             yield before[2]
-
-    def _rest(self, first: SceneContents, points: NDArray[np.float64]) -> SceneNode:
-        """What of a studio the first frame lacks; its camera has notes in `_sensor`."""
-        return with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings(), self.name)
 
     def _sensor(
         self, contents: SceneContents, first: SceneContents, rest: SceneNode, notes: StageWarnings
@@ -294,9 +289,8 @@ def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bo
 
 
 def _is_equal(a: Any, b: Any) -> bool:
-    return (
-        bool(np.array_equal(np.array(a.matrix), np.array(b.matrix))) if isinstance(a, mi.ScalarTransform4f) else a == b
-    )
+    is_transform = isinstance(a, mi.ScalarTransform4f)
+    return np.array_equal(np.array(a.matrix), np.array(b.matrix)) if is_transform else a == b
 
 
 def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
@@ -310,16 +304,14 @@ class StageReader:
     Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
 
     Raises OSError if the file cannot be read.
-
-    Parameters
-    ----------
-    camera : str, optional
-        Path of the camera; by default, that of the stage's render settings, or its first one.
-    warned : set of str, optional
-        Warnings about other files, without their names; those about this one are added.
     """
 
-    def __init__(self, path: str | Path, camera: str | None = None, warned: set[str] | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        camera: str | None = None,  # Its path; by default, that of the stage's render settings, or its first one
+        warned: set[str] | None = None,  # Warnings about other files, without their names; those about this are added
+    ) -> None:
         with Path(path).open("rb"):
             pass  # So that a missing file is an OSError, as for other formats.
         self._path, self._camera = path, camera

@@ -84,22 +84,15 @@ class _Subtree:
         return bool(self.shapes) and not self.lights and not any(is_hindered)
 
 
-def read_stage(path: str | Path, time: float | None = None, camera: str | None = None) -> SceneContents:
-    """Read a stage, in this process.
+def read_stage(
+    path: str | Path,
+    # Time code; by default, each value is the one that does not depend on time, or else its first sample
+    time: float | None = None,
+    camera: str | None = None,  # Its path; by default, that of the stage's render settings, or its first one
+) -> SceneContents:
+    """Read a stage, in this process. Warns about everything that is ignored, once for each kind.
 
     Raises CageError if the package usd-core is missing; if the file is malformed; if there is no such camera.
-
-    Parameters
-    ----------
-    time : float, optional
-        Time code; by default, each value is the one that does not depend on time, or else its first sample.
-    camera : str, optional
-        Path of the camera; by default, that of the stage's render settings, or its first one.
-
-    Warns
-    -----
-    CageWarning
-        About everything that is ignored, once for each kind.
     """
     return read_open_stage(open_checked(path), f'"{path}"', time, camera)
 
@@ -209,7 +202,9 @@ class _StageWalk:
 
     def _below(self, root: Usd.Prim) -> _Subtree:
         """Visible contents of a prim and its descendants."""
-        found, to_root = _Subtree(), _inverse(self._to_world(root))
+        found, to_world = _Subtree(), self._to_world(root)
+        # Of a singular transform, none of it is visible.
+        to_root = np.asarray(np.linalg.inv(to_world) if is_invertible(to_world) else np.eye(4))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
             name = str(prim.GetPath()).removeprefix(above)
@@ -231,7 +226,7 @@ class _StageWalk:
         elif prim.IsA(UsdGeom.PointInstancer):
             self._add_point_instances(UsdGeom.PointInstancer(prim), name, to_root, found)
         elif prim.IsA(UsdGeom.Imageable) and UsdGeom.Imageable(prim).ComputePurpose() not in HIDDEN_PURPOSES:
-            kind, path = str(prim.GetTypeName()), prim.GetPath()
+            kind = str(prim.GetTypeName())
             if prim.IsA(UsdGeom.Mesh) or kind in GPRIMS:
                 shapes = self._shapes.read(prim, to_root @ self._to_world(prim))
                 found.shapes += [replace(shape, name=name) for shape in shapes]
@@ -239,7 +234,7 @@ class _StageWalk:
                 light = self._light(prim, to_root @ self._to_world(prim))
                 found.lights += [] if light is None else [replace(light, name=name)]
             elif kind not in _SILENT:
-                self._notes.add(f"prims of type {kind} are ignored", path)
+                self._notes.add(f"prims of type {kind} are ignored", prim.GetPath())
 
     @contextmanager
     def _left_out_if_unusable(self, prim: Usd.Prim) -> Iterator[None]:
@@ -286,8 +281,10 @@ class _StageWalk:
     def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
         """Add an instance; instances that differ in appearance belong to different prototypes."""
         matrix = to_root @ self._to_world(prim)
-        if self._is_invertible(matrix, prim.GetPath()):
+        if is_invertible(matrix):
             found.instances.append(InstanceContents(name, self._prototype(self._appearance(prim), prim), matrix))
+        else:
+            self._notes.add(_SINGULAR, prim.GetPath())
 
     def _appearance(self, prim: Usd.Prim) -> tuple[object, ...]:
         """What an instance inherits that may make it look different from others of its prototype, and the prototype."""
@@ -397,13 +394,6 @@ class _StageWalk:
         firsts = [samples[0] for samples in (each.GetTimeSamples() for each in moving) if samples]
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
-    def _is_invertible(self, matrix: NDArray[np.float64], prim: object) -> bool:
-        """Whether a transform is invertible; records a problem if it is not."""
-        if is_invertible(matrix):
-            return True
-        self._notes.add(_SINGULAR, prim)
-        return False
-
     def _prototype(self, key: object, root: Usd.Prim) -> int:
         """Number of a prototype, which is read unless its key is known."""
         if key not in self._numbers:
@@ -430,10 +420,7 @@ class _StageWalk:
         return contents
 
     def _camera(self, path: str | None) -> UsdGeom.Camera | None:
-        """The camera of a path, or by default the first one; None if there is none.
-
-        Raises CageError if there is no camera of the path.
-        """
+        """The camera of a path, which raises CageError if there is none, or by default the first one, or None."""
         from pxr import Usd, UsdGeom
 
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
@@ -471,8 +458,3 @@ def _texts(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> tuple[str, str]:
         return "", ""
     indices = primvar.GetIndicesAttr()
     return str(value_at(primvar.GetAttr(), time)), str(value_at(indices, time)) if indices else ""
-
-
-def _inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of a prim's transform; arbitrary if singular, as nothing of the prim is visible then."""
-    return np.asarray(np.linalg.inv(matrix) if is_invertible(matrix) else np.eye(4))

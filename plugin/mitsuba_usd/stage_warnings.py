@@ -36,20 +36,12 @@ class StageWarnings:
         self._first.setdefault(kind, message)
         self.add(kind, prim)
 
-    def warn(self, name: str, warned: set[str] | None = None) -> None:
-        """Warn of each kind once.
-
-        Parameters
-        ----------
-        name : str
-            Name of the file, with which messages begin.
-        warned : set of str, optional
-            Kinds that have had a warning, which are skipped; the others are added.
-
-        Warns
-        -----
-        CageWarning
-        """
+    def warn(
+        self,
+        name: str,  # Of the file, with which messages begin
+        warned: set[str] | None = None,  # Kinds that have had a warning, which are skipped; the others are added
+    ) -> None:
+        """Warn of each kind once."""
         for kind, prims in self._prims.items():
             if warned is not None and kind in warned:
                 continue

@@ -113,40 +113,18 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
     metal = times(i("base_weight"), i("base_color"))
     diffuse = mixed(metal, i("subsurface_color"), i("subsurface_weight"))
     base = mixed(diffuse, times(i("specular_weight"), metal), metalness)
-    reflected = reflectance(i("coat_ior"))
     # What the coat reflects back inwards: (1 - K) / (1 - E K), with the albedo E of what is below.
-    inner = plus(
-        1.0,
-        number(
-            "multiply",
-            -1.0,
-            number(
-                "divide",
-                plus(1.0, number("multiply", -1.0, reflected)),
-                number("multiply", i("coat_ior"), i("coat_ior")),
-            ),
-        ),
-    )
-    outwards = plus(1.0, number("multiply", -1.0, inner))
-    darkening = node(
-        "divide",
-        "color3",
-        in1=times(outwards, WHITE),
-        in2=node("subtract", "color3", in1=WHITE, in2=times(inner, base)),
-    )
-    below = times(
-        times(
-            mixed(WHITE, darkening, number("multiply", coat, i("coat_darkening"))), mixed(WHITE, i("coat_color"), coat)
-        ),
-        _below_coat(coat, i("coat_ior")),
-    )
-    fourth = plus(
-        number("power", i("specular_roughness"), 4.0),
-        number("multiply", 2.0, number("power", i("coat_roughness"), 4.0)),
-    )
+    through = complement(reflectance(i("coat_ior")))
+    inner = complement(number("divide", through, number("multiply", i("coat_ior"), i("coat_ior"))))
+    kept = node("subtract", "color3", in1=WHITE, in2=times(inner, base))
+    darkening = node("divide", "color3", in1=times(complement(inner), WHITE), in2=kept)
+    darkened = mixed(WHITE, darkening, number("multiply", coat, i("coat_darkening")))
+    below = times(times(darkened, mixed(WHITE, i("coat_color"), coat)), _below_coat(coat, i("coat_ior")))
+    of_coat = number("multiply", 2.0, number("power", i("coat_roughness"), 4.0))
+    fourth = plus(number("power", i("specular_roughness"), 4.0), of_coat)
     rough = number_mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat)
     # Widths are r^2 sqrt(2 / (1 + (1 - a)^2)) and (1 - a) of that.
-    narrow = plus(1.0, number("multiply", -1.0, i("specular_roughness_anisotropy")))
+    narrow = complement(i("specular_roughness_anisotropy"))
     product = number("divide", number("multiply", 2.0, narrow), plus(1.0, number("multiply", narrow, narrow)))
     return {
         "base_color": times(base, below),
@@ -191,7 +169,7 @@ def preview_surface(i: Given) -> dict[str, Input]:
         "base_color": base,
         "metalness": 0.0 if is_specular else i("metallic"),
         "edge_color": edge_color(base, WHITE),
-        "specular_color": _over(i("specularColor"), 0.04) if is_specular else WHITE,
+        "specular_color": node("divide", "color3", in1=i("specularColor"), in2=0.04) if is_specular else WHITE,
         "ior": 1.5 if is_specular else i("ior"),
         "roughness": i("roughness"),
         "transmission": transmission,
@@ -213,7 +191,7 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     wide = number_mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")))
     is_isotropic = i("anisotropy_strength") == 0
     is_thin = i("thickness") == 0
-    anisotropy = plus(1.0, number("multiply", -1.0, number("divide", narrow, number("max", wide, 1e-6))))
+    anisotropy = complement(number("divide", narrow, number("max", wide, 1e-6)))
     colors = [node("extract", "float", in_=i("sheen_color"), index=float(k)) for k in range(3)]
     sheen = number("max", number("max", colors[0], colors[1]), colors[2])
     base = times(i("base_color"), below)
@@ -265,6 +243,11 @@ def plus(a: Input, b: Input) -> Input:
     return number("add", a, b)
 
 
+def complement(a: Input) -> Input:
+    """1 less a number."""
+    return plus(1.0, number("multiply", -1.0, a))
+
+
 def number_mixed(background: Input, foreground: Input, amount: Input) -> Input:
     """Mixture of numbers."""
     return node("mix", "float", bg=background, fg=foreground, mix=amount)
@@ -288,10 +271,7 @@ def conductor(
     reflectivity: ArrayLike,
     edge: ArrayLike,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Index of refraction and absorption of a metal.
-
-    Source: [Gulbrandsen 2014], equations 11 to 15.
-    """
+    """Index of refraction and absorption of a metal: [Gulbrandsen 2014], equations 11 to 15."""
     r, g = np.clip(reflectivity, 0, 0.99), np.clip(edge, 0, 1)
     root = np.sqrt(r)
     n = g * (1 - r) / (1 + r) + (1 - g) * (1 + root) / (1 - root)
@@ -329,13 +309,9 @@ def edge_color(reflectivity: Input, at_82_degrees: Input) -> Input:
     return edges[np.abs(found - target).argmin(axis=0), 0].tolist()
 
 
-def _over(color: Input, divisor: float) -> Input:
-    return node("divide", "color3", in1=color, in2=divisor)
-
-
 def _below_coat(coat: Input, ior: Input) -> Input:
     """What of the light gets through a coat, head-on."""
-    return plus(1.0, number("multiply", -1.0, number("multiply", coat, reflectance(ior))))
+    return complement(number("multiply", coat, reflectance(ior)))
 
 
 def _colors_of_depth(color: Input, depth: Input) -> dict[str, Input]:

@@ -103,7 +103,8 @@ def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
     is_there = np.zeros((rows, height, columns, width), dtype=bool)
     for (u, v), tile in tiles.items():
         row, column = rows - 1 - (v - first[1]), u - first[0]
-        pixels[row, :, column] = _resized(_with_channels(tile, channels), (height, width), dtype)
+        alike = tile if tile.shape[2] == channels else with_alpha(tile)[..., :channels]
+        pixels[row, :, column] = _resized(alike, (height, width), dtype)
         is_there[row, :, column] = True
     to_uv = np.diag([1 / columns, 1 / rows, 1.0])
     to_uv[:2, 2] = -first / (columns, rows)
@@ -122,10 +123,6 @@ def with_alpha(picture: NDArray) -> NDArray:
     alpha = picture[..., 1:2] if channels == 2 else np.full_like(picture[..., :1], _full(picture.dtype))
     color = picture if channels == 3 else np.repeat(picture[..., :1], 3, axis=2)
     return np.concatenate([color, alpha], axis=2)
-
-
-def _with_channels(tile: NDArray, channels: int) -> NDArray:
-    return tile if tile.shape[2] == channels else with_alpha(tile)[..., :channels]
 
 
 def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype) -> NDArray:
@@ -307,9 +304,8 @@ def _half(values: NDArray) -> NDArray:
         # The filter goes beyond the values that there are.
         bounds = float(values.min()), float(values.max())
         size = mi.ScalarVector2u((width + 1) // 2, (height + 1) // 2)
-        found = np.array(mi.Bitmap(values.astype(np.float32)).resample(size, clamp=bounds)).reshape(
-            size[1], size[0], -1
-        )
+        resampled = mi.Bitmap(values.astype(np.float32)).resample(size, clamp=bounds)
+        found = np.array(resampled).reshape(size[1], size[0], -1)
         return np.rint(found).astype(values.dtype) if values.dtype.kind == "u" else found
     rows = values[::2].astype(np.uint32 if values.dtype.kind == "u" else np.float32) + values[1::2]
     sums = rows[:, ::2] + rows[:, 1::2]

@@ -60,7 +60,7 @@ class Textures:
             found = self._baked(given)
             values = found.values[..., :3]
             if values.shape[2] == 1:
-                values = np.broadcast_to(values, (*values.shape[:2], 3))
+                values = np.repeat(values, 3, axis=2)
             elif values.shape[2] == 2:
                 # Red and green.
                 values = np.pad(values, ((0, 0), (0, 0), (0, 1)))
@@ -110,9 +110,8 @@ class Textures:
                 found = baked(expression, self._source)
             except (ValueError, IndexError):
                 what = f'expressions of "{expression.category}" with values of other types are ignored; 0.5 is used'
-                self._notes.add(
-                    what, ", ".join(each.file for each in leaves(expression) if isinstance(each, TextureContents))
-                )
+                files = [each.file for each in leaves(expression) if isinstance(each, TextureContents)]
+                self._notes.add(what, ", ".join(files))
                 found = Baked(np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat")
             self._expressions[id(expression)] = expression, found
         return self._expressions[id(expression)][1]
@@ -127,9 +126,7 @@ class Textures:
         if picture is None:
             return None
         values = linear_values(with_alpha(picture.pixels), is_srgb_image(picture.pixels, "auto"))[..., :3] * scale
-        bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
-        bitmap.set_srgb_gamma(False)
-        return bitmap
+        return _linear_bitmap(values)
 
     def _plain(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
         """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
@@ -146,18 +143,11 @@ class Textures:
         return self._node(self._bitmaps[key], to_uv, texture.wrap, is_raw)
 
     def _bitmap(self, values: NDArray, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
-        bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
-        bitmap.set_srgb_gamma(False)
-        return self._node(bitmap, to_uv, wrap, is_raw)
+        return self._node(_linear_bitmap(values), to_uv, wrap, is_raw)
 
     def _node(self, bitmap: mi.Bitmap, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
-        return {
-            "type": "bitmap",
-            "bitmap": bitmap,
-            "raw": is_raw,
-            "wrap_mode": wrap,
-            "to_uv": mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist()),
-        }
+        transform = mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist())
+        return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": wrap, "to_uv": transform}
 
     def _picture(self, path: str, use: TextureContents | None = None) -> TextureImage | None:
         """A picture, as fine as its use needs; None if it cannot be read."""
@@ -183,6 +173,12 @@ class Textures:
             return error
 
 
+def _linear_bitmap(values: NDArray) -> mi.Bitmap:
+    bitmap = mi.Bitmap(np.ascontiguousarray(values.astype(np.float32)))
+    bitmap.set_srgb_gamma(False)
+    return bitmap
+
+
 def _key(path: str, use: TextureContents | None) -> tuple[str, str | None]:
     return path, None if use is None else use.color_space
 
@@ -192,9 +188,8 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
     channels = ["rgba".index(each) for each in texture.channel]
     pixels = _selected(picture.pixels, channels)
     values = linear_values(pixels, is_srgb_image(picture.pixels, texture.color_space), channels)
-    scale, bias, fallback = (
-        np.array(each, dtype=np.float32)[channels] for each in (texture.scale, texture.bias, texture.fallback)
-    )
+    numbers = np.array([texture.scale, texture.bias, texture.fallback], dtype=np.float32)
+    scale, bias, fallback = numbers[:, channels]
     if (scale != 1).any() or (bias != 0).any():
         values = values * scale + bias
     if picture.is_there is not None:

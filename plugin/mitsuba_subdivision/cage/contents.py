@@ -20,41 +20,25 @@ class CageContents:
 
     A reader of files returns it, and `ControlCage.from_arrays` validates it. A writer of files takes that of a cage,
     `ControlCage.contents`.
-
-    Parameters
-    ----------
-    positions : (n_v, 3) array
-    face_sizes : (n_f,) int
-        Number of vertices of each face.
-    face_vertices : (n_h,) int
-        0-based vertices of all faces, one face after the other.
-    creases : (n, 3) float64
-        Rows (vertex, vertex, sharpness), one for each sharp edge.
-    corners : (n, 2) float64
-        Rows (vertex, sharpness), one for each sharp vertex.
-    holes : (n,) int
-        0-based faces that are not part of the surface.
-    materials : dict of str to (n,) int
-        0-based faces of each material that the file names.
-    rules : dict of str to str
-        Names and values as in `RULES`, for those rules that the file chooses.
-    scheme : str or None
-        Subdivision scheme that the file names.
-    source : CageSource
-        How messages name the file, its lines, vertices and faces.
     """
 
-    positions: NDArray
-    face_sizes: IntArray
-    face_vertices: NDArray
+    positions: NDArray  # (n_v, 3)
+    face_sizes: IntArray  # (n_f,) int: number of vertices of each face
+    face_vertices: NDArray  # (n_h,) int: 0-based vertices of all faces, one face after the other
+    # (n, 3) float64: rows (vertex, vertex, sharpness), one for each sharp edge
     creases: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    # (n, 2) float64: rows (vertex, sharpness), one for each sharp vertex
     corners: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    # (n,) int: 0-based faces that are not part of the surface
     holes: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     texcoords: Attribute | None = None
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    # (n,) int: 0-based faces of each material that the file names
     materials: Mapping[str, IntArray] = field(default_factory=dict)
+    # Names and values as in `RULES`, for those rules that the file chooses
     rules: Mapping[str, str] = field(default_factory=dict)
-    scheme: str | None = None
+    scheme: str | None = None  # Subdivision scheme that the file names
+    # How messages name the file, its lines, vertices and faces
     source: CageSource = field(default_factory=CageSource)
 
     @property
@@ -73,10 +57,7 @@ class CageContents:
 def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
     """Whether nested records, mappings, lists, arrays and values are equal; their sources are not compared.
 
-    Parameters
-    ----------
-    but : frozenset of str
-        Fields of ``a`` and ``b`` themselves that may differ.
+    ``but`` names fields of ``a`` and ``b`` themselves that may differ.
     """
     if a is b or (isinstance(a, CageSource) and isinstance(b, CageSource)):
         return True

@@ -18,30 +18,21 @@ def oriented_faces(
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
     """Turn over faces that are wound against their neighbours, and cut the mesh at non-manifold edges.
 
-    Returns
-    -------
-    topology : Topology
-        Half-edges of non-manifold edges have no twin; a non-manifold vertex has several fans.
-    non_manifold : NonManifold or None
-        Where the faces are not a manifold; None if they are one everywhere.
-    order : (n_h,) int64 or None
-        If faces were turned over: which given face corner became each face corner of the topology.
+    Returns the topology, in which half-edges of non-manifold edges have no twin, and non-manifold vertices have several
+    fans; where the faces are not a manifold, None if they are one everywhere; and, if faces were turned over, (n_h,)
+    int64: which given face corner became each face corner of the topology.
 
-    Raises
-    ------
-    CageError
-        With ``strict``, if a face has a vertex twice, an edge more than two faces, neighbouring faces are wound against
-        each other, or the faces of a vertex are not one fan.
-
-    Warns
-    -----
-    CageWarning
-        Without ``strict``, about faces that were turned over, and about edges and vertices that are non-manifold.
+    Raises CageError, with ``strict``, if a face has a vertex twice, an edge more than two faces, neighbouring faces are
+    wound against each other, or the faces of a vertex are not one fan. Without, warns about faces that were turned
+    over, and about edges and vertices that are non-manifold.
     """
     if is_manifold(given):
         return given, None, None
     if strict:
-        _raise_first(given, source)
+        _require_distinct_corners(given, source)
+        _require_two_faces(given, source)
+        _require_opposite_directions(given, source)
+        _require_single_fans(given, source)
     topology, order = given, turning_order(given)
     if order is not None:
         topology = Topology(given.vertex_count, given.face_sizes, given.face_vertices[order])
@@ -67,14 +58,14 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
     fans = np.flatnonzero(fan_counts(t, fan_labels(t)[1]) > 1)
     fans = fans[~t.ends_of(found.is_edge)[fans]]
     kinds = (
-        (len(crowded), "edge", "of more than two faces, or of two in one direction", crowded, _edge_at),
-        (len(fans), "vertex", "between separate fans", fans, _vertex_at),
-        (len(repeats), "face", "with a vertex more than once", repeats, _face_at),
+        ("edge", "of more than two faces, or of two in one direction", crowded, lambda edge: _edge_at(t, edge, source)),
+        ("vertex", "between separate fans", fans, source.vertex),
+        ("face", "with a vertex more than once", repeats, lambda face: source.faces(np.array([face]))),
     )
     parts = []
-    for count, noun, what, indices, name in kinds:
-        if count:
-            names = ", ".join(name(t, index, source) for index in indices[:SHOWN].tolist())
+    for noun, what, indices, name in kinds:
+        if count := len(indices):
+            names = ", ".join(map(name, indices[:SHOWN].tolist()))
             parts.append(f"{number_of(count, noun)} {what} ({names}{', ...' if count > SHOWN else ''})")
     return (
         f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp, and such "
@@ -83,14 +74,7 @@ def _description(topology: Topology, found: NonManifold, source: CageSource) -> 
     )
 
 
-def _raise_first(topology: Topology, source: CageSource) -> None:
-    """Raise an error about the first defect of an oriented manifold."""
-    for require in (_require_distinct_corners, _require_two_faces, _require_opposite_directions, _require_single_fans):
-        require(topology, source)
-
-
 def _require_distinct_corners(topology: Topology, source: CageSource) -> None:
-    """Raise an error if a face has a vertex more than once."""
     t = topology
     repeated = np.flatnonzero(is_repeated(t))
     if len(repeated):
@@ -101,7 +85,6 @@ def _require_distinct_corners(topology: Topology, source: CageSource) -> None:
 
 
 def _require_two_faces(topology: Topology, source: CageSource) -> None:
-    """Raise an error if an edge has more than two faces."""
     t = topology
     crowded = np.flatnonzero(np.bincount(t.edge) > 2)
     if len(crowded):
@@ -113,7 +96,6 @@ def _require_two_faces(topology: Topology, source: CageSource) -> None:
 
 
 def _require_opposite_directions(topology: Topology, source: CageSource) -> None:
-    """Raise an error if both faces of an edge run along it in the same direction."""
     t = topology
     same_way = np.flatnonzero(runs_with_twin(t))
     if len(same_way):
@@ -125,7 +107,6 @@ def _require_opposite_directions(topology: Topology, source: CageSource) -> None
 
 
 def _require_single_fans(topology: Topology, source: CageSource) -> None:
-    """Raise an error if the faces around a vertex are not one fan."""
     t = topology
     fan, is_first = fan_labels(t)
     pinched = np.flatnonzero(fan_counts(t, is_first) > 1)
@@ -142,14 +123,6 @@ def _require_single_fans(topology: Topology, source: CageSource) -> None:
 def _edge_at(topology: Topology, half_edge: int, source: CageSource) -> str:
     start, end = topology.face_vertices[[half_edge, topology.next[half_edge]]]
     return source.edge(start, end)
-
-
-def _vertex_at(_: Topology, vertex: int, source: CageSource) -> str:
-    return source.vertex(vertex)
-
-
-def _face_at(_: Topology, face: int, source: CageSource) -> str:
-    return source.faces(np.array([face]))
 
 
 def turning_order(topology: Topology) -> IntArray | None:

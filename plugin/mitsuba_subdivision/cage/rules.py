@@ -26,10 +26,7 @@ def boundary_corners(rule: str, t: Topology) -> NDArray[np.bool_]:
 def boundary_holes(rule: str, t: Topology, is_boundary: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``(n_f,)`` whether a boundary rule leaves each face out: with "none", those at a boundary.
 
-    Parameters
-    ----------
-    is_boundary : (n_h,) bool
-        Half-edges on the boundary, but for infinitely sharp ones, which the surface reaches.
+    ``is_boundary``, ``(n_h,)``, has no infinitely sharp half-edges, which the surface reaches.
     """
     found = np.zeros(t.face_count, dtype=bool)
     if rule == "none":

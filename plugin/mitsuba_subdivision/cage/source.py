@@ -65,12 +65,7 @@ class CageSource:
     def error(self, where: str, problem: str, expected: str, count: int, noun: str) -> CageError:
         """An error about the first of several vertices, faces, edges or indices with the same problem.
 
-        Parameters
-        ----------
-        where : str
-            Beginning of the message, from `at_face` or `at_vertex`.
-        count, noun : int, str
-            How many there are, and of what: "vertex".
+        ``where`` begins the message, from `at_face` or `at_vertex`; ``count`` and ``noun`` ("vertex") say how many.
         """
         such = number_of_such(count, noun)
         return CageError(f"{where} {problem}; expected {expected} ({such}; numbers count from {self.index_base})")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class CageStructure:
     """Faces, tags and rules of a control cage, and data derived from these.
 
-    Cages of equal structure share one, see `shared`. Attributes are those of `ControlCage`.
+    Cages of equal structure share one, see `shared`. Attributes and properties are those of `ControlCage`.
     """
 
     topology: Topology
@@ -49,7 +49,6 @@ class CageStructure:
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:
-        """See `ControlCage.is_corner`."""
         t, found = self.topology, self.tags.is_corner
         if self.non_manifold is not None:
             found = found | self.non_manifold.is_corner
@@ -57,31 +56,26 @@ class CageStructure:
 
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:
-        """See `ControlCage.is_boundary`."""
         is_border, found = self.topology.twin < 0, self.non_manifold
         return is_border if found is None else is_border & ~found.is_edge | found.is_own_edge
 
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
-        """See `ControlCage.is_boundary_vertex`."""
         if self.non_manifold is None:
             return self.topology.is_border_vertex
         return self.topology.ends_of(self.is_boundary)
 
     @cached_property
     def sharp_mesh(self) -> SharpMesh:
-        """See `ControlCage.sharp_mesh`."""
         is_corner, is_boundary_vertex = self.is_corner, self.is_boundary_vertex
         return SharpMesh(self.topology, self.tags, is_corner, is_boundary_vertex, self.crease_method, self.non_manifold)
 
     @property
     def cut_mesh(self) -> CutMesh:
-        """See `ControlCage.cut_mesh`."""
         return self.sharp_mesh.cut
 
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:
-        """See `ControlCage.is_hole`."""
         t = self.topology
         hole = boundary_holes(self.boundary, t, self.is_boundary & ~self.tags.is_infinite)
         hole[self.holes] = True
@@ -89,12 +83,10 @@ class CageStructure:
 
     @cached_property
     def edges(self) -> IndexArray:
-        """See `ControlCage.edges`."""
         return edges_of(self.topology)
 
     @cached_property
     def triangles(self) -> IndexArray:
-        """See `ControlCage.triangles`."""
         return triangles_of(self.topology)
 
 

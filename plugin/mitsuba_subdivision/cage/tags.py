@@ -27,12 +27,8 @@ def validated_tags(
 
     As in OpenSubdiv, those that name an edge or a vertex that the mesh does not have are ignored.
 
-    Raises CageError if rows are no numbers of vertices, or a sharpness is negative or not a number.
-
-    Warns
-    -----
-    CageWarning
-        If creases or corners are ignored.
+    Raises CageError if rows are no numbers of vertices, or a sharpness is negative or not a number. Warns if creases or
+    corners are ignored.
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
@@ -69,8 +65,10 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
 
     Raises CageError if a pair is no edge of two faces, or is given twice.
     """
-    t = topology
-    ends = _indices(edges, (2,), "edges", source)
+    t, ends = topology, np.asarray(edges)
+    if ends.size and (ends.dtype.kind not in "iu" or ends.shape != (len(ends), 2)):
+        raise CageError(f"{source.name}: edges of shape {ends.shape} and type {ends.dtype}; expected integers, (n, 2)")
+    ends = ends.astype(np.int64).reshape(-1, 2)
     found = _half_edges_between(t, *ends.T).astype(np.int64)
 
     def where(row: int) -> str:
@@ -78,27 +76,9 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
 
     _require(found >= 0, where, "is no edge of a face", "edges of two faces", source)
     _require(t.twin[found] >= 0, where, "is infinitely sharp, as it has not two faces", "edges of two faces", source)
-    _require(_is_first(t.edge[found]), where, "is given twice", "each edge once", source)
-    return found
-
-
-def _indices(values: ArrayLike, shape: tuple[int, ...], name: str, source: CageSource) -> NDArray[np.int64]:
-    """Integers in rows of a shape."""
-    found = np.asarray(values)
-    if not found.size:
-        return np.zeros((0, *shape), dtype=np.int64)
-    if found.dtype.kind not in "iu" or found.shape != (len(found), *shape):
-        expected = "(n, 2)" if shape else "(n,)"
-        raise CageError(
-            f"{source.name}: {name} of shape {found.shape} and type {found.dtype}; expected integers, {expected}"
-        )
-    return found.astype(np.int64)
-
-
-def _is_first(values: IntArray) -> NDArray[np.bool_]:
-    """``(n,)`` whether a value has not come before."""
-    found = np.zeros(len(values), dtype=bool)
-    found[np.unique(values, return_index=True)[1]] = True
+    is_first = np.zeros(len(found), dtype=bool)
+    is_first[np.unique(t.edge[found], return_index=True)[1]] = True
+    _require(is_first, where, "is given twice", "each edge once", source)
     return found
 
 

@@ -45,11 +45,9 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
 
 
 def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
-    """Sizes and concatenated vertices of faces, not yet validated. Raises CageError if ``faces`` are neither.
+    """Sizes and concatenated vertices of faces, not yet validated.
 
-    Parameters
-    ----------
-    faces : sequence of int sequences, or (f, k) array
+    Raises CageError if ``faces`` are neither int sequences nor an (f, k) array.
     """
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
@@ -69,25 +67,17 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
 
 
 def validated_faces(
-    vertex_count: int, face_sizes: ArrayLike, face_vertices: ArrayLike, source: CageSource, strict: bool
+    vertex_count: int,
+    face_sizes: ArrayLike,  # (n_f,) int
+    face_vertices: ArrayLike,  # (n_h,) int: 0-based
+    source: CageSource,
+    strict: bool,  # Whether the faces must be an oriented 2-manifold, closed or with boundary
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
     """Check the faces of a cage, and make them an oriented manifold, as `oriented_faces` returns it.
 
     Raises CageError if there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is
-    not an integer or out of range; with ``strict``, also as `oriented_faces` does.
-
-    Parameters
-    ----------
-    face_sizes : (n_f,) int
-    face_vertices : (n_h,) int
-        0-based.
-    strict : bool
-        Whether the faces must be an oriented 2-manifold, closed or with boundary.
-
-    Warns
-    -----
-    CageWarning
-        If vertices belong to no face, faces are turned over, or the faces are not a manifold.
+    not an integer or out of range; with ``strict``, also as `oriented_faces` does. Warns if vertices belong to no face,
+    faces are turned over, or the faces are not a manifold.
     """
     given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
     sizes = _integers(given_sizes, "face_sizes", source)

@@ -60,12 +60,7 @@ def wants_passes(options: argparse.Namespace) -> bool:
 
 
 def validate_pass_options(options: argparse.Namespace) -> None:
-    """Refuse options of ``render`` that contradict each other, or have no effect with the others.
-
-    Raises
-    ------
-    RegressionError
-    """
+    """Raise RegressionError for options of ``render`` that contradict each other, or have no effect with the others."""
     from ..regression import RegressionError
     from ..regression.scene import BOX
 
@@ -83,9 +78,8 @@ def validate_pass_options(options: argparse.Namespace) -> None:
     if options.denoise and options.filter not in (None, BOX):
         raise RegressionError(f'--denoise needs the filter "{BOX}", not "{options.filter}"')
     if options.sensor and wants_passes(options):
-        raise RegressionError(
-            "--sensor is for whole images; expected no --pass, --passes, --dask or --reference beside it"
-        )
+        others = "--pass, --passes, --dask or --reference"
+        raise RegressionError(f"--sensor is for whole images; expected no {others} beside it")
     if options.batch and not wants_passes(options):
         raise RegressionError("--batch is for passes; expected --pass, --passes, --dask or --reference beside it")
     if options.tolerances and not options.reference:

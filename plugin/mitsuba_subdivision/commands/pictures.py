@@ -26,9 +26,6 @@ from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from ..regression.scene import LoadedScene
     from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
     from ..studio.studio_entries import Look
@@ -103,8 +100,6 @@ def threads(count: int | None) -> Iterator[None]:
 
 
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    import mitsuba as mi
-
     from ..regression.passes import cluster, results
 
     # The command's own number: files may change until the next one.
@@ -158,16 +153,14 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
         from mitsuba_usd import StageScenes
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}
-        parameters = {name: v for name, v in given.items() if v is not None}
+        parameters = {name: value for name, value in given.items() if value is not None}
         return StageScenes(options.scene, look, parameters, shutter=options.shutter, **which)
     if options.shutter:
-        raise ValueError(
-            f'--shutter was given for one cage of "{options.scene}", which has no camera; expected a whole USD file'
-        )
+        what = f'one cage of "{options.scene}", which has no camera'
+        raise ValueError(f"--shutter was given for {what}; expected a whole USD file")
     if options.texture_size:
-        raise ValueError(
-            f'--texture-size was given for one cage of "{options.scene}"; expected it for a whole USD file'
-        )
+        what = f'one cage of "{options.scene}"'
+        raise ValueError(f"--texture-size was given for {what}; expected it for a whole USD file")
     from ..studio.cage_scenes import CageScenes
 
     shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})

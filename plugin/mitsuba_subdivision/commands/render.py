@@ -31,20 +31,9 @@ SCENE_SUFFIX = ".xml"
 DEFAULT_FPS = 24
 # Options about models, by the names that they have after parsing; others are about every scene.
 _OF_MODELS = (
-    "view",
-    "azimuth",
-    "elevation",
-    "up",
-    "size",
-    "scheme",
-    "prim",
-    "time",
-    "rate",
-    "shading",
-    "checker",
-    "cage",
+    "view", "azimuth", "elevation", "up", "size", "scheme", "prim", "time", "rate", "shading", "checker", "cage",
     "texture_size",
-)
+)  # fmt: skip
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
@@ -181,11 +170,9 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
         given = getattr(options, name)
         # An angle or a sensor may be 0.
         if given is not None and given is not False and given != []:
-            flag = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance"}.get(name)
-            raise ValueError(
-                f'{flag or "--" + name.replace("_", "-")} was given for the {what} "{options.scene}"; expected it for '
-                f"{other}"
-            )
+            flags = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance"}
+            flag = flags.get(name, f"--{name.replace('_', '-')}")
+            raise ValueError(f'{flag} was given for the {what} "{options.scene}"; expected it for {other}')
     validate_pass_options(options)
     if options.denoise:
         from ..regression.scene import BOX
@@ -194,7 +181,6 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
         require_denoiser()
         options.filter = BOX
     has_frames = options.turntable or options.frames
-
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if options.output.suffix.lower() not in known:
         is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
@@ -346,10 +332,7 @@ def _assignment(text: str) -> tuple[str, str]:
 
 
 def require_encoder(path: Path) -> None:
-    """Check that the packages that write a video are installed, before frames are rendered.
-
-    Raises ValueError if a package is missing.
-    """
+    """Raise ValueError if a package that writes a video is missing, before frames are rendered."""
     try:
         import imageio.v2  # noqa: F401 - only to find out whether it is there
 

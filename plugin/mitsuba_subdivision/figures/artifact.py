@@ -189,7 +189,7 @@ def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray
         "sample_offset": offset,
         "bsdf": next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter()),
     }
-    scene = staged(stage, [shape for shape in stage.shapes() if shape.is_emitter()], surface=mi.load_dict(shape))
+    scene = staged(stage, [each for each in stage.shapes() if each.is_emitter()], surface=mi.load_dict(shape))
     pixels = render(scene, options, f"valence {row.valence}, {rule.title}")[..., :3]
     tessellation = surface.tessellate(row.rate, rule.evaluator, np.float32, offset)
     distance = np.linalg.norm(tessellation.positions - tessellation.positions[0], axis=1)
@@ -208,9 +208,8 @@ def _edges(surface: LimitSurface) -> NDArray[np.float64]:
     begin = surface.evaluate(elements.face, np.zeros((len(corner), 2)), corner).p
     near = np.flatnonzero(np.linalg.norm(begin - begin[0], axis=1) < EDGE_RADIUS)
     # Elements that are a part of a face end in the middle of an edge.
-    samples = surface.evaluate(
-        np.repeat(elements.face[near], 17), np.tile(along, (len(near), 1)), np.repeat(corner[near], 17)
-    )
+    faces, corners = np.repeat(elements.face[near], 17), np.repeat(corner[near], 17)
+    samples = surface.evaluate(faces, np.tile(along, (len(near), 1)), corners)
     return samples.p.reshape(-1, 17, 3).astype(np.float64, copy=False)
 
 

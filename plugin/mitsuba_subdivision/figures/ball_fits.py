@@ -148,19 +148,11 @@ def fit_mesh(views: list[View], steps: int, measure: Measurement) -> Course:
     """Fit a dense mesh of triangles, in the same way but for the surface."""
     ball = ball_cage(DENSE, RADIUS)
     mesh = ControlCage(ball.positions, ball.triangles)
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": integrator(SPP, EDGE_SPP),
-            **LIGHTS,
-            "mesh": make_mesh(mesh.positions, ball.triangles, GREY),
-        }
-    )
+    shape = make_mesh(mesh.positions, ball.triangles, GREY)
+    scene = mi.load_dict({"type": "scene", "integrator": integrator(SPP, EDGE_SPP), **LIGHTS, "mesh": shape})
     params, key = mi.traverse(scene), "mesh.vertex_positions"
-    targets, sensors = (
-        [upload(mi.TensorXf, view.picture) for view in views],
-        [mi.load_dict(view.sensor) for view in views],
-    )
+    targets = [upload(mi.TensorXf, view.picture) for view in views]
+    sensors = [mi.load_dict(view.sensor) for view in views]
     for sensor in sensors:
         sensor.sampler().set_sample_count(SPP)
     large_steps = LargeSteps(mesh.laplacian(), MESH_SMOOTHING)
@@ -170,19 +162,15 @@ def fit_mesh(views: list[View], steps: int, measure: Measurement) -> Course:
     def moved() -> ControlCage:
         return mesh.with_positions(np.array(params[key], dtype=np.float64).reshape(-1, 3))
 
+    def squared_error(image: mi.TensorXf, view: int) -> mi.TensorXf:
+        return dr.mean(dr.square(image - targets[view]), axis=None)
+
     course, rate = Course(), Schedule.of(_rates(MESH_RATES, steps), "learning_rate")
     measure(course, moved)
     for step in range(steps):
         params[key] = large_steps.from_differential(optimizer["u"])
         params.update()
-        loss = loss_of_views(
-            scene,
-            params,
-            lambda image, view: dr.mean(dr.square(image - targets[view]), axis=None),
-            sensors,
-            seed=step,
-            spp=0,
-        )
+        loss = loss_of_views(scene, params, squared_error, sensors, seed=step, spp=0)
         dr.backward(loss / len(views))
         optimizer.set_learning_rate(rate(step) * DIAGONAL)
         optimizer.step()

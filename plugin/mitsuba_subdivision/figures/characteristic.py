@@ -24,16 +24,12 @@ class CharacteristicMap:
 
     The two subdominant eigenvectors could be any basis of their plane. In the basis chosen here, the edges at the
     extraordinary point form a regular star, and the first edge lies along x.
-
-    Attributes
-    ----------
-    control_points : (K, 2)
-        Control points in the plane; the map is the patch that they make.
     """
 
     def __init__(self, patch: IrregularPatch, valence: int) -> None:
         self.patch = patch
         self.turn = 2 * np.pi / valence
+        # (K, 2): in the plane; the map is the patch that they make.
         self.control_points = patch.basis.vectors[:, 1:3]
         begin, end = self(patch.scheme.domain.corners[[1, -1]])
         star = np.array([(1, 0), (np.cos(self.turn), np.sin(self.turn))]).T

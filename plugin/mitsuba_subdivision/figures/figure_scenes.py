@@ -55,9 +55,8 @@ def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects:
     children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes() if shapes is None else shapes)}
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
     children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
-    return mi.load_dict(
-        {"type": "scene", "integrator": stage.integrator(), "sensor": stage.sensors()[0], **children, **objects}
-    )
+    seen_by = {"integrator": stage.integrator(), "sensor": stage.sensors()[0]}
+    return mi.load_dict({"type": "scene", **seen_by, **children, **objects})
 
 
 def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.float32]:

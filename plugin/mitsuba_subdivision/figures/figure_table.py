@@ -54,22 +54,12 @@ FIGURES: dict[str, Figure] = {
 }
 
 
-def require_options(name: str, given: dict[str, object], formats: Iterable[str]) -> None:
-    """Reject options that do not change a figure, and formats that it does not have.
-
-    Parameters
-    ----------
-    name : str
-        In `FIGURES`.
-    given : dict
-        Options that were given, by name.
-    formats : iterable of str
-        Formats that are wanted.
-
-    Raises
-    ------
-    ValueError
-    """
+def require_options(
+    name: str,  # In `FIGURES`
+    given: dict[str, object],  # Options that were given, by name
+    formats: Iterable[str],  # Those that are wanted
+) -> None:
+    """Raise ValueError for options that do not change a figure, and formats that it does not have."""
     figure = FIGURES[name]
     for option in given:
         if option not in (*figure.options, "resolution", "width"):

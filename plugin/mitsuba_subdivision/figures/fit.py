@@ -86,8 +86,7 @@ def rendered(shown: Sequence[Panel], field_of_view: float, options: FigureOption
     pictures = []
     for title, shapes in shown:
         options.report(title.replace("\n", ", "))
-        pixels = render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]
-        pictures.append((title, pixels))
+        pictures.append((title, render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]))
     return stage.sensors()[0], pictures
 
 
@@ -154,10 +153,8 @@ def creases_as_rods(cage: ControlCage, edges: NDArray[np.integer], sharpness: ND
     shapes: SceneNode = {}
     # The sharpest edge comes last: a vertex keeps the joint of that edge.
     for edge in np.argsort(sharpness, kind="stable"):
-        rod = {
-            "radius": CREASE_RADIUS + CREASE_GROWTH * float(sharpness[edge]),
-            "bsdf": paint(sharpness_colour(float(sharpness[edge]))),
-        }
+        value = float(sharpness[edge])
+        rod = {"radius": CREASE_RADIUS + CREASE_GROWTH * value, "bsdf": paint(sharpness_colour(value))}
         p0, p1 = cage.positions[edges[edge]].tolist()
         shapes[f"edge{edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
         for end, at in zip(edges[edge], (p0, p1), strict=True):
@@ -191,12 +188,9 @@ def composed(
     *of_balls, losses, distances, sharpness = left
     for axis, (title, pixels) in zip((*of_balls, *of_box), (*balls, *boxes), strict=True):
         show(axis, in_8_bits(pixels), *title.split("\n", 1))
-    for axis, cage, values in zip(
-        of_box,
-        (creases.target, creases.start, creases.found),
-        (creases.truth, creases.sharpness[0], creases.sharpness[-1]),
-        strict=True,
-    ):
+    cages = creases.target, creases.start, creases.found
+    sharpnesses = creases.truth, creases.sharpness[0], creases.sharpness[-1]
+    for axis, cage, values in zip(of_box, cages, sharpnesses, strict=True):
         _label(axis, sensor, cage, creases.edges, values)
     _plot_losses(losses, courses)
     _plot_distances(distances, courses)
@@ -258,17 +252,10 @@ def _label(
     """Write their sharpness on the edges that the camera sees."""
     camera = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
     width = int(sensor.film().crop_size()[0])
+    box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
     for edge in np.flatnonzero(in_front(cage, edges, camera)):
         x, y = project(sensor, cage.positions[edges[edge]].mean(axis=0), width).tolist()
-        axis.text(
-            x,
-            y,
-            f"{sharpness[edge]:.1f}",
-            color="white",
-            ha="center",
-            va="center",
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"},
-        )
+        axis.text(x, y, f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
 
 
 def in_front(cage: ControlCage, edges: NDArray[np.integer], camera: NDArray[np.float64]) -> NDArray[np.bool_]:

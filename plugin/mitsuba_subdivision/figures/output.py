@@ -91,12 +91,9 @@ def scene_path(name: str) -> Path:
 def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
     """Make axes in rows and columns over the width of the figure; their heights follow when it is written.
 
-    Raises FigureError if matplotlib is not installed; the message names the extra that brings it.
+    More options are for `matplotlib.pyplot.subplots`.
 
-    Parameters
-    ----------
-    **more
-        For `matplotlib.pyplot.subplots`.
+    Raises FigureError if matplotlib is not installed; the message names the extra that brings it.
     """
     try:
         import matplotlib
@@ -111,8 +108,7 @@ def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tupl
     width = options.width / INCH
     # As high as rows of panels that are twice as high as wide.
     size = (width, 1 + 2 * rows * width / columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=size, layout="compressed", squeeze=False, **more)
-    return figure, axes
+    return pyplot.subplots(rows, columns, figsize=size, layout="compressed", squeeze=False, **more)
 
 
 def rows_of(options: FigureOptions, count: int) -> tuple[int, int]:
@@ -120,17 +116,18 @@ def rows_of(options: FigureOptions, count: int) -> tuple[int, int]:
     return (1, count) if options.width >= BETWEEN else (2, (count + 1) // 2)
 
 
-def write_plot(options: FigureOptions, name: str, figure: Figure, *, layouts: int = LAYOUTS) -> list[Path]:
+def write_plot(
+    options: FigureOptions,
+    name: str,
+    figure: Figure,
+    *,
+    layouts: int = LAYOUTS,  # How often the height of the figure is set to that of its contents
+) -> list[Path]:
     """Write a figure as PNG and as PDF, if these formats are wanted, and close it.
 
     The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
 
     Returns list of Path: the files written, each of which appears whole or not at all.
-
-    Parameters
-    ----------
-    layouts : int
-        How often the height of the figure is set to that of its contents.
     """
     from matplotlib.image import AxesImage
     from matplotlib.pyplot import close

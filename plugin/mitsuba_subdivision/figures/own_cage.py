@@ -33,12 +33,11 @@ def around_vertices(
     Raises FigureError if the cage has no extraordinary vertex inside of its surface whose faces have no creases.
     """
     cage = read(path)
+    fans = _isolated_fans(cage)
     for _ in range(REFINEMENTS):
-        if fans := _isolated_fans(cage):
-            break
-        cage = cage.refined()
-    else:
-        fans = _isolated_fans(cage)
+        if not fans:
+            cage = cage.refined()
+            fans = _isolated_fans(cage)
     if not fans:
         raise FigureError(f'"{path}" has no extraordinary vertex inside of its surface and apart from creases')
     return {valence: _aligned(_numbered(cage, fans[valence]), like) for valence in sorted(fans)[:most]}

@@ -91,27 +91,15 @@ def blender_mesh(
     cage: ControlCage,  # Without tags; Catmull-Clark's
     level: int,  # Edges of quads become `2 ** level` segments
 ) -> BlenderMesh:
-    """Subdivide a cage in Blender, with the modifier's own defaults but for the level.
-
-    Raises FigureError if Blender fails.
-    """
+    """Subdivide a cage in Blender, by default options but for the level. Raises FigureError if Blender fails."""
     records: dict[str, NDArray] = {
         "values": cage.positions,
         "sizes": cage.face_sizes.astype(np.int32),
         "corners": cage.face_vertices.astype(np.int32),
     }
     # Several threads race for the last bits of points that faces share.
-    options = [
-        "--threads",
-        "1",
-        "--background",
-        "--factory-startup",
-        "--python-exit-code",
-        "1",
-        "--python",
-        str(BLENDER_SCRIPT),
-        "--",
-    ]
+    options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
+    options += ["--python", str(BLENDER_SCRIPT), "--"]
     found = _answers(program, options, records, [str(level)])
     version = ".".join(map(str, found["version"][:2]))
     points, normals = (found[name].reshape(-1, 3) for name in ("p", "n"))

@@ -41,9 +41,8 @@ def draw(options: FigureOptions) -> list[Path]:
         cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
     if len(counts) != 1:
-        raise FigureError(
-            f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}; expected as many at each"
-        )
+        found = f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}"
+        raise FigureError(f"{found}; expected as many at each")
     figure, axes = panels(options, *rows_of(options, LEVELS + 1))
     for axis in axes.flat[LEVELS + 1 :]:
         axis.set_axis_off()
@@ -54,30 +53,16 @@ def draw(options: FigureOptions) -> list[Path]:
         share = area_share(surface, regular)
         options.report(f"level {level}: {cage.face_count} faces, {100 * share:.1f} % of the area regular")
         pixels, scene = _render_cage(stage, cage, regular, options, f"level {level}")
-        _draw(
-            axis,
-            scene,
-            pixels,
-            _edges(cage, EDGE_SEGMENTS >> level),
-            _extraordinary_points(cage),
-            0.55 - 0.12 * level,
-            options.resolution,
-        )
+        lines, points = _edges(cage, EDGE_SEGMENTS >> level), _extraordinary_points(cage)
+        _draw(axis, scene, pixels, lines, points, 0.55 - 0.12 * level, options.resolution)
         axis.set_title(f"level {level}")
         axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
         rendered.append(pixels)
     options.report("limit surface")
     limit = LimitSurface(cages[-1])
     pixels, scene = _render_limit(stage, limit, options)
-    _draw(
-        axes[-1],
-        scene,
-        pixels,
-        _isolines(limit, EDGE_SEGMENTS >> (LEVELS - 1)),
-        _limit_points(limit),
-        0.17,
-        options.resolution,
-    )
+    lines, points = _isolines(limit, EDGE_SEGMENTS >> (LEVELS - 1)), _limit_points(limit)
+    _draw(axes[-1], scene, pixels, lines, points, 0.17, options.resolution)
     axes[-1].set_title("limit surface")
     axes[-1].set_xlabel(f"regular but for {counts.pop()} points")
     rendered.append(pixels)
@@ -136,15 +121,9 @@ def _render_cage(
 def _render_limit(
     stage: mi.Scene, surface: LimitSurface, options: FigureOptions
 ) -> tuple[NDArray[np.float32], mi.Scene]:
-    shape = mi.load_dict(
-        {
-            "type": "subdivision",
-            **surface.cage.as_properties(mi),
-            "tessellation_rate": RATE,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}},
-        }
-    )
-    scene = staged(stage, surface=shape)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
+    shape = {"type": "subdivision", **surface.cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": bsdf}
+    scene = staged(stage, surface=mi.load_dict(shape))
     return render(scene, options, "limit surface"), scene
 
 
@@ -181,9 +160,8 @@ def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
     t = surface.cage.topology
     half_edge = t.vertex_half_edge[_is_extraordinary(t)]
     face = t.face[half_edge]
-    return surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face]).p.astype(
-        np.float64, copy=False
-    )
+    found = surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face])
+    return found.p.astype(np.float64, copy=False)
 
 
 def _draw(
@@ -199,9 +177,8 @@ def _draw(
     from matplotlib.collections import LineCollection
 
     show(axis, on_white(pixels))
-    axis.add_collection(
-        LineCollection(visible_runs(scene, lines, resolution), colors="#14181c", linewidths=width, capstyle="round")
-    )
+    runs = visible_runs(scene, lines, resolution)
+    axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
     seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
     axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
     # The part of the square image that the surface fills.

@@ -103,10 +103,8 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
     properties = {**cage.as_properties(mi), "tessellation_rate": 2**level}
     exact = mi.load_dict({"type": "subdivision", **properties, "bsdf": MIRROR})
     shapes = {"exact": exact, "mesh": _refined_mesh(cage)}
-    titles = {
-        "exact": ("This package", "exact\nnormals"),
-        "mesh": ("Refined mesh", f"level {LEVEL},\naveraged normals"),
-    }
+    averaged = f"level {LEVEL},\naveraged normals"
+    titles = {"exact": ("This package", "exact\nnormals"), "mesh": ("Refined mesh", averaged)}
     if program := osd_peer():
         shapes["opensubdiv"] = _opensubdiv_mesh(program, cage, 2**level)
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
@@ -141,11 +139,8 @@ def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
 
     stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
     scene = staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
-    show(
-        axis,
-        on_white(render(scene, options, "whole surface")),
-        caption="around the vertex" if options.cage else "whole surface",
-    )
+    caption = "around the vertex" if options.cage else "whole surface"
+    show(axis, on_white(render(scene, options, "whole surface")), caption=caption)
     half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * options.resolution / 2
     middle = options.resolution / 2
     corner = (middle - half, middle - half)

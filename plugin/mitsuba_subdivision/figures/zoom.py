@@ -108,9 +108,8 @@ def draw(options: FigureOptions) -> list[Path]:
         column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(extent)}")
     for axis, evaluator in zip(axes[:, 0], rows, strict=True):
         axis.set_ylabel(LABELS[evaluator])
-    bar = figure.colorbar(
-        ScalarMappable(_error_scale(), COLOURS), ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both"
-    )
+    scale = ScalarMappable(_error_scale(), COLOURS)
+    bar = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
     bar.set_label("error of the normal in degrees; medians below panels")
     label_powers(bar.ax.yaxis)
     written = write_plot(options, "zoom", figure)

@@ -26,29 +26,16 @@ class Format:
 
     Each is named "module:function", as entry points of Python packages are, with a module of this package. The module
     is imported when the function is first used.
-
-    Parameters
-    ----------
-    read : str
-        A function from a path to `CageContents`. If the format has prims, it also takes ``prim``, ``time`` and the
-        rules that replace the file's own, as `ControlCage.from_file` does.
-    write : str, optional
-        A function that takes `CageContents` and a path.
-    write_triangles : str, optional
-        A function with the parameters of `files.triangle_writer.write_triangles`.
-    has_prims : bool
-        Whether a file may hold several meshes, and values at several times.
-    refers_to_files : bool
-        Whether what a file says may depend on other files.
-    up : "y" or "z", optional
-        Axis that points up in the files that modelling programs write by default; None if files store it.
     """
 
+    # From a path to `CageContents`. If the format has prims, it also takes `prim`, `time` and the rules that replace
+    # the file's own, as `ControlCage.from_file` does.
     read: str
-    write: str | None = None
-    write_triangles: str | None = None
-    has_prims: bool = False
-    refers_to_files: bool = False
+    write: str | None = None  # Takes `CageContents` and a path
+    write_triangles: str | None = None  # Has the parameters of `files.triangle_writer.write_triangles`
+    has_prims: bool = False  # Whether a file may hold several meshes, and values at several times
+    refers_to_files: bool = False  # Whether what a file says may depend on other files
+    # Axis, "y" or "z", that points up in the files that modelling programs write by default; None if files store it
     up: str | None = "y"
 
 

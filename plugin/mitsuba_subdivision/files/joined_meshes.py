@@ -20,26 +20,19 @@ from ..mesh.connectivity import IntArray
 Value = TypeVar("Value")
 
 
-def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
+def joined(
+    # One or more, with the same rules by name. Creases and corners name vertices of their mesh. A single mesh is
+    # returned as it is.
+    meshes: Sequence[CageContents],
+    name: str,  # Of the file in messages
+) -> CageContents:
     """Contents of one cage with the vertices and faces of all meshes, one mesh after the other.
 
-    Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width.
+    Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width. Warns if
+    they are not kept.
 
     Returns CageContents: with a source that names vertices and faces by their mesh and their numbers there. Raises
     CageError if meshes have different rules or schemes, or an index is out of the range of its own mesh.
-
-    Parameters
-    ----------
-    meshes : sequence of CageContents
-        One or more, with the same rules by name. Creases and corners name vertices of their mesh. A single mesh is
-        returned as it is.
-    name : str
-        Name of the file in messages.
-
-    Warns
-    -----
-    CageWarning
-        If texture coordinates or attributes are not kept.
     """
     if len(meshes) == 1:
         return meshes[0]
@@ -72,7 +65,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
         rules=rules,
         scheme=scheme,
         source=_JoinedSource(
-            f"{name}, {len(meshes)} meshes", parts=tuple(mesh.source for mesh in meshes), starts=starts
+            f"{name}, {len(meshes)} meshes", parts=tuple(each.source for each in meshes), starts=starts
         ),
     )
 
@@ -118,8 +111,7 @@ def _require_own_indices(mesh: CageContents) -> None:
 
 def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Texture coordinates and attributes that all meshes have."""
-    found = {}
-    lost = []
+    found, lost = {}, []
     texcoords = _joined_attribute([mesh.texcoords for mesh in meshes])
     if texcoords is None and any(mesh.texcoords is not None for mesh in meshes):
         lost.append("texture coordinates")
@@ -131,10 +123,8 @@ def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute |
             found[attribute] = whole
     if lost:
         shown = shortened(", ".join(lost), 200)
-        warn(
-            f"{name}: {shown} left out; expected them in all {len(meshes)} meshes, with the same interpolation and "
-            "width"
-        )
+        everywhere = f"in all {len(meshes)} meshes, with the same interpolation and width"
+        warn(f"{name}: {shown} left out; expected them {everywhere}")
     return texcoords, found
 
 
@@ -154,17 +144,11 @@ def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
 
 @dataclass(frozen=True, eq=False)
 class _JoinedSource(CageSource):
-    """Source of a cage that was joined from several meshes: names the mesh, and the number in this mesh.
+    """Source of a cage that was joined from several meshes: names the mesh, and the number in this mesh."""
 
-    Parameters
-    ----------
-    parts : tuple of CageSource
-        Sources of the meshes.
-    starts : dict of str to (len(parts),) int
-        Number of the first one of the "vertices", "faces", "creases", "corners" and "holes" of each mesh.
-    """
-
-    parts: tuple[CageSource, ...] = ()
+    parts: tuple[CageSource, ...] = ()  # Of the meshes
+    # (len(parts),) int each: number of the first one of the "vertices", "faces", "creases", "corners" and "holes" of
+    # each mesh
     starts: Mapping[str, IntArray] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:

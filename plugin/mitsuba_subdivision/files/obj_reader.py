@@ -42,11 +42,9 @@ def read_obj(path: str | Path) -> CageContents:
     Raises CageError if the file is malformed; the message names the line. The cage itself is not validated. Raises
     OSError if the file cannot be read.
 
-    Warns
-    -----
-    CageWarning
-        If a tag is not supported. If face corners have indices of texture coordinates, but some have none, or there are
-        no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture coordinates.
+    Warns if a tag is not supported. Warns if face corners have indices of texture coordinates, but some have none, or
+    there are no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture
+    coordinates.
     """
     with open(path, "rb") as file:
         content = file.read()
@@ -131,8 +129,8 @@ class _FaceCorners:
     is_face: NDArray[np.bool_]
     sizes: IntArray  # Number of corners of each face.
     arguments: Arguments
-    vertices: IntArray
-    has_texcoord: NDArray[np.bool_]
+    vertices: IntArray  # (n_h,)
+    has_texcoord: NDArray[np.bool_]  # (n_h,)
     texcoords: IntArray  # Only of the corners that have one.
 
     @classmethod
@@ -201,14 +199,7 @@ def _texcoords(
 def _corner_indices(
     arguments: NDArray[np.uint8], corner_count: int
 ) -> tuple[IntArray, NDArray[np.bool_], IntArray] | None:
-    """Indices of all face corners, as they are written; None if one is malformed.
-
-    Returns
-    -------
-    vertices : (n_h,) int
-    has_texcoord : (n_h,) bool
-    texcoords : (number of corners that have one,) int
-    """
+    """Vertices, `has_texcoord` and `texcoords` of `_FaceCorners`; None if a corner is malformed."""
     has_texcoord = np.zeros(corner_count, dtype=bool)
     slash = np.flatnonzero(arguments == _SLASH)
     if len(slash) == 0:

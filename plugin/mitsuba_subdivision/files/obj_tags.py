@@ -56,13 +56,7 @@ class ObjTags:
     plain: dict[str, tuple[NDArray[np.float64], IntArray]] = field(default_factory=dict)
 
     def as_contents(self) -> dict[str, Any]:
-        """Tags as arguments of `CageContents`.
-
-        Warns
-        -----
-        CageWarning
-            If a tag has no effect because of another one.
-        """
+        """Tags as arguments of `CageContents`. Warns if a tag has no effect because of another one."""
         rules = dict(self.rules)
         if self.propagates_corners is not None:
             if rules.get("face_varying", "corners_plus1") in ("corners_plus1", "corners_plus2"):
@@ -125,25 +119,16 @@ def take_plain_tags(
     return is_taken
 
 
-def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
+def parse_tag(
+    tags: ObjTags,
+    file: str,  # Its name in messages
+    line: int,  # 1-based
+    arguments: str,  # The statement after its keyword `t`
+) -> None:
     """Add the tag of one statement to ``tags``. If a rule is given more than once, the last value counts.
 
-    Raises CageError if the statement is malformed.
-
-    Parameters
-    ----------
-    file : str
-        Name of the file in messages.
-    line : int
-        1-based.
-    arguments : str
-        The statement after its keyword ``t``.
-
-    Warns
-    -----
-    CageWarning
-        If the tag has no effect, so that the surface may differ from what its author saw: hierarchical edits, unknown
-        tags and unknown values.
+    Raises CageError if the statement is malformed. Warns if the tag has no effect, so that the surface may differ from
+    what its author saw: hierarchical edits, unknown tags and unknown values.
     """
     where, shown = f"{file}, line {line}", shortened(arguments.strip())
     name, integers, floats, strings = _fields(where, arguments)

@@ -36,10 +36,7 @@ _NO_TEXT = {
 
 
 def require_text(name: str, content: bytes) -> None:
-    """Refuse a file that is no text of one byte for each character.
-
-    Raises CageError if it is not text; the message names the format it has.
-    """
+    """Raise CageError, which names the format, for a file that is no text of one byte for each character."""
     for begin, what in _NO_TEXT.items():
         if content.startswith(begin):
             raise CageError(f"{name}: the file is {what}")

@@ -24,13 +24,9 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
 
     Numbers have all digits that distinguish float64 numbers. The file appears whole or not at all.
 
-    Raises OSError if the file cannot be written.
-
-    Warns
-    -----
-    CageWarning
-        If the cage has more than OBJ files can hold: attributes, a scheme, texture coordinates that are not
-        face-varying, several materials of one face, or names of materials that are not one line of text.
+    Raises OSError if the file cannot be written. Warns if the cage has more than OBJ files can hold: attributes, a
+    scheme, texture coordinates that are not face-varying, several materials of one face, or names of materials that are
+    not one line of text.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "face_varying":

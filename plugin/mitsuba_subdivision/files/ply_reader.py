@@ -59,12 +59,8 @@ def read_ply(path: str | Path) -> CageContents:
     or "" for negative numbers.
 
     Raises CageError if the package plyfile is missing, or the file is malformed. The cage itself is not validated.
-    Raises OSError if the file cannot be read.
-
-    Warns
-    -----
-    CageWarning
-        If faces have other data, or vertices have lists, which are not read.
+    Raises OSError if the file cannot be read. Warns if faces have other data, or vertices have lists, which are not
+    read.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
     header = content[: max(0, content.find(b"end_header"))]
@@ -179,12 +175,8 @@ def _listed(names: Sequence[str]) -> str:
 def _polygons(lists: NDArray) -> tuple[IntArray, IntArray]:
     """Sizes and concatenated vertices of all faces, of which each is a row of a table or an array of its own."""
     if lists.ndim == 2:
-        sizes = np.full(len(lists), lists.shape[1])
-        vertices = np.array(lists, lists.dtype.newbyteorder("=")).ravel()
-    else:
-        sizes = np.fromiter((len(polygon) for polygon in lists), np.int64, len(lists))
-        vertices = np.concatenate(list(lists))
-    return sizes, vertices
+        return np.full(len(lists), lists.shape[1]), np.array(lists, lists.dtype.newbyteorder("=")).ravel()
+    return np.fromiter((len(polygon) for polygon in lists), np.int64, len(lists)), np.concatenate(list(lists))
 
 
 def _materials(numbers: NDArray) -> dict[str, IntArray]:

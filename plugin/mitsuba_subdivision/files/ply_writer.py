@@ -23,14 +23,9 @@ _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): 
 def write_ply(contents: CageContents, path: str | Path) -> None:
     """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
 
-    Raises OSError if the file cannot be written.
-
-    Warns
-    -----
-    CageWarning
-        If the cage has more than PLY files can hold: creases, corners, holes, rules other than the default, a scheme,
-        data that is varying or face-varying, attributes whose names cannot be names of properties, several materials of
-        one face, or names of materials other than "material_0" and so on.
+    Raises OSError if the file cannot be written. Warns if the cage has more than PLY files can hold: creases, corners,
+    holes, rules other than the default, a scheme, data that is varying or face-varying, attributes whose names cannot
+    be names of properties, several materials of one face, or names of materials other than "material_0" and so on.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "vertex":
@@ -98,10 +93,7 @@ def write_polygons(
     face_vertices: NDArray,  # (sum of face_sizes,) int: 0-based
     materials: NDArray | None = None,  # (n_f,) int: number of each face's material; negative for none
 ) -> None:
-    """Write polygons to a binary PLY file, which appears whole or not at all.
-
-    Raises OSError if the file cannot be written.
-    """
+    """Write polygons to a binary PLY file, whole or not at all. Raises OSError if the file cannot be written."""
     types = {name: values.dtype.newbyteorder("<") for name, values in properties.items()}
     vertex_count = len(next(iter(properties.values())))
     vertices = np.empty(vertex_count, dtype=list(types.items()))

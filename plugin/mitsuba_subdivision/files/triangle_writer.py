@@ -27,33 +27,19 @@ def require_format(path: str | Path) -> str:
 
 
 def write_triangles(
+    # `.obj`, with every digit; `.ply`, binary and in single precision; or `.usd`, `.usda` or `.usdc`, in single
+    # precision, as a mesh that is not to be subdivided
     path: str | Path,
-    positions: NDArray,
-    normals: NDArray,
-    triangles: NDArray,
-    texcoords: NDArray | None = None,
-    attributes: Mapping[str, NDArray] | None = None,
+    positions: NDArray,  # (n, 3) float32 or float64
+    normals: NDArray,  # The same
+    triangles: NDArray,  # (m, 3) int: 0-based rows of positions, normals, texture coordinates and attributes
+    texcoords: NDArray | None = None,  # (n, 2)
+    attributes: Mapping[str, NDArray] | None = None,  # (n, k) each
 ) -> None:
     """Write triangles and the data at their vertices. The file appears whole or not at all.
 
     Raises ValueError if the format is unknown. Raises CageError if the package usd-core, which writes USD files, is
-    missing. Raises OSError if the file cannot be written.
-
-    Parameters
-    ----------
-    path : str or Path
-        ``.obj``, with every digit; ``.ply``, binary and in single precision; or ``.usd``, ``.usda`` or ``.usdc``, in
-        single precision, as a mesh that is not to be subdivided.
-    positions, normals : (n, 3) float32 or float64
-    triangles : (m, 3) int
-        0-based rows of positions, normals, texture coordinates and attributes.
-    texcoords : (n, 2), optional
-    attributes : dict of str to (n, k) array, optional
-
-    Warns
-    -----
-    CageWarning
-        If the format cannot hold an attribute, or its name.
+    missing. Raises OSError if the file cannot be written. Warns if the format cannot hold an attribute, or its name.
     """
     write = function_named(writers()[require_format(path)])
     write(path, positions, normals, triangles, texcoords, attributes or {})

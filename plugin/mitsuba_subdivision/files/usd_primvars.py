@@ -23,17 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PrimvarChoice:
-    """Which primvars of a mesh are read, where not all are.
+    """Which primvars of a mesh are read, where not all are."""
 
-    Parameters
-    ----------
-    texcoords : sequence of str
-        Names that texture coordinates are looked up by first.
-    attributes : collection of str
-        Names of the attributes that are read; values of whole faces become values of their corners.
-    """
-
-    texcoords: Sequence[str] = ()
+    texcoords: Sequence[str] = ()  # Names that texture coordinates are looked up by first
+    # Names of the attributes that are read; values of whole faces become values of their corners
     attributes: Collection[str] = ()
 
     @property
@@ -58,9 +51,10 @@ class AttributeReader(Protocol):
 def read_primvars(
     reader: AttributeReader,
     mesh: UsdGeom.Mesh,
+    # (n_h,) int64, if the orientation of faces is reversed: which face corner of the file becomes each face corner
     order: IntArray | None,
-    topology: Topology | None = None,
-    choice: PrimvarChoice | None = None,
+    topology: Topology | None = None,  # What values are checked against. By default, the cage does so later.
+    choice: PrimvarChoice | None = None,  # By default, all primvars are read
 ) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Read the texture coordinates and attributes of a mesh.
 
@@ -68,26 +62,8 @@ def read_primvars(
     texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
     which follow from the surface, joints and their weights, and primvars with a single value for the whole mesh.
 
-    Raises CageError if the indices of a primvar are out of range, or their number is wrong.
-
-    Parameters
-    ----------
-    order : (n_h,) int64, optional
-        If the orientation of faces is reversed: which face corner of the file becomes each face corner.
-    topology : Topology, optional
-        What values are checked against. By default, the cage does so later.
-    choice : PrimvarChoice, optional
-        By default, all primvars are read.
-
-    Returns
-    -------
-    texcoords : Attribute or None
-    attributes : dict of str to Attribute
-
-    Warns
-    -----
-    CageWarning
-        If primvars have other types, or one value per face, and are not read.
+    Raises CageError if the indices of a primvar are out of range, or their number is wrong. Warns if primvars have
+    other types, or one value per face, and are not read.
     """
     from pxr import UsdGeom
 
@@ -113,10 +89,8 @@ def read_primvars(
             found[name], types[name] = made, kind
     if left_out:
         shown = shortened(", ".join(left_out.values()), 200)
-        reader.tell(
-            f"{reader.location}: primvars {shown} left out; expected floats, at vertices or face corners",
-            ", ".join(left_out),
-        )
+        message = f"{reader.location}: primvars {shown} left out; expected floats, at vertices or face corners"
+        reader.tell(message, ", ".join(left_out))
     by_type = [name for name, kind in types.items() if kind.startswith("texCoord2")]
     preferred = choice.texcoords if choice else ()
     pairs = (name for name in (*preferred, *TEXCOORDS, *by_type) if name in found and found[name].values.shape[1] == 2)

@@ -34,7 +34,14 @@ _NO_FACES: IntArray = np.zeros(0, np.int64)
 
 
 def read_usd(
-    path: str | Path, prim: str | None = None, time: float | None = None, rules: Mapping[str, str] | None = None
+    path: str | Path,
+    # Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default, the file's
+    # only mesh.
+    prim: str | None = None,
+    # Time code. By default, each value is the one that does not depend on time, or else the one at its first time. If a
+    # mesh has no points or faces at its first time, it is read at the first time at which it has both.
+    time: float | None = None,
+    rules: Mapping[str, str] | None = None,  # Rules and scheme that replace the mesh's own, which are then not read
 ) -> CageContents:
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
@@ -42,31 +49,13 @@ def read_usd(
     are counter-clockwise from outside. Points are not transformed for the stage's units and up axis. Skeletons and
     blend shapes move the points, as usd-core evaluates them.
 
-    Parameters
-    ----------
-    prim : str, optional
-        Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default, the file's
-        only mesh.
-    time : float, optional
-        Time code. By default, each value is the one that does not depend on time, or else the one at its first time. If
-        a mesh has no points or faces at its first time, it is read at the first time at which it has both.
-    rules : dict of str to str, optional
-        Rules and scheme that replace the mesh's own, which are then not read.
+    Raises CageError if the package usd-core is missing; if the file is malformed; if there is no such mesh, or more
+    than one; if the mesh is not a subdivision surface of a known scheme and none is given; if attributes contradict
+    each other; if meshes that become one cage differ in scheme or rules. The cage itself is not validated. Raises
+    OSError if the file cannot be read.
 
-    Raises
-    ------
-    CageError
-        If the package usd-core is missing; if the file is malformed; if there is no such mesh, or more than one; if
-        the mesh is not a subdivision surface of a known scheme and none is given; if attributes contradict each other;
-        if meshes that become one cage differ in scheme or rules. The cage itself is not validated.
-    OSError
-        If the file cannot be read.
-
-    Warns
-    -----
-    CageWarning
-        If the scheme that is given is not the mesh's own, the file refers to something that is not there, or meshes,
-        primvars or skinning are not read.
+    Warns if the scheme that is given is not the mesh's own, the file refers to something that is not there, or meshes,
+    primvars or skinning are not read.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
@@ -127,10 +116,8 @@ class MeshReader:
         sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
         vertices = self.array(mesh.GetFaceVertexIndicesAttr(), np.int64, required=True)
         if (sizes < 0).any() or sizes.sum() != len(vertices):
-            raise self.error(
-                f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries",
-                "as many",
-            )
+            found = f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries"
+            raise self.error(found, "as many")
         points = self.skinning.points(mesh, points)
         matrix = np.eye(4) if is_local else self.local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
@@ -172,18 +159,16 @@ class MeshReader:
             source=CageSource(self.location),
         )
 
-    def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
+    def fitting(
+        self,
+        attribute: Usd.Attribute,
+        consequence: str,  # End of the message, such as "the creases are left out"
+        read: Callable[[], Read],
+        otherwise: Read,
+    ) -> Read:
         """What a function reads of an attribute; something else, with a report, where that does not fit the mesh.
 
-        Parameters
-        ----------
-        consequence : str
-            End of the message, such as "the creases are left out".
-
-        Raises
-        ------
-        CageError
-            As ``read``, if nothing takes reports.
+        Raises CageError as ``read`` does, if nothing takes reports.
         """
         try:
             return read()
@@ -274,10 +259,8 @@ class MeshReader:
         if given is None:
             if asked not in SCHEMES:
                 what = "is not to be subdivided" if asked == "none" else "is to be subdivided without smoothing"
-                raise self.error(
-                    f'the mesh {what}: its subdivisionScheme is "{asked}"',
-                    f"{' or '.join(SCHEMES)}, or a scheme given in its place",
-                )
+                expected = f"{' or '.join(SCHEMES)}, or a scheme given in its place"
+                raise self.error(f'the mesh {what}: its subdivisionScheme is "{asked}"', expected)
             return SCHEMES[asked]
         if SCHEMES.get(asked) != given:
             warn(f'{self.location}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
@@ -295,18 +278,15 @@ class MeshReader:
             first = int(np.argmax(lengths < 2))
             raise self.error(f"creaseLengths has the value {lengths[first]} at {first}", "2 or more vertices")
         if lengths.sum() != len(indices):
-            raise self.error(
-                f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries", "as many"
-            )
+            found = f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries"
+            raise self.error(found, "as many")
         edges = lengths - 1
         require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of creaseSharpnesses")
         if len(sharpness) == len(lengths):
             sharpness = np.repeat(sharpness, edges)
         elif len(sharpness) != edges.sum():
-            raise self.error(
-                f"creaseSharpnesses has {len(sharpness)} entries",
-                f"{len(lengths)}, one per crease, or {edges.sum()}, one per edge",
-            )
+            expected = f"{len(lengths)}, one per crease, or {edges.sum()}, one per edge"
+            raise self.error(f"creaseSharpnesses has {len(sharpness)} entries", expected)
         is_start = np.ones(len(indices), dtype=bool)
         is_start[np.cumsum(lengths) - 1] = False
         start = np.flatnonzero(is_start)
@@ -320,9 +300,8 @@ class MeshReader:
         if not len(indices) and not len(sharpness):
             return np.zeros((0, 2))
         if len(indices) != len(sharpness):
-            raise self.error(
-                f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}", "as many"
-            )
+            found = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
+            raise self.error(found, "as many")
         require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
         path = self.mesh.GetCornerIndicesAttr().GetPath()
         return self._own_rows(np.stack([indices, sharpness], axis=1), vertex_count, "corner", path)
@@ -348,9 +327,8 @@ class MeshReader:
         matrix = np.array(local_to_world(self.mesh.GetPrim(), self.time_of))
         # The determinant says nothing about a matrix that is not finite.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
-            raise self.error(
-                f"the transform to world space is {shortened(str(matrix.tolist()), 200)}", "an invertible matrix"
-            )
+            found = f"the transform to world space is {shortened(str(matrix.tolist()), 200)}"
+            raise self.error(found, "an invertible matrix")
         return matrix
 
 

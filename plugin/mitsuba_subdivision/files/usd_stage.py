@@ -25,10 +25,7 @@ _OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 
 
 def require_usd(name: str) -> None:
-    """Check that the USD library is there.
-
-    Raises CageError if the package usd-core is missing; the message begins with the name of a file.
-    """
+    """Raise CageError if the package usd-core is missing; the message begins with the name of a file."""
     try:
         import pxr  # noqa: F401 - only to find out whether it is missing
     except ImportError:
@@ -38,21 +35,14 @@ def require_usd(name: str) -> None:
 
 
 def open_stage(
-    path: str | Path, name: str, completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None
+    path: str | Path,
+    name: str,  # Beginning of messages
+    # Makes of the stage and its name one that has what USD itself cannot open
+    completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
 ) -> Usd.Stage:
     """Open the stage of a file, with everything that it refers to. Raises CageError if the file is malformed.
 
-    Parameters
-    ----------
-    name : str
-        Beginning of messages.
-    completed : callable, optional
-        Makes of the stage and its name one that has what USD itself cannot open.
-
-    Warns
-    -----
-    CageWarning
-        If the file refers to something that is not there.
+    Warns if the file refers to something that is not there.
     """
     from pxr import Tf, Usd
 
@@ -89,24 +79,16 @@ def stage_up_axis(path: str | Path) -> str:
     Raises CageError if the package usd-core is missing, or the file is malformed.
     """
     name = f'"{path}"'
-    try:
-        from pxr import UsdGeom
-    except ImportError:
-        raise CageError(
-            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
-        ) from None
+    require_usd(name)
+    from pxr import UsdGeom
+
     with usd_errors_at(name), usd_messages_of(name):
         return str(UsdGeom.GetStageUpAxis(open_stage(path, name))).lower()
 
 
 @contextmanager
 def usd_errors_at(where: str) -> Iterator[None]:
-    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``where``.
-
-    Raises
-    ------
-    CageError
-    """
+    """Turn errors of the USD library in a ``with`` block into a `CageError` that begins with ``where``."""
     from pxr import Tf
 
     try:
@@ -114,24 +96,16 @@ def usd_errors_at(where: str) -> Iterator[None]:
     except UnicodeError:
         raise CageError(f"{where}: there are names or words that are not UTF-8; expected UTF-8") from None
     except Tf.ErrorException as error:
-        raise CageError(f"{where}: {_reason(error)}; expected a USD file") from None
+        raise CageError(f"{where}: {_clear(_commentary(error))}; expected a USD file") from None
     except MemoryError:
         raise CageError(f"{where}: the file asks for more memory than there is; expected a USD file") from None
 
 
 @contextmanager
 def usd_messages_of(name: str) -> Iterator[None]:
-    """Keep the USD library from printing in a ``with`` block; one line at its end repeats what the library reported.
+    """Keep the USD library from printing in a ``with`` block; at its end, warn in one line of what it reported.
 
-    Parameters
-    ----------
-    name : str
-        Name of the file in messages.
-
-    Warns
-    -----
-    CageWarning
-        If the library reported something besides composition errors, which `open_stage` names.
+    Messages begin with the name. Composition errors are left out, as `open_stage` names them.
     """
     from pxr import UsdUtils
 
@@ -149,30 +123,19 @@ def usd_messages_of(name: str) -> Iterator[None]:
 
 
 def chosen_meshes(
-    stage: Usd.Stage, path: str | None, name: str, time: float | None, scheme: str | None
+    stage: Usd.Stage,
+    # Path of the mesh, or of a prim with one mesh below it; "*" for all meshes; None for the only mesh of the stage
+    path: str | None,
+    name: str,  # Of the file in messages
+    time: float | None,  # Time code at which visibility and schemes are read
+    scheme: str | None,  # Replaces the meshes' own
 ) -> list[UsdGeom.Mesh]:
     """The mesh to read, or all meshes.
 
     Meshes that are not to be smoothed are skipped if there are others. If all meshes are requested, so are meshes that
-    renderers do not show.
+    renderers do not show. Warns if meshes are skipped.
 
     Raises CageError if there is no such mesh, or more than one and not all are requested.
-
-    Parameters
-    ----------
-    path : str or None
-        Path of the mesh, or of a prim with one mesh below it; "*" for all meshes; None for the only mesh of the stage.
-    name : str
-        Name of the file in messages.
-    time : float or None
-        Time code at which visibility and schemes are read.
-    scheme : str or None
-        Scheme that replaces the meshes' own.
-
-    Warns
-    -----
-    CageWarning
-        If meshes are skipped.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -236,10 +199,6 @@ def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
     # The parser names the rules of its grammar, which are in C++.
     what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
     return f"{name}, line {where[1]}: {_clear(what)}"
-
-
-def _reason(error: Exception) -> str:
-    return _clear(_commentary(error))
 
 
 def _commentary(error: Exception) -> str:

@@ -49,12 +49,7 @@ def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
 
 
 def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
-    """Check that values of the attributes of a prim have the types that its schema says; USD reads others as none.
-
-    Raises
-    ------
-    TypeError
-    """
+    """Raise TypeError unless values of a prim's attributes have the types of its schema; USD reads others as none."""
     for attribute in prim.GetAuthoredAttributes():
         value, declared = value_at(attribute, time), attribute.GetTypeName().defaultValue
         are_numbers = isinstance(value, (int, float)) and isinstance(declared, (int, float))

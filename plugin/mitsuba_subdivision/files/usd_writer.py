@@ -27,13 +27,9 @@ def write_usd(contents: CageContents, path: str | Path) -> None:
 
     A cage that names no scheme becomes a Catmull-Clark mesh.
 
-    Raises CageError if the package usd-core is missing. Raises OSError if the file cannot be written.
-
-    Warns
-    -----
-    CageWarning
-        If the cage has more than USD files can hold: Chaikin's rule, a scheme other than Catmull-Clark and Loop, or
-        attributes whose names cannot be names of primvars.
+    Raises CageError if the package usd-core is missing. Raises OSError if the file cannot be written. Warns if the cage
+    has more than USD files can hold: Chaikin's rule, a scheme other than Catmull-Clark and Loop, or attributes whose
+    names cannot be names of primvars.
     """
     with _new_mesh(path, "cage", contents.positions, contents.face_sizes, contents.face_vertices) as mesh:
         attributes = {name: each for name, each in contents.attributes.items() if is_possible(name)}

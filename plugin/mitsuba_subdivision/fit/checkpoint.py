@@ -61,10 +61,7 @@ class Checkpoint:
         return cls(int(arrays["refinements"]), int(arrays["since"]), arrays["losses"], states)
 
     def state(self, name: str, like: State) -> State:
-        """A state with the arrays of another one.
-
-        Raises ValueError if there is none of that name, or its arrays have other shapes.
-        """
+        """A state. Raises ValueError if there is none of that name, or its arrays have other shapes than these."""
         found = self.states.get(name, {})
         shapes = [{field: np.shape(values) for field, values in each.items()} for each in (found, like)]
         if shapes[0] != shapes[1]:

@@ -33,24 +33,14 @@ DAMPING = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Points of the surface, and their targets.
+    """Points of the surface, and their targets."""
 
-    Attributes
-    ----------
-    weights : (s, n) CSR array of float64
-        Points of the surface over control points.
-    goals : (s, 3) float64
-    across : (s, 3) float64
-        Unit normals, along which distances count in full; zero where there is none.
-    """
-
-    weights: sparse.csr_array
-    goals: FloatArray
-    across: FloatArray
+    weights: sparse.csr_array  # (s, n) CSR array of float64: points of the surface over control points
+    goals: FloatArray  # (s, 3) float64
+    across: FloatArray  # (s, 3) float64: unit normals, along which distances count in full; zero where there is none
 
     @classmethod
     def joined(cls, parts: Sequence[_Pairs]) -> _Pairs:
-        """The pairs of several lists, concatenated."""
         from scipy import sparse
 
         weights = sparse.csr_array(sparse.vstack([part.weights for part in parts]))
@@ -217,9 +207,8 @@ def _least_squares(
         for factor, term in terms:
             blocks[axis][axis] = blocks[axis][axis] + factor / 2 * term.matrix
             right[axis] += factor / 2 * (term.matrix @ term.origin[:, axis])
-    factors = splu(
-        sparse.block_array(blocks, format="csc"), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
-    )
+    system = sparse.block_array(blocks, format="csc")
+    factors = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     return np.ascontiguousarray(factors.solve(right.ravel()).reshape(3, -1).T)
 
 

@@ -63,14 +63,12 @@ def _samples(positions: np.ndarray, triangles: np.ndarray, count: int, seed: int
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions of the shape {positions.shape}; expected (n, 3)")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or not np.issubdtype(triangles.dtype, np.integer):
-        raise ValueError(
-            f"triangles of the shape {triangles.shape} and type {triangles.dtype}; expected (m, 3) integers"
-        )
+        found = f"triangles of the shape {triangles.shape} and type {triangles.dtype}"
+        raise ValueError(f"{found}; expected (m, 3) integers")
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
         row = int(np.flatnonzero(((triangles < 0) | (triangles >= len(positions))).any(axis=1))[0])
-        raise ValueError(
-            f"triangle {row} is {triangles[row].tolist()}; expected vertices from 0 to {len(positions) - 1}"
-        )
+        expected = f"expected vertices from 0 to {len(positions) - 1}"
+        raise ValueError(f"triangle {row} is {triangles[row].tolist()}; {expected}")
     a, b, c = positions[triangles].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     doubled = np.linalg.norm(normals, axis=1)
@@ -81,23 +79,16 @@ def _samples(positions: np.ndarray, triangles: np.ndarray, count: int, seed: int
     return points, normals[chosen] / doubled[chosen, None]
 
 
-def triangle_samples(positions: FloatArray, triangles: IntArray, count: int, seed: int) -> tuple[IntArray, FloatArray]:
+def triangle_samples(
+    positions: FloatArray,  # (n, 3)
+    triangles: IntArray,  # (m, 3): 0-based; some of them have an area
+    count: int,
+    seed: int,
+) -> tuple[IntArray, FloatArray]:
     """Locations uniform by area.
 
-    Parameters
-    ----------
-    positions : (n, 3) array
-    triangles : (m, 3) int array
-        0-based; some of them have an area.
-    count : int
-    seed : int
-
-    Returns
-    -------
-    triangle : (count,) int64
-        0-based.
-    weights : (count, 3) float64
-        Of its three vertices; not negative, and their sum is one.
+    Returns 0-based triangles ``(count,)`` int64, and weights ``(count, 3)`` float64 of their three vertices; these are
+    not negative, and their sum is one.
     """
     rng = np.random.default_rng(seed)
     a, b, c = positions[triangles].swapaxes(0, 1)

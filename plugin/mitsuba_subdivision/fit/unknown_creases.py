@@ -39,35 +39,17 @@ class UnknownCreases:
     Derivatives at integers are those of the interval above, at ``highest`` of the one below. Where creases of unequal
     sharpness meet, points may jump at integers: a vertex takes the mean sharpness of what a refinement makes smooth.
 
-    Parameters
-    ----------
-    cage : ControlCage
-        Its other tags stay.
-    edges : (n_e, 2) array of int
-        0-based ends of edges between two faces.
-    crease_of : (n_e,) int64
-        The crease that each edge belongs to: all edges of a crease have one sharpness.
-    highest : int
-        The highest sharpness, 1 to 6. `refined` is the cage refined as many times.
-    scheme : str, optional
-        As for `LimitSurface`.
-
-    Attributes
-    ----------
-    edges : (n_e, 2) int64
-    refined : ControlCage
-        The cage without semi-sharp creases that has the limit surface, with the control points of `points`.
-    initial : (n_c,) float64
-        Of each crease, the mean of its edges' sharpness in the cage, ``highest`` at most.
-
-    Raises
-    ------
-    CageError, SchemeError
-        Of an edge that is not between two faces, of ``highest`` out of range, and those of `ControlCage.refinement`.
+    Raises CageError, SchemeError of an edge that is not between two faces, of ``highest`` out of range, and those of
+    `ControlCage.refinement`.
     """
 
     def __init__(
-        self, cage: ControlCage, edges: ArrayLike, crease_of: IntArray, highest: int, scheme: str | None
+        self,
+        cage: ControlCage,  # Its other tags stay
+        edges: ArrayLike,  # (n_e, 2) int: 0-based ends of edges between two faces
+        crease_of: IntArray,  # (n_e,) int64: the crease of each edge; all edges of a crease have one sharpness
+        highest: int,  # The highest sharpness, 1 to 6. `refined` is the cage refined as many times.
+        scheme: str | None,  # As for `LimitSurface`
     ) -> None:
         if highest not in range(1, MOST_REFINEMENTS + 1):
             raise CageError(f"{cage.source.name}: highest_sharpness is {highest!r}; expected 1 to {MOST_REFINEMENTS}")
@@ -77,8 +59,10 @@ class UnknownCreases:
         self.highest, self.crease_of = int(highest), crease_of
         self._cage, self._chosen, self._half_edges = cage, scheme, np.stack([half_edges, t.twin[half_edges]])
         given = np.minimum(cage.tags.edges[half_edges], highest)
+        # (n_c,) float64: of each crease, the mean of its edges' sharpness in the cage, `highest` at most.
         self.initial: FloatArray = np.bincount(crease_of, given) / np.bincount(crease_of)
         self._scheme = adapted_scheme(self.with_sharpness(np.full(len(self.initial), highest)), scheme)
+        # Without semi-sharp creases, it has the limit surface, with the control points of `points`.
         self.refined = self.with_sharpness(self.initial)
         for _ in range(self.highest):
             self.refined = self.refined.refined(scheme)

@@ -48,35 +48,20 @@ class View:
 class Pictures:
     """A scene with a subdivision surface, rendered in its views.
 
-    Parameters
-    ----------
-    views : sequence of View
-    scene : dict
-        What there is besides the surface: emitters, and the integrator if it is to be another one.
-    shape : dict
-        Parameters of the surface besides its cage.
-    loss : "l1", "l2" or callable
-        Means over pixels of absolute or squared differences; or a function of a picture and the index of its view.
-    spp : int
-        Samples of each pixel.
-    edge_spp : int
-        Samples of outlines for each pixel, where the integrator has such.
-
-    Raises
-    ------
-    ValueError
-        If the variant has no derivatives, there are no views, a picture does not fit its film, or an entry of
-        ``scene`` has the shape's name.
+    Raises ValueError if the variant has no derivatives, there are no views, a picture does not fit its film, or an
+    entry of ``scene`` has the shape's name.
     """
 
     def __init__(
         self,
         views: Sequence[View],
+        # What there is besides the surface: emitters, and the integrator if it is to be another one
         scene: Mapping[str, Any],
-        shape: Mapping[str, Any],
+        shape: Mapping[str, Any],  # Parameters of the surface besides its cage
+        # Means over pixels of absolute or squared differences; or a function of a picture and the index of its view
         loss: Loss,
-        spp: int,
-        edge_spp: int,
+        spp: int,  # Samples of each pixel
+        edge_spp: int,  # Samples of outlines for each pixel, where the integrator has such
     ) -> None:
         if not mi.variant() or not dr.is_diff_v(mi.Float):
             raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
@@ -84,10 +69,8 @@ class Pictures:
             raise ValueError("no views: expected one at least")
         if SHAPE in scene:
             raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
-        self._shape, self._scene = (
-            {**DEFAULT_SHAPE, **shape},
-            {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene},
-        )
+        self._shape = {**DEFAULT_SHAPE, **shape}
+        self._scene = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
         self._scene["integrator"] = _with_samples(self._scene["integrator"], spp, edge_spp)
         self.sensors = [_loaded(view.sensor, spp) for view in views]
         sizes = [_size(sensor) for sensor in self.sensors]
@@ -97,28 +80,21 @@ class Pictures:
             raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
         self._loss = loss
 
-    def load(self, cage: ControlCage, halvings: int = 0) -> None:
-        """Make the scene with a cage's surface.
-
-        Parameters
-        ----------
-        cage : ControlCage
-        halvings : int
-            How often it was refined: its edges have half as many segments each time.
-        """
+    def load(
+        self,
+        cage: ControlCage,
+        halvings: int = 0,  # How often it was refined: its edges have half as many segments each time
+    ) -> None:
+        """Make the scene with a cage's surface."""
         rate = max(1, self._shape["tessellation_rate"] >> halvings)
         shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}
         self.scene = mi.load_dict({**self._scene, SHAPE: shape})
         self.params = mi.traverse(self.scene)
 
     def loss(self, values: Mapping[str, Any], seed: int) -> mi.TensorXf:
-        """The loss of all views; one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
+        """The loss of all views at values of the scene's parameters, by their names.
 
-        Parameters
-        ----------
-        values : dict
-            Parameters of the scene, by their names.
-        seed : int
+        It is one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
         """
         for name, value in values.items():
             self.params[name] = value
@@ -150,7 +126,6 @@ def _loaded(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
 
 
 def _target(picture: Any, size: tuple[int, int], where: str) -> mi.TensorXf:
-    """A picture as a tensor."""
     if isinstance(picture, (str, Path)):
         picture = mi.Bitmap(str(picture))
     if isinstance(picture, mi.Bitmap):
@@ -164,7 +139,6 @@ def _target(picture: Any, size: tuple[int, int], where: str) -> mi.TensorXf:
 
 
 def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.TensorXf | None:
-    """A mask as a tensor, if there is one."""
     if mask is None:
         return None
     values = np.array(mask, dtype=np.float32)

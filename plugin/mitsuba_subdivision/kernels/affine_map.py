@@ -72,7 +72,6 @@ def _rows(matrix: Matrix4) -> tuple[Sequence[Float], ...]:
 
 
 def _inverse(rows: tuple[Sequence[Float], ...]) -> tuple[Sequence[Float], ...]:
-    """The inverse of a linear map."""
     # Divided by the largest entry, so that the determinant neither overflows nor underflows.
     scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for row in rows for entry in row])
     x, y, z = ([entry * scale for entry in row] for row in rows)

@@ -28,18 +28,12 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 class SubdividedChannelKernel:
-    """Values subdivided like points.
-
-    Attributes
-    ----------
-    values : ControlValues
-        Coefficients of pieces, padded to 3-vectors with zeros.
-    """
+    """Values subdivided like points."""
 
     def __init__(
         self,
         channel: SubdividedChannel,  # Of 1, 2 or 3 numbers
-        float_type: type,  # Flat Dr.Jit array, or `float`
+        float_type: type,  # Flat Dr.Jit array
     ) -> None:
         table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
         self._kernel, types = PieceKernel.shared(table, float_type), ArrayTypes.of(float_type)
@@ -50,6 +44,7 @@ class SubdividedChannelKernel:
             own: Value = values if size == 1 else dr.unravel(types.vector(size), values)
             return coefficients(dr.ravel(types.vector3(*([own] if size == 1 else own), *[0] * (3 - size))))
 
+        # Coefficients of pieces, padded to 3-vectors with zeros
         self.values = ControlValues(channel.values, types, make, key=coefficients)
 
     def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:
@@ -83,7 +78,7 @@ class LinearChannelKernel:
         self,
         channel: LinearChannel,  # Of 1, 2 or 3 numbers
         walk: ElementWalk,  # Over the surface's elements
-        float_type: type,  # Flat Dr.Jit array, or `float`
+        float_type: type,  # Flat Dr.Jit array
     ) -> None:
         self._types, self._walk = ArrayTypes.of(float_type), walk
         patches = channel.patches
@@ -124,8 +119,7 @@ class LinearChannelKernel:
     def _at(self, half_edge: Index, active: Mask, *, of_centre: bool = False) -> Value:
         types = self._types
         location = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
-        row = types.fetch(types.index, self._rows, location, active)
-        return self.values.fetch(row, active)
+        return self.values.fetch(types.fetch(types.index, self._rows, location, active), active)
 
 
 ChannelKernel = SubdividedChannelKernel | LinearChannelKernel

@@ -30,7 +30,7 @@ class CoefficientMap:
     def __init__(
         self,
         table: PieceTable,
-        float_type: type,  # Flat Dr.Jit array, such as `drjit.llvm.ad.Float`, or `float`
+        float_type: type,  # Flat Dr.Jit array, such as `drjit.llvm.ad.Float`
     ) -> None:
         self._table, self._types = table, ArrayTypes.of(float_type)
 
@@ -88,32 +88,18 @@ class CoefficientMap:
 
 
 class _Steps:
-    """The stages of the map on a device: refinement, control points of parts, coefficients.
-
-    Attributes
-    ----------
-    refinement : WeightedValues or None
-        Map to the control points of the cage refined once.
-    refined_count, point_count : int
-        Of these control points, and of all together with those of parts.
-    parts : _Packets or None
-        Control points of parts.
-    rings : tuple of three index arrays, or None
-        Control points that are packets of the coefficients: their indices, those of what they are relative to or
-        `NOTHING`, and the packets.
-    pieces : _Packets or None
-        Coefficients of pieces.
-    """
+    """The stages of the map on a device: refinement, control points of parts, coefficients."""
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
         refinement = table.refinement
+        # Map to the control points of the cage refined once, and their number
         self.refined_count = table.control_count if refinement is None else refinement.shape[0]
         self.refinement = None if refinement is None else WeightedValues.shared(refinement, types.float)
         controls = table.controls
         monomial_count = next((maps[0].pieces.shape[1] for maps in table.maps if maps), 1)
         of_piece = table.packets_of_piece
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
-        self.point_count = self.refined_count
+        self.point_count = self.refined_count  # Together with the control points of parts
         for maps, (first, count, control_count, first_piece, piece_count, _, _) in zip(
             table.maps, table.classes.tolist(), strict=True
         ):
@@ -128,6 +114,8 @@ class _Steps:
                 pieces.add(weights, own_first, count, own_count, to, of_piece, step)
         listed = types.indices(controls, np.arange(self.refined_count, self.point_count))
         self.parts, self.pieces = (each.rows(types, listed) if each.added else None for each in (parts, pieces))
+        # Control points that are packets of the coefficients: their indices, those of what they are relative to or
+        # `NOTHING`, and the packets.
         self.rings = None
         if table.classes[:, 6].any():
             rings = []
@@ -140,20 +128,16 @@ class _Steps:
 
 
 class _Blocks:
-    """Collects blocks: rows of weights shared by all patches of a class.
-
-    Attributes
-    ----------
-    added : list of tuple of ints
-        Of what was added: how many blocks; of each its number of patches; the index of its first control, and how many
-        controls there are; its first row of weights; where it writes to, how far blocks are apart there, and patches.
-    """
+    """Collects blocks: rows of weights shared by all patches of a class."""
 
     def __init__(
         self,
         width: int,  # Number of vectors that a row computes
     ) -> None:
         self.width = width
+        # Of what was added: how many blocks; of each its number of patches; the index of its first control, and how
+        # many controls there are; its first row of weights; where it writes to, how far blocks are apart there, and
+        # patches
         self.added: list[tuple[int, ...]] = []
         self._weights: dict[int, tuple[np.ndarray, int]] = {}
         self._row_count = 0

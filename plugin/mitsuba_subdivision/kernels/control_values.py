@@ -29,7 +29,7 @@ class WeightedValues:
     def __init__(
         self,
         weights: sparse.csr_array,  # (n, m) sparse array: rows sum to one
-        float_type: type,  # Flat Dr.Jit array of the values, whose precision weights get; `float` for values in NumPy
+        float_type: type,  # Flat Dr.Jit array of the values, whose precision weights get
     ) -> None:
         self._weights, self._float = weights, float_type
 
@@ -40,8 +40,8 @@ class WeightedValues:
         return _WEIGHTED.get(key, lambda: cls(weights, float_type))
 
     def __call__(self, values: FloatBuffer, size: int) -> FloatBuffer:
-        """The weighted values, each of `size` components: flat, or in NumPy one per row."""
-        return self._weights @ values if self._float is float else dr.custom(_Product, self, values, size)
+        """The weighted values, each of `size` components, flat."""
+        return dr.custom(_Product, self, values, size)
 
     @cached_property
     def product(self) -> SparseMatrix:
@@ -72,34 +72,25 @@ class _Product(dr.CustomOp):
 
 
 class ControlValues:
-    """Values that kernels gather by index, and that may change.
-
-    Attributes
-    ----------
-    size : int
-        Of a value.
-    flat : flat array, or float64 without a backend
-        On a device always the same object, because others may hold a reference to it.
-    """
+    """Values that kernels gather by index, and that may change."""
 
     def __init__(
         self,
         values: NDArray[np.floating],  # (n, k) float64: of a cage
         types: ArrayTypes,
-        # Computes the gathered values, flat, from the cage's, which are flat on a device, else `(n, k)`
-        # float64. The default is the identity.
+        # Computes the gathered values, flat, from the cage's, flat. The default is the identity.
         make: Callable[[FloatBuffer], FloatBuffer] | None = None,
         # Of what `make` does: with it, equal values share what is made of them until they are set
         key: Hashable = None,
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
-        self.flat: FloatBuffer = None
-        self._shared: LaterArray | None = None
-        self.flat = types.float()
+        # Always the same object, because others may hold a reference to it.
+        self.flat: FloatBuffer = types.float()
         # Kept, so that others that are equal share the memory.
         self._given = types.shared_floats(values)
-        self._shared = LaterArray() if key is None else _MADE.get((key, self._given), LaterArray)
-        self.flat[:] = self._shared.get(lambda: self._made(self._given.array))
+        shared = LaterArray() if key is None else _MADE.get((key, self._given), LaterArray)
+        self._shared: LaterArray | None = shared
+        self.flat[:] = shared.get(lambda: self._made(self._given.array))
 
     def set(self, values: FloatBuffer) -> None:
         """Set new values of the cage, flat. Later lookups are attached to them."""

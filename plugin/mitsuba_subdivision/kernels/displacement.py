@@ -34,13 +34,7 @@ class Heights(Protocol):
     """Heights that depend on the values of a channel."""
 
     def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
-        """Heights and their derivatives by the parameters.
-
-        Parameters
-        ----------
-        value, du, dv : arrays
-            The channel's value, and its derivatives by the parameters.
-        """
+        """Heights and their derivatives by the parameters, from those of the channel's value."""
         ...
 
     def height(self, value: Value) -> Float:
@@ -108,16 +102,13 @@ class DisplacedPiece:
 
     @property
     def magnification(self) -> Float:
-        """See `Piece`."""
         return self.surface.magnification
 
     @property
     def is_deep(self) -> Mask | None:
-        """See `Piece`."""
         return self.surface.is_deep
 
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
-        """See `Piece.is_inside`."""
         return self.surface.is_inside(du, dv, tolerance)
 
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:

@@ -31,21 +31,10 @@ def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
 
 
 def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> tuple[Index, Float, Float, Float]:
-    """The halved copy of a domain that parameters lie in.
+    """The halved copy of a domain that parameters lie in; not the first where `ParameterDomain.extent` is 0.5 or more.
 
-    Parameters
-    ----------
-    u, v : float arrays
-        Where `ParameterDomain.extent` of them is a half or more, it is not the first copy.
-
-    Returns
-    -------
-    number : index array
-        In the order of `ParameterDomain.children`.
-    u, v : float arrays
-        Parameters in the copy.
-    scale : float array
-        Their derivatives by the parameters before: 2, or -2 in the copy that is turned by half a turn.
+    Returns its number, in the order of `ParameterDomain.children`; parameters in the copy; and their derivatives by the
+    parameters before: 2, or -2 in the copy that is turned by half a turn.
     """
     right, upper = u >= 0.5, v >= 0.5
     one, of_index = types.float(1), types.index

@@ -27,26 +27,16 @@ class Location:
 
     def chosen(self, condition: Mask, other: Location) -> Location:
         """Another location where a condition holds."""
-        select = dr.select
-        return Location(
-            select(condition, other.half_edge, self.half_edge),
-            select(condition, other.u, self.u),
-            select(condition, other.v, self.v),
-        )
+        pairs = (other.half_edge, self.half_edge), (other.u, self.u), (other.v, self.v)
+        return Location(*(dr.select(condition, there, here) for there, here in pairs))
 
 
 class ElementWalk:
-    """The elements of a piece table on the device, and their adjacency.
-
-    Attributes
-    ----------
-    domain : ParameterDomain
-        Of the elements.
-    """
+    """The elements of a piece table on the device, and their adjacency."""
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
         self.types = types
-        self.domain: ParameterDomain = table.patches.scheme.domain
+        self.domain: ParameterDomain = table.patches.scheme.domain  # Of the elements
         self._half_edges = types.indices(table.half_edges)
         self._first = types.indices(table.patches.elements.face_offsets)
         self._all_whole = bool(table.patches.is_whole.all())
@@ -80,12 +70,8 @@ class ElementWalk:
         """Map locations whose parameters have left their element to the neighbouring element.
 
         Parameters continue as if both elements lay in a plane. They are clamped to the sides where there is no
-        neighbour, on a border or a crease, and where they have left the neighbour as well.
-
-        Parameters
-        ----------
-        row : index array, optional
-            `row` of the half-edges, if it is known.
+        neighbour, on a border or a crease, and where they have left the neighbour as well. ``row`` is that of the
+        half-edges, if it is known.
         """
         if row is None:
             row = self.row(location.half_edge, active)

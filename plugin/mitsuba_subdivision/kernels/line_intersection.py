@@ -82,16 +82,15 @@ class LineIntersection:
     - `MISSED`: only the surface's values where the search began.
 
     On borders and creases, where steps lead beyond, it holds the nearest point there.
-
-    Parameters
-    ----------
-    walk : ElementWalk
-        Over the surface's elements.
-    piece : callable
-        The piece of the surface in which parameters lie, from a half-edge, u, v, a mask and the half-edge's row.
     """
 
-    def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., AnyPiece]) -> None:
+    def __init__(
+        self,
+        types: ArrayTypes,
+        walk: ElementWalk,  # Over the surface's elements
+        # The piece of the surface in which parameters lie, from a half-edge, u, v, a mask and the half-edge's row
+        piece: Callable[..., AnyPiece],
+    ) -> None:
         self._types, self._walk, self._piece = types, walk, piece
         self._rounding = rounding(types)
 
@@ -125,7 +124,11 @@ class LineIntersection:
             is_finite = dr.isfinite(taken.u) & dr.isfinite(taken.v)
             to = self._walk.carried(goal, active & is_finite, row)
 
-            last_step = self._last_step(piece, p, here)
+            # A step shorter than this, in parameters of a piece, is the last. Next to extraordinary points, rounding
+            # errors exceed `STEP_TOLERANCE`.
+            size = dr.sqrt(dot(p, p)) + dr.sqrt(dot(here.value, here.value))
+            longest = dr.sqrt(dr.maximum(dot(here.du, here.du), dot(here.dv, here.dv)))
+            last_step = dr.clip(over(self._rounding * size * piece.magnification, longest), STEP_TOLERANCE, 1)
             moved = dr.maximum(dr.abs(to.u - u), dr.abs(to.v - v))
             has_settled = is_finite & (dr.minimum(taken.length, moved) * piece.magnification < last_step)
             # Also if the other side is unreachable, beyond a crease.
@@ -159,15 +162,6 @@ class LineIntersection:
         corner = self._walk.corner(half_edge, active)
         first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
         return LineHits(first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(self._walk, corner))
-
-    def _last_step(self, piece: AnyPiece, p: Vector3, here: PatchValues) -> Float:
-        """A step shorter than this, in parameters of a piece, is the last.
-
-        Next to extraordinary points, rounding errors exceed `STEP_TOLERANCE`.
-        """
-        size = dr.sqrt(dot(p, p)) + dr.sqrt(dot(here.value, here.value))
-        longest = dr.sqrt(dr.maximum(dot(here.du, here.du), dot(here.dv, here.dv)))
-        return dr.clip(over(self._rounding * size * piece.magnification, longest), STEP_TOLERANCE, 1)
 
     def _steps(
         self,

@@ -24,6 +24,8 @@ SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
 CONVEX, PARALLEL = 1e-4, 1e-6
 # Points nearer to a side of the domain than this are on it.
 ON_SIDE = 1e-6
+# Directions of the sides of a domain with so many corners, in the order of `distances`.
+_SIDES = {3: ((1, 0), (1, -1), (0, 1)), 4: ((1, 0), (0, 1), (1, 0), (0, 1))}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,21 +44,15 @@ class NearestPoints:
         by_u, by_v = dr.dot(away, here.du), dr.dot(away, here.dv)
         free_u, free_v = _newton(dr.detach(here), dr.detach(away), by_u, by_v)
         part = _along(dr.detach(here), dr.detach(away), by_u, by_v, self.along_u, self.along_v)
-        return dr.select(self.is_free, free_u, part * self.along_u), dr.select(
-            self.is_free, free_v, part * self.along_v
-        )
+        along_u, along_v = part * self.along_u, part * self.along_v
+        return dr.select(self.is_free, free_u, along_u), dr.select(self.is_free, free_v, along_v)
 
 
 class NearestLocation:
-    """Finds nearest points near given locations.
-
-    Parameters
-    ----------
-    piece : callable
-        Takes a half-edge, parameters and a mask, and returns the `Piece` there, without derivatives.
-    """
+    """Finds nearest points near given locations."""
 
     def __init__(self, types: ArrayTypes, walk: ElementWalk, piece: Callable[..., Piece]) -> None:
+        # The piece is that at a half-edge, parameters and a mask, without derivatives.
         self._types, self._walk, self._piece = types, walk, piece
         self._domain = walk.domain
 
@@ -66,14 +62,9 @@ class NearestLocation:
         start: Location,  # Where to begin
         active: Mask = True,
     ) -> tuple[Location, NearestPoints]:
-        """Locations where the distance to points is least, at least among those nearby.
+        """Locations where the distance to points is least, at least among those nearby, and where they may move.
 
-        Returns
-        -------
-        location : Location
-            In whole elements seen from the first corner.
-        nearest : NearestPoints
-            The directions in which the location may move.
+        In whole elements, locations are seen from the first corner.
         """
         types = self._types
         last_step = STEP_TOLERANCE_DOUBLE if types.is_double else STEP_TOLERANCE
@@ -161,14 +152,9 @@ class NearestLocation:
         # Test whether this side alone is a border.
         is_free = (is_on_side & self._walk.is_border(here, leaving, is_on_side)) == False  # noqa: E712 - an array
         u, v = types.float(0), types.float(0)
-        for k, (along_u, along_v) in enumerate(_sides(self._domain.corner_count)):
+        for k, (along_u, along_v) in enumerate(_SIDES[self._domain.corner_count]):
             u, v = dr.select(leaving == k, along_u, u), dr.select(leaving == k, along_v, v)
         return u, v, is_free
-
-
-def _sides(corner_count: int) -> tuple[tuple[float, float], ...]:
-    """Directions of the sides of a domain, in the order of `distances`."""
-    return ((1, 0), (1, -1), (0, 1)) if corner_count == 3 else ((1, 0), (0, 1), (1, 0), (0, 1))
 
 
 def _limited(du: Float, dv: Float) -> tuple[Float, Float]:

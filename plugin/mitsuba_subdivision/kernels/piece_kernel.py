@@ -143,13 +143,9 @@ class Piece:
         return least >= -tolerance
 
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
-        """Evaluate the piece.
+        """Evaluate so far on from the parameters that were given, maybe outside of the piece.
 
-        Parameters
-        ----------
-        du, dv : float arrays
-            How far on from the parameters that were given, maybe outside of the piece. Without derivatives: see
-            `PatchValues.shifted`.
+        ``du`` and ``dv`` are without derivatives: see `PatchValues.shifted`.
         """
         s, t = self._parameters(du, dv)
         kernel = self.kernel
@@ -178,10 +174,8 @@ class Piece:
                 for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
             ]
         vector = kernel.types.vector(self.size)
-        value, found_u, found_v, normal, *second = (
-            vector(*each) for each in (value, found_u, found_v, normal, *second)
-        )
-        return PatchValues(value, found_u, found_v, normal, tuple(second))
+        value, found_u, found_v, normal = (vector(*each) for each in (value, found_u, found_v, normal))
+        return PatchValues(value, found_u, found_v, normal, tuple(vector(*each) for each in second))
 
     def _parameters(self, du: Float, dv: Float) -> tuple[Float, Float]:
         a, b, c, d = self.jacobian
@@ -234,24 +228,16 @@ class Piece:
 
 
 class PieceKernel:
-    """A piece table on the device.
+    """A piece table on the device."""
 
-    Parameters
-    ----------
-    float_type : type
-        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``, or ``float``.
-    use_stam : bool
-        Whether tips are evaluated by (9) and (11) instead of (10) and (12). They must not have levels that are pieces.
-
-    Attributes
-    ----------
-    walk : ElementWalk
-        Over the table's elements.
-    centre : tuple of two floats
-        The middle of the domain.
-    """
-
-    def __init__(self, table: PieceTable, float_type: type, *, use_stam: bool = False) -> None:
+    def __init__(
+        self,
+        table: PieceTable,
+        float_type: type,  # Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``
+        *,
+        # Whether tips are evaluated by (9) and (11) instead of (10) and (12). They must have no levels that are pieces.
+        use_stam: bool = False,
+    ) -> None:
         if use_stam and table.piece_levels:
             raise ValueError("a table with levels of tips that are pieces; expected one made for Stam's form")
         self.types = types = ArrayTypes.of(float_type)
@@ -259,9 +245,9 @@ class PieceKernel:
         self.domain = scheme.domain
         basis = polynomial_basis(scheme)
         self.monomials = Monomials(basis.powers.tolist())
-        self.centre = tuple(basis.centre.tolist())
+        self.centre = tuple(basis.centre.tolist())  # The middle of the domain
         self.first_term = FirstTerm(basis.matrix.T.tolist(), self.monomials) if use_stam else None
-        self.walk = ElementWalk(table, types)
+        self.walk = ElementWalk(table, types)  # Over the table's elements
         self._count = len(basis.powers)
         self._numbers, self._row_size = PACKET * table.packets_of_piece, -(-self._count // PACKET) * PACKET
         self._piece_levels = table.piece_levels
@@ -317,11 +303,12 @@ class PieceKernel:
             is_deep = active & is_tip & (level >= self._piece_levels)
             is_piece = active & (is_deep == False)  # noqa: E712 - an array
             tip = self._tip(patch, block_row, ends, level, block, is_deep)
+        numbers = types.row(buffer, self._numbers, number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(
             self,
             buffer,
-            self._coefficients(buffer, number, is_piece, size),
+            [numbers[i : 3 * self._count : 3] for i in range(size)],
             u - self.centre[0],
             v - self.centre[1],
             (a * scale, b * scale, c * scale, d * scale),
@@ -338,24 +325,12 @@ class PieceKernel:
         """A row of the blocks, one number for each monomial."""
         return self.types.row(self._weights, self._row_size, row, active)[: self._count]
 
-    def _coefficients(self, buffer: FloatBuffer, piece: Index, active: Mask, size: int) -> list[list[Float]]:
-        """Coefficients of a piece, by its number, of each coordinate."""
-        numbers = self.types.row(buffer, self._numbers, piece, active)
-        return [numbers[i : 3 * self._count : 3] for i in range(size)]
-
     def _split(
         self, half_edge: Index, row: Index4, u: Float, v: Float, active: Mask
     ) -> tuple[Index, Float, Float, Float, Index]:
         """Of the corner of a whole element in whose quarter parameters lie.
 
-        Returns
-        -------
-        code : index array
-            Of its half-edge.
-        u, v, scale : float arrays
-            Parameters in the quarter, seen from there, and how fast they run.
-        turn : index array
-            By which they are turned.
+        Returns the code of its half-edge; parameters in the quarter, seen from there; how fast they run; their turn.
         """
         types = self.types
         is_whole = (row[CODE] & WHOLE) != 0
@@ -408,12 +383,8 @@ class PieceKernel:
     ) -> tuple[Index, Index, Float, Float, Float]:
         """Where parameters lie in a tip.
 
-        Returns
-        -------
-        level, block : index arrays
-            The level, and the number of the regular child among those of all levels; zero in other leaves.
-        u, v, scale : float arrays
-            Parameters in the regular child of that level, and how fast they run.
+        Returns the level, and the number of the regular child among those of all levels, zero in other leaves;
+        parameters in the regular child of that level, and how fast they run.
         """
         types = self.types
         extent = u + v if self.domain.corner_count == 3 else dr.maximum(u, v)

@@ -25,14 +25,9 @@ class Monomials:
             self._columns.append([column.get(a) for a in range(max(column, default=0) + 1)])
 
     def values(self, coefficients: Sequence[Value], s: Float, t: Float, derivatives: int = 1) -> tuple[Value, ...]:
-        """Evaluate a polynomial.
+        """Evaluate a polynomial from its m coefficients, numbers or vectors.
 
-        Returns tuple: the value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
-
-        Parameters
-        ----------
-        coefficients : sequence of m arrays
-            Numbers or vectors.
+        Returns the value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
         """
         along_s = [
             _horner([0 if k is None else coefficients[k] for k in column], s, derivatives) for column in self._columns

@@ -35,47 +35,27 @@ _LOADED: Shared[LaterArray] = Shared()
 
 
 class SurfaceKernel:
-    """The limit surface of a cage on the device; see `LimitSurface.on_device`.
-
-    Parameters
-    ----------
-    table : PieceTable
-    float_type : type
-        Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``. With ``float``, each call is about one point, in double
-        precision, as in scalar variants.
-    use_stam : bool
-        Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out.
-    cells : callable, optional
-        Makes the `SamplingCells` that `sample` draws from, when it is first asked.
-
-    Attributes
-    ----------
-    types : ArrayTypes
-    walk : ElementWalk
-        Over the surface's elements.
-    displacement : Displacement or None
-        If there is one, the displaced surface is evaluated and intersected. Derivatives reach heights and their scale,
-        too.
-    coefficients : flat array
-        Of all pieces, see `PieceTable`, as the control points make them.
-    """
+    """The limit surface of a cage on the device; see `LimitSurface.on_device`."""
 
     def __init__(
         self,
         table: PieceTable,
-        float_type: type,
+        float_type: type,  # Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``
         *,
+        # Whether to evaluate by Stam's form, (9) and (11): with the first term, which the stabilised form leaves out
         use_stam: bool = False,
-        cells: Callable[[], SamplingCells] | None = None,
+        cells: Callable[[], SamplingCells] | None = None,  # Makes what `sample` draws from, when it is first asked
     ) -> None:
         self.types = ArrayTypes.of(float_type)
         self._cells = cells
         self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
-        self.walk = self._patches.walk
+        self.walk = self._patches.walk  # Over the surface's elements
+        # If there is one, the displaced surface is evaluated and intersected. Derivatives reach heights and their
+        # scale, too.
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
         self._map = CoefficientMap.shared(table, float_type)
-        self.coefficients: FloatBuffer = float_type()
+        self.coefficients: FloatBuffer = float_type()  # Of all pieces, see `PieceTable`, as control points make them
         self._loaded: LaterArray | None = None
 
     def set_control_points(self, points: FloatBuffer) -> None:
@@ -247,31 +227,17 @@ class SurfaceKernel:
         self,
         location: Location,
         active: Mask = True,
-        derivatives: int = 1,
+        derivatives: int = 1,  # 2 adds those of the normals
         *,
+        # With these, derivatives follow the points at which the lines intersect the surface; else the location stays.
+        # Beside extraordinary points, those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
         lines: Lines | None = None,
-        nearest: NearestPoints | None = None,
-        moves: bool = True,
+        nearest: NearestPoints | None = None,  # With these, derivatives follow the points that are nearest to them
+        moves: bool = True,  # Whether there are derivatives by the control points, and by what displaces the surface
+        # As `line_hits` has found them there, which saves time where there are no derivatives
         values: PatchValues | None = None,
     ) -> SurfacePoints:
-        """Evaluate the surface.
-
-        Parameters
-        ----------
-        location : Location
-        active : mask
-        derivatives : 1 or 2
-            2 adds those of the normals.
-        lines : Lines, optional
-            With these, derivatives follow the points at which the lines intersect the surface; else the location stays.
-            Beside extraordinary points, those of ``dp_du`` and ``dp_dv`` are of the location as it is, in any case.
-        nearest : NearestPoints, optional
-            With these, derivatives follow the points that are nearest to them.
-        moves : bool
-            Whether there are derivatives by the control points, and by what displaces the surface.
-        values : PatchValues, optional
-            As `line_hits` has found them there, which saves time where there are no derivatives.
-        """
+        """Evaluate the surface."""
         coefficients = self.coefficients if moves else dr.detach(self.coefficients)
         if self.displacement is None or moves:
             return self._at(location, active, derivatives, lines, nearest, coefficients, values)
@@ -343,39 +309,23 @@ class SurfaceKernel:
 
     def line_hits(
         self,
-        p: Vector3,
-        d: Vector3,
-        location: Location,
+        p: Vector3,  # A point of each line, near the surface
+        d: Vector3,  # Along it
+        location: Location,  # Where to begin
         active: Mask = True,
         *,
-        max_distance: Float = dr.inf,
+        max_distance: Float = dr.inf,  # How far from the point the surface may be
+        # Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
+        # that enters a ball also leaves it, and Newton's method may find either.
         facing: Float = 0,
     ) -> LineHits:
-        """Find where lines intersect the surface near given locations, see `LineIntersection`; without derivatives.
-
-        Parameters
-        ----------
-        p : 3-vector
-            A point of each line, near the surface.
-        d : 3-vector
-            Along it.
-        location : Location
-            Where to begin.
-        active : mask
-        max_distance : float array
-            How far from the point the surface may be.
-        facing : float array
-            Above zero where the surface's normal is to be along the line, below where it is to be against it: a line
-            that enters a ball also leaves it, and Newton's method may find either.
-        """
+        """Find where lines intersect the surface near given locations, see `LineIntersection`; without derivatives."""
         with dr.suspend_grad():
             piece = partial(self._piece, dr.detach(self.coefficients))
-            search = LineIntersection(self.types, self.walk, piece)
-            return search.hits(p, d, location, active, max_distance, facing)
+            return LineIntersection(self.types, self.walk, piece).hits(p, d, location, active, max_distance, facing)
 
 
 def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vector3]:
-    """Derivatives of the unit normal, from second derivatives."""
     uu, uv, vv = values.second
     # Where the surface collapses, nothing turns: infinite derivatives times zero would not be numbers.
     inverse = over(1, dr.norm(cross(values.du, values.dv)), 0)
@@ -412,9 +362,8 @@ class AreaSampler:
         self._count = len(cells.areas)
         if not cells.areas.sum() > 0:
             raise ValueError("the surface has no area; expected one to draw points from")
-        precision = types.numpy_float
         # Probabilities are differences of the rounded cumulative sums.
-        until = (np.cumsum(cells.areas) / cells.areas.sum()).astype(precision)
+        until = (np.cumsum(cells.areas) / cells.areas.sum()).astype(types.numpy_float)
         until[-1] = 1
         chances = np.diff(until.astype(np.float64), prepend=0)
         size = np.abs(np.linalg.det(cells.matrices)) * (0.5 if walk.domain.corner_count == 3 else 1)

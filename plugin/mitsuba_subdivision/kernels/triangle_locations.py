@@ -24,10 +24,7 @@ class TriangleLocations(Protocol):
     def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
         """The location of a point of a triangle, where its parameters are interpolated.
 
-        Parameters
-        ----------
-        b1, b2 : float arrays
-            Barycentric coordinates of the triangle's second and third corner.
+        ``b1`` and ``b2`` are barycentric coordinates of the triangle's second and third corner.
         """
         ...
 
@@ -44,13 +41,7 @@ def triangle_locations(
 
 
 class AdaptiveLocations:
-    """Parameters on the triangles of an adaptive tessellation, which are kept for each.
-
-    Parameters
-    ----------
-    walk, types
-        As for `triangle_locations`.
-    """
+    """Parameters on the triangles of an adaptive tessellation, which are kept for each."""
 
     def __init__(self, grid: AdaptiveGrid, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk = types, walk
@@ -66,13 +57,7 @@ class AdaptiveLocations:
 
 
 class UniformLocations:
-    """Parameters on the triangles of a uniform tessellation, which are the same in all elements of a kind.
-
-    Parameters
-    ----------
-    walk, types
-        As for `triangle_locations`.
-    """
+    """Parameters on the triangles of a uniform tessellation, which are the same in all elements of a kind."""
 
     def __init__(self, grid: UniformGrid, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk = types, walk

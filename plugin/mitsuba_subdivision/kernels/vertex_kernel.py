@@ -26,11 +26,7 @@ class VertexKernel:
     """A tessellation on the device, evaluated whenever its control points move.
 
     Points and tangents are linear in the control points: forward mode applies the same map, reverse mode its transpose.
-
-    Parameters
-    ----------
-    float_type : type
-        Flat Dr.Jit array of the control points, such as ``drjit.llvm.ad.Float``. Weights have its precision.
+    Weights have the precision of ``float_type``, the flat array of control points, such as ``drjit.llvm.ad.Float``.
     """
 
     def __init__(self, table: VertexTable, float_type: type) -> None:
@@ -45,20 +41,10 @@ class VertexKernel:
         self._weld_target = types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Evaluate every vertex of the tessellation.
+        """Points and unit normals, flat, from x, y, z of each control point; differentiable, forward and backward.
 
-        Raises ValueError if the number of control points is not that of the table.
-
-        Parameters
-        ----------
-        control_points : flat Dr.Jit float array, (3 control_count)
-            x, y, z of each control point.
-
-        Returns
-        -------
-        positions, normals : flat Dr.Jit float arrays, (3 vertex_count)
-            Points, and unit normals along the cross product of the tangents, zero where a patch is folded or collapsed.
-            Differentiable with respect to the control points, forward and backward.
+        Normals are along the cross product of the tangents, zero where a patch is folded or collapsed. Raises
+        ValueError if the number of control points is not that of the table.
         """
         return self.evaluated(dr.detach(control_points)).attached(control_points)
 

@@ -262,13 +262,8 @@ def paired(
 ) -> tuple[IndexArray, IndexArray, int]:
     """Join half-edges of equal keys into edges.
 
-    Returns
-    -------
-    edge : (n,) int32
-        0-based edge of each half-edge, in the order of the keys.
-    twin : (n,) int32
-        The other half-edge of the edge, -1 if there is none. Where an edge has more than two, one of them.
-    edge_count : int
+    Returns (n,) int32, the 0-based edge of each half-edge, in the order of the keys; (n,) int32, the other half-edge of
+    the edge, -1 if there is none, and where an edge has more than two, one of them; and the number of edges.
     """
     order, begins = sorted_order(keys)
     edge, twin = np.empty_like(order), np.full_like(order, -1)

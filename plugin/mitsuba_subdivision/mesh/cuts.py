@@ -91,12 +91,7 @@ def _split_vertices(
 ) -> tuple[NDArray[np.int32], IntArray]:
     """Give every side of a vertex, the faces between two borders, a copy of it; the first one keeps the vertex itself.
 
-    Returns
-    -------
-    face_vertices : (n_h,) int32
-        Of the cut mesh.
-    vertex : (n,) int64
-        The vertex that each vertex of the cut mesh is a copy of.
+    Returns ``face_vertices`` of the cut mesh, (n_h,) int32, and `CutMesh.vertex`.
     """
     t = mesh.topology
     # Counter-clockwise, a side begins at a border edge that leaves the vertex. A closed fan beside other fans of the

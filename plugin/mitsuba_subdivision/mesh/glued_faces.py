@@ -28,18 +28,12 @@ class GluedFaces:
     half-edge is to be glued to a second one, the two that it is glued to are the same half-edge, and their faces the
     same face. Sets of half-edges that are the same are named by the first one, which belongs to the first walk that
     arrives at the face.
-
-    Attributes
-    ----------
-    walks : list of (corner, turns)
-        In an order that puts the element first, and walks with few turns before those with many.
-    twin : list of int
-        The half-edge that each one is glued to, -1 if none; for half-edges that name their sets.
     """
 
     def __init__(self, signature: Signature) -> None:
         fans = signature.fans
         walks = [(corner, turns) for corner, fan in enumerate(fans) for turns in fan_turns(fan)]
+        # (corner, turns): the element first, and walks with few turns before those with many
         self.walks = sorted(walks, key=lambda walk: (walk[0], abs(walk[1]), walk[1]))
         is_element = [signature.kind == "face" and turns == 0 for _, turns in self.walks]
         sizes = [
@@ -48,6 +42,7 @@ class GluedFaces:
         ]
         self._begins = ragged.offsets(sizes).tolist()
         self._walk_of = np.repeat(np.arange(len(sizes)), sizes).tolist()
+        # The half-edge that each one is glued to, -1 if none; for half-edges that name their sets
         self.twin = [-1] * self._begins[-1]
         # A half-edge that is the same, lower but for the first of all that are the same.
         self._lower = list(range(len(self.twin)))
@@ -100,24 +95,17 @@ class GluedFaces:
         if self._walk_of[kept] == self._walk_of[dropped]:
             return
         for here, there in zip(self._around(kept), self._around(dropped), strict=True):
-            _unite(self._lower, here, there)
+            # Make one set of those of the two.
+            one, other = _first(self._lower, here), _first(self._lower, there)
+            self._lower[max(one, other)] = min(one, other)
         for half_edge in self._around(dropped):
             twin, self.twin[half_edge] = self.twin[half_edge], -1
             if twin >= 0:
                 self._glue(half_edge, twin)
 
 
-# Sets of integers, named by their least members. Each integer leads to a lower one of its set, the least to itself.
-
-
 def _first(lower: list[int], member: int) -> int:
-    """The least member of a set."""
+    """The least member of a set of integers, each of which leads to a lower one, the least to itself."""
     while (other := lower[member]) != member:
         member = other
     return member
-
-
-def _unite(lower: list[int], one: int, other: int) -> None:
-    """Make one set of those of two members."""
-    one, other = _first(lower, one), _first(lower, other)
-    lower[max(one, other)] = min(one, other)

@@ -116,12 +116,7 @@ def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
     Found by pointer doubling: after ``r`` rounds each corner knows of the next ``2**r`` corners counter-clockwise, so
     that a vertex of many faces takes a few rounds more, and not a walk around it.
 
-    Returns
-    -------
-    fan : (n_h,) int
-        A number that is equal for corners of one fan, and different for others.
-    is_first : (n_h,) bool
-        True at one corner of each fan.
+    Returns (n_h,) int, equal for corners of one fan and different for others; and (n_h,) bool, true at one of each fan.
     """
     corners = np.arange(topology.half_edge_count)
     jump = topology.turn(corners)
@@ -169,9 +164,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
 
     def edges_at(half_edges: IntArray) -> IntArray:
         """``(n_v,)`` number of some edges that end at each vertex, given one half-edge of each edge."""
-        return np.bincount(start[half_edges], minlength=t.vertex_count) + np.bincount(
-            end[half_edges], minlength=t.vertex_count
-        )
+        return np.bincount(np.concatenate([start[half_edges], end[half_edges]]), minlength=t.vertex_count)
 
     edge_count = edges_at(t.edge_half_edge)
     creases = vertices & (edges_at(t.edge_half_edge[is_odd]) == 2) & (t.vertex_face_count > edge_count)

@@ -64,13 +64,8 @@ def value_mesh(
     And where semi-sharp edges of one index sharpen the other while the seam itself is semi-sharp for longer, OpenSubdiv
     lets the other become smooth one refinement late; here both become smooth together.
 
-    Returns
-    -------
-    topology : Topology
-        The cage's mesh, cut along creases and seams, with the rules that the values follow. Faces and half-edges keep
-        their numbers.
-    value_index : (n,) int64
-        0-based row of the attribute's values at each vertex.
+    Returns the cage's mesh, cut along creases and seams, with the rules that the values follow; faces and half-edges
+    keep their numbers. And (n,) int64, the 0-based row of the attribute's values at each vertex.
     """
     t = mesh.topology
     seam = seams(t, indices)

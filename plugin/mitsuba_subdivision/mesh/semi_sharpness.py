@@ -93,20 +93,14 @@ SMOOTH_EDGE = 0.0, 0.0, 0.0
 
 
 class FanSharpness(NamedTuple):
-    """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on numbers of edges.
+    """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on numbers of edges."""
 
-    Parameters
-    ----------
-    edges : tuple of (sharpness, sharpness of the refined half at the vertex, of the half at the other end)
-        Of the edges at which the faces of the fan begin, from the most clockwise face on.
-    vertex : float
-        Sharpness of the vertex.
-    across : tuple of (sharpness, sharpness of the refined half at the vertex, whether the edge sharpens the vertex)
-        Of semi-sharp edges across the cut, in increasing order.
-    """
-
+    # (sharpness, sharpness of the refined half at the vertex, of the half at the other end) of the edges at which the
+    # faces of the fan begin, from the most clockwise face on
     edges: tuple[tuple[float, float, float], ...]
-    vertex: float
+    vertex: float  # Sharpness of the vertex
+    # (sharpness, sharpness of the refined half at the vertex, whether the edge sharpens the vertex) of semi-sharp edges
+    # across the cut, in increasing order
     across: tuple[tuple[float, float, bool], ...]
 
 

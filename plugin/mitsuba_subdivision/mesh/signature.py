@@ -29,25 +29,13 @@ FanHalfEdges = tuple[list[int], list[int]]
 
 
 class TaggedFan(NamedTuple):
-    """Faces around a vertex on a border, with a rule of its own or semi-sharp features, as one of them sees the others.
+    """Faces around a vertex on a border, with its own rule or semi-sharp features, as one of them sees the others."""
 
-    Parameters
-    ----------
-    ahead : tuple of int
-        Sizes of the faces from this one on, counter-clockwise up to the border, or all around.
-    behind : tuple of int
-        Sizes of the faces on its other side, clockwise up to the border, without this one.
-    is_closed : bool
-        Whether the faces go all around.
-    sharpness : FanSharpness or None
-        None where nothing is semi-sharp.
-    """
-
-    ahead: tuple[int, ...]
-    behind: tuple[int, ...]
+    ahead: tuple[int, ...]  # Sizes of the faces from this one on, counter-clockwise up to the border, or all around
+    behind: tuple[int, ...]  # Sizes of the faces on its other side, clockwise up to the border, without this one
     rule: VertexRule = VertexRule.AUTOMATIC
-    is_closed: bool = False
-    sharpness: FanSharpness | None = None
+    is_closed: bool = False  # Whether the faces go all around
+    sharpness: FanSharpness | None = None  # None where nothing is semi-sharp
 
     @property
     def is_open(self) -> bool:
@@ -104,16 +92,10 @@ class Signature:
     """Shape of a one-ring, as the half-edge that names the element sees it.
 
     Elements of equal signature have the same limit stencils over their one-rings.
-
-    Parameters
-    ----------
-    kind : "face" or "vertex"
-    fans : tuple of Fan
-        The fan at each corner of the element, counter-clockwise, as the element sees it. A vertex element has one fan,
-        the faces around it.
     """
 
     kind: ElementKind
+    # At each corner of the element, counter-clockwise, as the element sees it; of a vertex element, the faces around it
     fans: tuple[Fan, ...]
 
     def __eq__(self, other: object) -> bool:

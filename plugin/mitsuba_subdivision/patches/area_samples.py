@@ -158,11 +158,8 @@ def uniform_locations(
     are accepted with the ratio of the area element to its bound. The surface beyond the measured levels around
     extraordinary points, some 10^-11 of it, is left out.
 
-    Returns
-    -------
-    half_edge : (count,) int64
-        The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
-    uv : (count, 2) float64
+    Returns ``half_edge``, (count,) int64: the corner of an element where parameters begin, a half-edge of
+    `PatchTable.elements`; and ``uv``, (count, 2) float64.
     """
     flat = [areas.regular, *(each.ravel() for each in areas.tips)]
     until = np.cumsum(np.concatenate(flat))

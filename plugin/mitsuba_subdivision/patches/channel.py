@@ -69,44 +69,35 @@ class ChannelLayout:
 _LAYOUTS: Shared[ChannelLayout] = Shared()
 
 
+@dataclass(frozen=True, eq=False)
 class _OfLayout:
     """The members that a channel takes from its layout."""
 
     layout: ChannelLayout
-    values: FloatArray
+    values: FloatArray  # (n, k) float64
 
     @property
     def patches(self) -> PatchTable:
+        """See `SubdividedChannel` and `LinearChannel`."""
         return self.layout.patches
 
     @property
     def value_index(self) -> IntArray:
+        """``(n,)`` int64, 0-based row of ``values`` at each vertex or face corner, as `patches`."""
         return self.layout.value_index
 
     @property
     def seam(self) -> NDArray[np.bool_] | None:
+        """``(n_h,)`` whether each half-edge of the cage lies on a seam; None where none does."""
         return self.layout.seam
 
 
-@dataclass(frozen=True, eq=False)
 class SubdividedChannel(_OfLayout):
-    """Values that are subdivided as points are.
+    """Values at mesh vertices that are subdivided as points are.
 
-    Attributes
-    ----------
-    layout : ChannelLayout
-        Which has the next three.
-    patches : PatchTable
-        Of the mesh on which the values are subdivided: cut along seams as well. Its half-edges have the cage's numbers.
-    value_index : (n_v,) int64
-        0-based row of ``values`` at each mesh vertex.
-    seam : (n_h,) bool or None
-        Whether each half-edge of the cage lies on a seam; None where none does.
-    values : (n, k) float64
+    `patches` are those of the mesh on which the values are subdivided: cut along seams as well. Its half-edges have the
+    cage's numbers.
     """
-
-    layout: ChannelLayout
-    values: FloatArray
 
     def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `PatchSampler.evaluate`."""
@@ -125,28 +116,13 @@ class SubdividedChannel(_OfLayout):
         return vertex_matrices(self.patches, self.value_index, len(self.values), half_edge, uv, 1)[0]
 
 
-@dataclass(frozen=True, eq=False)
 class LinearChannel(_OfLayout):
-    """Values that are interpolated linearly over each element.
+    """Values at face corners that are interpolated linearly over each element.
 
     Over a polygon that has a patch at each corner, they are interpolated bilinearly over each patch: the quadrilateral
-    between the corner, the middles of its two edges and the polygon's centre, as by linear refinement.
-
-    Attributes
-    ----------
-    layout : ChannelLayout
-        Which has the next three.
-    patches : PatchTable
-        Of the surface.
-    value_index : (n_h,) int64
-        0-based row of ``values`` at each face corner.
-    seam : (n_h,) bool or None
-        As for `SubdividedChannel`.
-    values : (n, k) float64
+    between the corner, the middles of its two edges and the polygon's centre, as by linear refinement. `patches` are
+    those of the surface.
     """
-
-    layout: ChannelLayout
-    values: FloatArray
 
     def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples, given as for `PatchSampler.evaluate`."""
@@ -187,12 +163,7 @@ class LinearChannel(_OfLayout):
     def _corners(self, half_edge: IntArray) -> tuple[list[IntArray], IntArray, NDArray[np.bool_]]:
         """Corners of the faces around samples, as the domain counts them from the samples' own, with the last one last.
 
-        Returns
-        -------
-        corners : list of (s,) int
-        face : (s,) int
-        is_partial : (s,) bool
-            Whether the face has another number of corners than the domain.
+        Returns corners, each (s,) int, the faces, and whether these have another number of corners than the domain.
         """
         t, corner_count = self.patches.topology, self.patches.scheme.domain.corner_count
         corners = [self.patches.half_edge_of_corner[half_edge]]
@@ -252,7 +223,6 @@ def contracts_alike(
 def _layout_of(
     name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable
 ) -> ChannelLayout:
-    """See `ChannelLayout.of`."""
     if attribute.interpolation == "vertex":
         return ChannelLayout(SubdividedChannel, patches, cage.cut_mesh.vertex)
     # Varying values have no indices, but one value for each vertex.
@@ -314,18 +284,11 @@ def _is_linear_alone(scheme: Scheme) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PatchSampler:
-    """Evaluates points, or other values that are subdivided as points are, anywhere on patches.
-
-    Parameters
-    ----------
-    control_values : (n, k) float64
-    control_of_vertex : (n_v,) int64
-        0-based row of ``control_values`` at each mesh vertex.
-    """
+    """Evaluates points, or other values that are subdivided as points are, anywhere on patches."""
 
     patches: PatchTable
-    control_values: FloatArray
-    control_of_vertex: IntArray
+    control_values: FloatArray  # (n, k) float64
+    control_of_vertex: IntArray  # (n_v,) int64: 0-based row of ``control_values`` at each mesh vertex
 
     def evaluate(
         self,

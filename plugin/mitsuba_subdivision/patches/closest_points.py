@@ -105,11 +105,8 @@ class ClosestPointSearch:
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         """Locations of the points nearest to some points ``(s, 3)``.
 
-        Returns
-        -------
-        half_edge : (s,) int64
-            The corner of an element where parameters begin, a half-edge of `PatchTable.elements`.
-        uv : (s, 2) float64
+        Returns ``half_edge``, (s,) int64: the corner of an element where parameters begin, a half-edge of
+        `PatchTable.elements`; and ``uv``, (s, 2) float64.
         """
         found = [self._nearest(part) for part in np.split(points, range(CHUNK, len(points), CHUNK))]
         half_edge, uv = zip(*found, strict=True)
@@ -343,7 +340,7 @@ def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPi
             is_flat[:] = True
         done.append((pieces.chosen(is_flat), boxes.chosen(is_flat)))
         pieces = pieces.chosen(~is_flat).halved()
-    return PolynomialPieces.joined(each for each, _ in done), TurnedBoxes.joined([each for _, each in done])
+    return PolynomialPieces.joined(each for each, _ in done), TurnedBoxes.joined(each for _, each in done)
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,13 +44,8 @@ def nearest_in_pieces(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find a local minimum of the distance to a point in each piece.
 
-    Returns
-    -------
-    uv : (s, 2) float64
-        Parameters in the piece.
-    squared_distance : (s,) float64
-    slope : (s,) float64
-        How fast the distance still falls along the tangents, beyond the piece's edges too; see `slopes`.
+    Returns parameters in the piece, (s, 2) float64; the squared distances; and how fast the distance still falls along
+    the tangents, beyond the piece's edges too; see `slopes`.
     """
     runs = np.split(np.arange(len(points)), range(CHUNK, len(points), CHUNK))
     parts = [_nearest(_Descent.begun(pieces, which[at], points[at], uv[at], size)) for at in runs]
@@ -135,11 +130,7 @@ class _Descent:
     def _direction(self) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Newton's step, along the edges of the domain where it would leave it, and no further than to the next.
 
-        Returns
-        -------
-        step : (s, 2) float64
-        is_newton : (s,) bool
-            Whether it is the full step of Newton's method.
+        Returns the step, (s, 2) float64, and whether it is the full step of Newton's method.
         """
         domain = self.pieces.basis.domain
         normals = domain.edge_normals

@@ -56,8 +56,7 @@ class PatchTable:
         # copies of each other share a class. If not, each begins at its element's first corner.
         may_turn: bool = True,
     ) -> None:
-        self.topology, self.scheme = topology, scheme
-        self.is_hole, self.may_turn = is_hole, may_turn
+        self.topology, self.scheme, self.is_hole, self.may_turn = topology, scheme, is_hole, may_turn
 
     @cached_property
     def elements(self) -> Topology:
@@ -125,7 +124,7 @@ class PatchTable:
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
             for corners in counted(members, "Classes of patches")
         ]
-        if self._has_local_borders:
+        if self.scheme.has_local_borders:
             signatures = [signature.near() for signature in signatures]
         # Semi-sharpness changes no one-ring.
         rings = [one_ring(signature.smoothed) for signature in signatures]
@@ -175,14 +174,7 @@ class PatchTable:
         control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
         control_count: int,
     ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-        """Control values of all patches and, for refined ones, the matrix that makes them of the cage's.
-
-        Returns
-        -------
-        controls : (n,) uint32
-            `controls`, by their rows.
-        refinement : (n, control_count) sparse array or None
-        """
+        """`controls`, as rows of control values; of refined patches also the matrix that makes these of the cage's."""
         refined = self.refined
         if refined is not None:
             from scipy import sparse
@@ -242,13 +234,9 @@ class PatchTable:
             codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + unused)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
 
-    @property
-    def _has_local_borders(self) -> bool:
-        return self.scheme.has_local_borders
-
     def _fan_codes(self) -> IntArray:
         """``(n_h,)`` code of the fan around the mesh's vertex at each corner of `elements`, see `one_ring_codes`."""
-        codes = fan_codes(self.topology, near=self._has_local_borders)
+        codes = fan_codes(self.topology, near=self.scheme.has_local_borders)
         return codes if self.elements is self.topology else codes[self.half_edge_of_corner]
 
     def _keys(self, fans: IntArray, corners: IntArray, corner_count: int) -> list[IntArray]:
@@ -266,13 +254,7 @@ class PatchTable:
         fans: IntArray,  # (n_h,) int: as made by `_fan_codes`
         corners: IndexArray,  # (n,) int32: first corners of the elements
     ) -> tuple[IndexArray, IntArray]:
-        """Begin each whole element at the corner from which its code is least: turned copies get the same code.
-
-        Returns
-        -------
-        corners : (n,) int32
-        codes : (n,) int
-        """
+        """Begin each whole element at the corner from which its code is least: turned copies get the same code."""
         count = self.scheme.domain.corner_count
         if fans.size == count * len(corners):
             # All elements are whole, and their corners follow each other.

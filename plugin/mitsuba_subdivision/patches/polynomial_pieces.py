@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache, partial
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ RUN = 1024
 MOST_PIECES, DIVISIONS = 64, 3
 
 _Any = TypeVar("_Any")
+_Parts = TypeVar("_Parts", bound="PartArrays")
 
 # Every element is divided this often, so into 8 by 8 parts, before the coefficients of the parts bound it. A box is
 # then larger than the tight one by some percent of the bend of a part, which is a 64th of the element's.
@@ -40,8 +41,32 @@ UNITS, UNIT = 16, 2.0**-24
 CHUNK = 128
 
 
+class PartArrays:
+    """Parts of a surface as a dataclass: first what they have in common, then arrays with a row for each."""
+
+    @property
+    def _fields(self) -> tuple[Any, ...]:
+        return tuple(getattr(self, each.name) for each in fields(self))  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return len(self._fields[1])
+
+    def chosen(self: _Parts, which: NDArray) -> _Parts:
+        """Some of the parts, by their numbers or a mask."""
+        make: Callable[..., _Parts] = type(self)
+        common, *arrays = self._fields
+        return make(common, *(each[which] for each in arrays))
+
+    @classmethod
+    def joined(cls: type[_Parts], parts: Iterable[_Parts]) -> _Parts:
+        """Parts that have the same in common, one after the other; at least one."""
+        make: Callable[..., _Parts] = cls
+        (common, *_), *columns = zip(*(part._fields for part in parts), strict=True)
+        return make(common, *map(np.concatenate, columns))
+
+
 @dataclass(frozen=True, eq=False)
-class PolynomialPieces:
+class PolynomialPieces(PartArrays):
     """Parts of a surface that are polynomials."""
 
     basis: BernsteinBasis
@@ -53,21 +78,10 @@ class PolynomialPieces:
     origins: FloatArray  # (n, 3) float64: points near the pieces, so that small ones lose no digits
     coefficients: FloatArray  # (n, b, 3) float64: relative to these
 
-    def __len__(self) -> int:
-        return len(self.half_edge)
-
     @cached_property
     def monomials(self) -> FloatArray:
         """``(n, b, 3)`` coefficients of products of powers of u and v; the powers are the basis's `indices`."""
         return self.basis.monomials @ self.coefficients
-
-    def chosen(self, which: NDArray) -> PolynomialPieces:
-        """Some of the pieces, by their numbers or a mask."""
-        return PolynomialPieces(self.basis, *(each[which] for each in self._arrays))
-
-    @property
-    def _arrays(self) -> tuple[NDArray, ...]:
-        return self.half_edge, self.matrices, self.offsets, self.origins, self.coefficients
 
     def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
         """Runs of pieces, at least one, and their coefficients ``(b, 3, n)``.
@@ -85,13 +99,6 @@ class PolynomialPieces:
             lower[at] += columns.min(axis=0).T
             upper[at] += columns.max(axis=0).T
         return lower, upper
-
-    @classmethod
-    def joined(cls, parts: Iterable[PolynomialPieces]) -> PolynomialPieces:
-        """Pieces one after the other; at least one part."""
-        parts = list(parts)
-        columns = zip(*(part._arrays for part in parts), strict=True)
-        return cls(parts[0].basis, *(np.concatenate(column) for column in columns))
 
     def halved(self) -> PolynomialPieces:
         """The four copies of each piece at half the size, all first ones before all second ones and so on."""
@@ -117,7 +124,7 @@ class PolynomialPieces:
 
 
 @dataclass(frozen=True, eq=False)
-class Tips:
+class Tips(PartArrays):
     """The surface around extraordinary points of the same patch: at every level, three polynomials."""
 
     patch: IrregularPatch
@@ -126,9 +133,6 @@ class Tips:
     matrices: FloatArray
     offsets: FloatArray
     coordinates: FloatArray  # (t, K, 3) float64: eigen-coordinates; the first is the extraordinary point
-
-    def __len__(self) -> int:
-        return len(self.half_edge)
 
     @property
     def points(self) -> FloatArray:
@@ -144,20 +148,6 @@ class Tips:
     def tangents(self) -> FloatArray:
         """``(t, 2, 3)`` two tangents at the points, whose cross product is along the normal."""
         return self.patch.limit_frame @ self.coordinates
-
-    def chosen(self, which: NDArray) -> Tips:
-        """Some of the tips, by their numbers or a mask."""
-        return Tips(self.patch, *(each[which] for each in self._arrays))
-
-    @property
-    def _arrays(self) -> tuple[NDArray, ...]:
-        return self.half_edge, self.matrices, self.offsets, self.coordinates
-
-    @classmethod
-    def joined(cls, parts: list[Tips]) -> Tips:
-        """Tips of the same patch, one after the other; at least one."""
-        columns = zip(*(each._arrays for each in parts), strict=True)
-        return cls(parts[0].patch, *(np.concatenate(column) for column in columns))
 
     def level(self, level: int) -> PolynomialPieces:
         """The regular pieces of a level: first those of all first children, and so on."""
@@ -180,7 +170,7 @@ class Tips:
 
 
 @dataclass(frozen=True, eq=False)
-class ElementParts:
+class ElementParts(PartArrays):
     """Parts of a surface that are divided alike, not yet divided."""
 
     element: DividedElement
@@ -191,23 +181,6 @@ class ElementParts:
     # (n, K, 3) float64: control points of their one-rings. Where rules are convex, the parts lie within the hull of
     # these.
     controls: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.half_edge)
-
-    def chosen(self, which: NDArray) -> ElementParts:
-        """Some of the parts, by their numbers or a mask."""
-        return ElementParts(self.element, *(each[which] for each in self._arrays))
-
-    @property
-    def _arrays(self) -> tuple[NDArray, ...]:
-        return self.half_edge, self.matrices, self.offsets, self.controls
-
-    @classmethod
-    def joined(cls, parts: list[ElementParts]) -> ElementParts:
-        """Parts that are divided alike, one after the other; at least one."""
-        columns = zip(*(each._arrays for each in parts), strict=True)
-        return cls(parts[0].element, *(np.concatenate(column) for column in columns))
 
     def box(self) -> tuple[FloatArray, FloatArray]:
         """``(n, 3)`` opposite corners of boxes around the control points."""
@@ -257,7 +230,8 @@ class SurfacePieces:
         if refined is not None:
             control_points = refined.matrix @ control_points
         form = regular_bernstein(table.scheme)
-        regular, tips, undivided = [_no_pieces(form.basis)], [], []
+        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.basis.indices), 3))]
+        regular, tips, undivided = [PolynomialPieces(form.basis, np.empty(0, dtype=np.int64), *empty)], [], []
         sizes = np.zeros((len(patches.elements.face_sizes), 3))
         elements = divided_elements(table.scheme, [each.signature for each in table.classes])
         known: dict[DividedElement, FloatArray] = {}
@@ -319,11 +293,6 @@ def alike(parts: Iterable[_Any], key: Callable[[_Any], object]) -> list[list[_An
     return list(found.values())
 
 
-def _no_pieces(basis: BernsteinBasis) -> PolynomialPieces:
-    empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(basis.indices), 3))]
-    return PolynomialPieces(basis, np.empty(0, dtype=np.int64), *empty)
-
-
 def _seen(
     patches: PatchTable,
     corners: IntArray,  # (p,) int: corners of elements where the patches begin
@@ -377,11 +346,12 @@ def element_bounds(
         np.maximum.at(upper, element, high)
 
     def widen_by(part: PolynomialPieces) -> None:
-        halvings = np.maximum(HALVINGS - _halvings_before(part), 0)
+        # Less the halvings of the element that have made each piece.
+        size = np.sqrt(np.abs(np.linalg.det(part.matrices)))
+        halvings = np.maximum(HALVINGS - np.rint(-np.log2(size)).astype(np.int64), 0)
         for count in np.unique(halvings).tolist():
             which = np.flatnonzero(halvings == count)
-            divide = _divided(part.basis, count)
-            chosen = part.chosen(which)
+            divide, chosen = _divided(part.basis, count), part.chosen(which)
             for at, columns in chosen.runs(CHUNK):
                 divided, origins = times(divide, columns), chosen.origins[at]
                 widen(chosen.half_edge[at], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
@@ -394,12 +364,6 @@ def element_bounds(
         widen(tips.half_edge, tips.points - reach, tips.points + reach)
     rounded = UNITS * UNIT * pieces.sizes
     return lower - rounded, upper + rounded
-
-
-def _halvings_before(pieces: PolynomialPieces) -> IntArray:
-    """``(n,)`` number of halvings of the element that make each piece."""
-    size = np.sqrt(np.abs(np.linalg.det(pieces.matrices)))
-    return np.rint(-np.log2(size)).astype(np.int64)
 
 
 @lru_cache(maxsize=64)

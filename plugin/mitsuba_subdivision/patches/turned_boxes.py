@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..evaluation.bernstein import BernsteinBasis, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .polynomial_pieces import PolynomialPieces
+from .polynomial_pieces import PartArrays, PolynomialPieces
 
 # Rounding error of a frame of unit vectors at right angles.
 SQUARE = 1e-12
@@ -21,7 +21,7 @@ SHORTEST = 1e-100
 
 
 @dataclass(frozen=True, eq=False)
-class TurnedBoxes:
+class TurnedBoxes(PartArrays):
     """Boxes around pieces, turned to lie along them."""
 
     basis: BernsteinBasis  # Of the pieces
@@ -38,10 +38,6 @@ class TurnedBoxes:
     # (n, 2) float64: the least and the largest eigenvalue of the second derivatives across the piece in the middle
     curvatures: FloatArray
     stretch: FloatArray  # (n,) float64: A lower bound of the squared length of unit displacements anywhere in the piece
-
-    @property
-    def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.frames, self.middles, self.halves, self.points, self.back, self.bends, self.curvatures, self.stretch
 
     @classmethod
     def around(cls, pieces: PolynomialPieces) -> TurnedBoxes:
@@ -103,16 +99,6 @@ class TurnedBoxes:
             np.maximum(1 - np.sqrt(change), 0) ** 2,
         )
 
-    def chosen(self, which: NDArray) -> TurnedBoxes:
-        """Some of the boxes, by their numbers or a mask."""
-        return TurnedBoxes(self.basis, *(each[which] for each in self._arrays))
-
-    @classmethod
-    def joined(cls, parts: list[TurnedBoxes]) -> TurnedBoxes:
-        """Boxes one after the other; at least one part."""
-        columns = zip(*(part._arrays for part in parts), strict=True)
-        return cls(parts[0].basis, *(np.concatenate(column) for column in columns))
-
     def near(
         self,
         points: FloatArray,  # (s, 3) float64
@@ -121,13 +107,8 @@ class TurnedBoxes:
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """Which points are no further from their box than a distance of their own.
 
-        Returns
-        -------
-        near : (n,) int64
-            Numbers of these points.
-        squared_distance : (n,) float64
-        away : (n, 3) float64
-            From them to the middles of their boxes, along the sides of these.
+        Returns numbers of these points, (n,) int64; their squared distances; and the way from them to the middles of
+        their boxes, along the sides of these, (n, 3) float64.
         """
         found = [(np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3)))]
         for begin in range(0, len(which), RUN):

@@ -12,12 +12,7 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     """The chosen scheme, or the cage's own or Catmull-Clark, with the cage's rules.
 
     Raises SchemeError if the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no
-    surface of it.
-
-    Warns
-    -----
-    CageWarning
-        If the cage's file names another scheme.
+    surface of it. Warns if the cage's file names another scheme.
     """
     scheme = _with_rules_of(cage, chosen)
     cut = cage.cut_mesh

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
 from ..cage.control_cage import ControlCage
@@ -31,7 +30,6 @@ from .refined_corners import RefinedCorners
 
 if TYPE_CHECKING:
     from scipy import sparse
-
 
 # Corners that are added may depend on creases that are added. Then nothing is left to add.
 MOST_REPAIRS = 3
@@ -138,8 +136,10 @@ def _with_tags(
     stays = corners.at_ends(cut.vertex_rules == VertexRule.CORNER, cut)
     rules = expected.vertex_rules[expected.face_vertices]
     for _ in range(MOST_REPAIRS):
-        creases, tags = _creases(sharpness, corners.vertex, expected.next), sharpness.corners()
-        contents = replace(contents, creases=creases, corners=tags)
+        sharp = np.flatnonzero(sharpness.edges)
+        ends = corners.vertex[sharp], corners.vertex[expected.next[sharp]]
+        creases = np.stack([*ends, sharpness.edges[sharp]], axis=1)
+        contents = replace(contents, creases=creases, corners=sharpness.corners())
         found = built(contents)
         is_joined, is_torn, has_other_rule, is_sharper = differences(expected, found.cut_mesh.topology)
         found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
@@ -167,12 +167,6 @@ def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: Refined
     vertices = np.zeros(len(corners.copies))
     vertices[: len(tags.vertices)] = np.where(tags.is_corner, INFINITE, np.maximum(tags.vertices - 1, 0))
     return Sharpness(edges, vertices)
-
-
-def _creases(sharpness: Sharpness, vertex: IntArray, following: IntArray) -> NDArray[np.float64]:
-    """Creases as a cage takes them, given the vertex at which each half-edge begins, and the half-edge after it."""
-    sharp = np.flatnonzero(sharpness.edges)
-    return np.stack([vertex[sharp], vertex[following[sharp]], sharpness.edges[sharp]], axis=1)
 
 
 def built(contents: CageContents) -> ControlCage:

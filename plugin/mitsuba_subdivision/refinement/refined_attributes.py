@@ -21,7 +21,6 @@ from .refined_corners import RefinedCorners
 if TYPE_CHECKING:
     from scipy import sparse
 
-
 TEXCOORDS = "texcoords"
 RefinedAttributes = tuple[Attribute | None, dict[str, Attribute]]
 
@@ -48,12 +47,7 @@ def refined_attributes(
     Raises CageError if no rule makes the same corners. Raises SchemeError if the scheme has no rules for seams, and an
     attribute has some.
 
-    Returns
-    -------
-    face_varying : str
-        The rule for the refined cage.
-    texcoords : Attribute or None
-    attributes : dict of str to Attribute
+    Returns the face-varying rule for the refined cage, its texture coordinates and its attributes.
     """
     found: dict[str, Attribute] = {}
     subdivided: dict[str, _RefinedValues] = {}
@@ -182,14 +176,9 @@ def _first_wrong(refined: ControlCage, mode: str, subdivided: dict[str, _Refined
 def differences(expected: Topology, found: Topology) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
     """Compare two meshes, half-edge by half-edge. Without differences refinement does the same to both.
 
-    Returns
-    -------
-    is_joined, is_torn : (n_h,) bool
-        Whether a half-edge of the found mesh has a twin that is not expected, and whether it lacks the expected one.
-    has_other_rule : (n_h,) bool
-        Whether the vertex at its beginning has another `VertexRule`.
-    is_sharper : (n_h,) bool
-        Whether semi-sharpness of its edge, or at the vertex at its beginning, is another one.
+    Returns, each (n_h,) bool, whether a half-edge of the found mesh has a twin that is not expected; whether it lacks
+    the expected one; whether the vertex at its beginning has another `VertexRule`; and whether semi-sharpness of its
+    edge, or at the vertex at its beginning, is another one.
     """
     is_other = expected.twin != found.twin
     has_other_rule = expected.vertex_rules[expected.face_vertices] != found.vertex_rules[found.face_vertices]

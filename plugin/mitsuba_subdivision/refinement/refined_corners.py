@@ -119,12 +119,7 @@ class RefinedCorners:
         Corners share a value if they are of the same vertex of the refined cage and follow from the same values: those
         at the old vertex, or at both ends of the edge.
 
-        Returns
-        -------
-        first : (n,) int64
-            A corner that has each value.
-        indices : (n_c,) int64
-            Of the values at all corners.
+        Returns a corner that has each value, (n,) int64, and the indices of the values at all corners, (n_c,) int64.
         """
         t, h = self.cage.topology, self.half_edge
         start, end = h, np.where(self.kind == EDGE, t.next[h], h)

@@ -10,15 +10,7 @@ from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import (
-    PhantomPoint,
-    Refinement,
-    Scheme,
-    TriangleRule,
-    kept_rules,
-    kept_sharpness,
-    tensor_basis,
-)
+from .scheme import PhantomPoint, Refinement, Scheme, TriangleRule, kept_rules, kept_sharpness, tensor_basis
 from .stencil_table import StencilTable
 
 
@@ -104,11 +96,7 @@ class CatmullClark(Scheme):
             # Of (Q + 2 R + (n - 3) S) / n, the edge midpoints in R hold half of S: (n - 2) / n in all.
             (np.arange(n_v), np.arange(n_v), own),
             (origin[around], end[around], (masks.smooth / valence**2)[origin[around]]),
-            (
-                origin[of_vertex],
-                member[vertex_share],
-                (masks.smooth / valence**2)[origin[of_vertex]] / size[of_vertex],
-            ),
+            (origin[of_vertex], member[vertex_share], (masks.smooth / valence**2)[origin[of_vertex]] / size[of_vertex]),
             (masks.rows, masks.columns, masks.weights),
         )
         return Refinement(refined, stencils)

@@ -91,33 +91,19 @@ def crease_masks(topology: Topology) -> CreaseMasks:
 
 def _vertex_masks(
     t: Topology,
-    centre: IntArray,
+    centre: IntArray,  # (n,) int: the vertex, for each edge at a vertex
+    # (n,) bool: whether each of these edges is infinitely sharp; whether it is sharp at all
     infinite: NDArray[np.bool_],
     sharp: NDArray[np.bool_],
-    sharp_vertices: NDArray[np.bool_],
-    across: IntArray,
+    sharp_vertices: NDArray[np.bool_],  # (n_v,) bool: vertices that are semi-sharp themselves
+    across: IntArray,  # (m,) int: the vertex, for each semi-sharp edge across the cut that sharpens it
 ) -> tuple[IntArray, FloatArray]:
     """Find the mask of every vertex, before or after a refinement.
 
-    Parameters
-    ----------
-    centre : (n,) int
-        The vertex, for each edge at a vertex.
-    infinite, sharp : (n,) bool
-        Whether each of these edges is infinitely sharp; whether it is sharp at all.
-    sharp_vertices : (n_v,) bool
-        Vertices that are semi-sharp themselves.
-    across : (m,) int
-        The vertex, for each semi-sharp edge across the cut that sharpens it.
-
-    Returns
-    -------
-    sharp_count : (n_v,) int64
-        Number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3 for the corner mask.
-        More than three count as 3, and so does whatever else makes the vertex a corner.
-    along : (n,) float64
-        For each edge at a vertex, 1 if it is sharp and 0 if it is not. The one sharp edge at a dart is cut into two
-        border edges, which count a half each.
+    Returns (n_v,) int64, the number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3
+    for the corner mask. More than three count as 3, and so does whatever else makes the vertex a corner. And (n,)
+    float64, for each edge at a vertex, 1 if it is sharp and 0 if it is not. The one sharp edge at a dart is cut into
+    two border edges, which count a half each.
     """
     along = sharp.astype(float)
     along[infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5

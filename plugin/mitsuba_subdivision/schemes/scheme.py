@@ -194,20 +194,14 @@ def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
 
 
 def kept_sharpness(
-    topology: Topology, face_vertices: NDArray[np.integer], last: int, new_count: int, method: CreaseMethod
+    topology: Topology,
+    # (n_h',) int: of the refined mesh. The faces at old corners come first, each listed from the old vertex on.
+    face_vertices: NDArray[np.integer],
+    last: int,  # Place of the last edge in each of these faces. The first edge and the last are halves of old edges.
+    new_count: int,  # Number of vertices that are new
+    method: CreaseMethod,
 ) -> SemiSharpness | None:
-    """Semi-sharp features after a refinement that keeps the vertices and makes a face at every corner of the old mesh.
-
-    Parameters
-    ----------
-    face_vertices : (n_h',) int
-        Of the refined mesh. The faces at old corners come first, each listed from the old vertex on.
-    last : int
-        Place of the last edge in each of these faces. The first edge and the last one are halves of old edges.
-    new_count : int
-        Number of vertices that are new.
-    method : "uniform" or "chaikin"
-    """
+    """Semi-sharp features after a refinement that keeps the vertices and makes a face at every corner of the mesh."""
     semi, t = topology.semi_sharpness, topology
     if semi is None:
         return None
@@ -229,16 +223,9 @@ def low_valence(topology: Topology, least: int) -> Unsupported | None:
 
 
 def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
-    """Products of one-dimensional bases.
+    """Products of the values and derivatives ``(derivatives + 1, s, r)`` of one-dimensional bases along u and v.
 
-    Parameters
-    ----------
-    u, v : (derivatives + 1, s, r)
-        Values and derivatives of the one-dimensional basis along each direction.
-
-    Returns
-    -------
-    (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
+    Returns (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
     """
     orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
     count = u.shape[1:]

@@ -70,13 +70,7 @@ def mesh_name(name: str) -> str:
 
 
 def mesh_attributes(cage: ControlCage) -> dict[str, int]:
-    """Attributes of a cage that a Mitsuba mesh can store, with the number of components of each.
-
-    Warns
-    -----
-    CageWarning
-        For each attribute that the mesh cannot store.
-    """
+    """Attributes of a cage that a Mitsuba mesh can store, with their numbers of components. Warns of the others."""
     found = {}
     for name, attribute in cage.attributes.items():
         size = attribute.values.shape[1]

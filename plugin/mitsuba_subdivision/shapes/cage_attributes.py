@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..device_arrays import take_over
 from ..kernels.types import FloatBuffer
 from ..mesh.shared import SharedArray
-from ..schemes.domain import FloatArray
 from ..variants import Variant
 from .attribute_parameters import mesh_name
 from .device_state import is_recording
@@ -31,14 +31,11 @@ from .parameter_table import errors_about
 from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
-    from scipy import sparse
-
     from ..patches import Channel
     from ..surface import LimitSurface
     from ..tessellation import AttributeTable, VertexTable
 
 PREFIX = "cage_"
-
 
 # Called with an attribute's name and the gradient with respect to its values, after reverse mode has reached them.
 OnBackward = Callable[[str, FloatBuffer], None]
@@ -48,34 +45,28 @@ class CageAttributes:
     """Control values of texture coordinates and attributes, and the mesh buffers computed from them.
 
     Weights are computed when a value first changes, so a shape with constant values never needs them.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Of the attributes that `traverse` exposes.
-
-    Attributes
-    ----------
-    values : dict of str to flat array
-        By the parameters' names, such as "cage_texcoords".
-    moving : set of str
-        Names of the parameters that move vertices.
     """
 
     # See `WeightedValues`.
     UPLOADED_LATER = ("all_weights",)
 
-    def __init__(self, variant: Variant, surface: LimitSurface, names: Iterable[str]) -> None:
+    def __init__(
+        self,
+        variant: Variant,
+        surface: LimitSurface,
+        names: Iterable[str],  # Of the attributes that `traverse` exposes
+    ) -> None:
         self._source = surface.cage.source.name
         self._float = variant.Float if dr.is_jit_v(variant.Float) else None
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
         # Meshes of equal values share their memory until one is assigned.
-        self._given = {name: self._control_values(channel) for name, channel in self._channels.items()}
+        self._given = {name: self._upload(channel.values) for name, channel in self._channels.items()}
         kind = self._float or dr.scalar.ArrayXf
+        # By the parameters' names, such as "cage_texcoords"
         self.values: dict[str, FloatBuffer] = {
             f"{PREFIX}{name}": kind(given.array) for name, given in self._given.items()
         }
-        self.moving: set[str] = set()
+        self.moving: set[str] = set()  # Names of the parameters that move vertices
         self._colors = {
             name
             for name, channel in self._channels.items()
@@ -104,7 +95,7 @@ class CageAttributes:
         """Set the vertices of a tessellation."""
         self._loaded = attributes.values
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}
-        self._uploaded = {name: self._upload(values) for name, values in shown.items()}
+        self._uploaded = {name: self._upload(values.astype(np.float32)) for name, values in shown.items()}
         self._locations = attributes.locate or table.locations
         self._weights: dict[tuple, Any] = {}
 
@@ -136,23 +127,15 @@ class CageAttributes:
         chosen = self._channels if names is None else names
         return {mesh_name(name): self._stored(name) for name in chosen if name in self._loaded}
 
-    def _control_values(self, channel: Channel) -> SharedArray:
+    def _upload(self, values: NDArray[np.floating]) -> SharedArray:
+        """Values, flat; in JIT variants, meshes with equal values share one array."""
         if self._float is None:
-            return SharedArray(channel.values.ravel())
+            return SharedArray(values.ravel())
         from ..kernels.array_types import ArrayTypes
 
-        return ArrayTypes.of(self._float).shared_floats(channel.values)
-
-    def _upload(self, values: FloatArray) -> SharedArray:
-        """A mesh buffer; in JIT variants, meshes with equal values share one array."""
-        if self._float is None:
-            return SharedArray(values.astype(np.float32).ravel())
-        from ..kernels.array_types import ArrayTypes
-
-        return ArrayTypes.of(self._float).shared_floats(values.astype(np.float32))
+        return ArrayTypes.of(self._float).shared_floats(values)
 
     def _stored(self, name: str) -> FloatBuffer:
-        """What the mesh stores of an attribute."""
         values = self._at_vertices(name)
         return self._upsampling.stored(values) if self._upsampling and name in self._colors else values
 
@@ -178,16 +161,13 @@ class CageAttributes:
         # Attributes that share control vertices and patches share weights.
         key = type(channel), id(channel.patches), channel.value_index.tobytes()
         if key not in self._weights:
-            self._weights[key] = self._made_weights(channel)
+            weights: Any = channel.weights(*self._locations())
+            if self._float is not None:
+                from ..kernels.control_values import WeightedValues
+
+                weights = WeightedValues(weights, self._float)
+            self._weights[key] = weights
         return self._weights[key]
-
-    def _made_weights(self, channel: Channel) -> Any:
-        weights: sparse.csr_array = channel.weights(*self._locations())
-        if self._float is None:
-            return weights
-        from ..kernels.control_values import WeightedValues
-
-        return WeightedValues(weights, self._float)
 
     def _move(self, name: str, on_backward: OnBackward) -> None:
         values = self.values[f"{PREFIX}{name}"]

@@ -45,19 +45,15 @@ def is_recording() -> bool:
 
 
 class DeviceState:
-    """Exposes the arrays of a shape, and of the objects that it holds, to Dr.Jit; a shape keeps one.
-
-    Attributes
-    ----------
-    is_frozen : bool
-        Whether a frozen function has seen the arrays. Dr.Jit goes on reading its tables, which are in NumPy's memory.
-    """
+    """Exposes the arrays of a shape, and of the objects that it holds, to Dr.Jit; a shape keeps one."""
 
     def __init__(
         self,
         shape: Any,  # Not kept alive
     ) -> None:
-        self._shape, self.is_frozen = weakref.ref(shape), False
+        self._shape = weakref.ref(shape)
+        # Whether a frozen function has seen the arrays. Dr.Jit goes on reading its tables, which are in NumPy's memory.
+        self.is_frozen = False
 
     # A scene that the garbage collector frees while a frozen function is called ends the process.
     @paused_collection()
@@ -82,11 +78,8 @@ def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
     if dr.is_array_v(kind):
         if dr.is_jit_v(kind):
             yield value
-    elif isinstance(value, dict):
-        for each in value.values():
-            yield from _arrays_in(each, seen)
-    elif isinstance(value, (list, tuple)):
-        for each in value:
+    elif isinstance(value, (dict, list, tuple)):
+        for each in value.values() if isinstance(value, dict) else value:
             yield from _arrays_in(each, seen)
     elif isinstance(value, partial):
         yield from _arrays_in(value.func, seen)

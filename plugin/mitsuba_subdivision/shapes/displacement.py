@@ -46,19 +46,6 @@ class ShapeDisplacement:
     """Displacement of a shape's surface: heights, their channel, and the scale.
 
     Raises ValueError if the cage lacks the channel that heights depend on, or heights are not scalar.
-
-    Attributes
-    ----------
-    attribute : str
-        Name of the cage's channel that the heights depend on: an attribute, or "texcoords".
-    channel : Channel
-        Its interpolation and its current values, which are read from the device.
-    scale : flat array of one number
-        The parameter ``displacement_scale``.
-    host_scale : float
-        Its value.
-    kernel : SurfaceKernel or None
-        The displaced surface on the device, that of exact shading if there is any. None in scalar variants without.
     """
 
     def __init__(
@@ -71,6 +58,7 @@ class ShapeDisplacement:
         exact: ExactShading | None = None,  # Exact shading, whose surface is displaced as well
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
+        # `attribute` names the cage's channel that the heights depend on: an attribute, or "texcoords".
         self.heights: SurfaceHeights
         if isinstance(given, str):
             self.attribute = _attribute_named(given, surface)
@@ -86,7 +74,9 @@ class ShapeDisplacement:
             self.heights = TextureHeights(variant, given)
         # On a device, once they have been updated.
         self._values: FloatBuffer = None
+        # The parameter ``displacement_scale``, a flat array of one number
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
+        # The displaced surface on the device, that of exact shading if there is any. None in scalar variants without.
         self.kernel: SurfaceKernel | None = None
         # The values of exact shading are updated by `CageAttributes` already.
         self._own_values: ControlValues | None = None
@@ -129,6 +119,7 @@ class ShapeDisplacement:
 
     @property
     def channel(self) -> Channel:
+        """The channel, with its current values, which are read from the device."""
         if self._values is None:
             return self._loaded
         values = np.array(self._values, dtype=np.float64).reshape(self._loaded.values.shape)

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from ..kernels.affine_map import AffineMap
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.control_values import ControlValues
-from ..kernels.element_walk import Location
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
-from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
+from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector3
 from ..kernels.vectors import added, dot, over
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
@@ -72,15 +71,6 @@ class ExactShading:
     Near the hit on a triangle, the ray's line is intersected with the limit surface. The intersection gives the
     interaction its normal, parameters, their derivatives, and texture coordinates. Lines are intersected in object
     space, so that shapes with equal control points share the surface's coefficients.
-
-    Attributes
-    ----------
-    kernel : SurfaceKernel
-        The surface in object space, relative to the centre.
-    to_world : 4x4 matrix
-        Of points relative to the centre.
-    values : dict of str to ControlValues
-        Of texture coordinates and of the attributes that are evaluated on the surface, by their names in the cage.
     """
 
     def __init__(
@@ -95,9 +85,10 @@ class ExactShading:
         self._variant = variant
         self._name = surface.cage.source.name
         pieces = surface.pieces("stam" if use_stam else "stabilized")
+        # The surface in object space, relative to the centre
         self.kernel = SurfaceKernel(pieces, variant.Float, use_stam=use_stam)
         self.kernel.load(positions)
-        self.to_world: Matrix4 = self.kernel.types.matrix4(1)
+        self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # Of points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
         self.take_counts()
         self._limit_surface = surface
@@ -165,6 +156,7 @@ class ExactShading:
 
     @property
     def values(self) -> dict[str, ControlValues]:
+        """Of texture coordinates and of the attributes evaluated on the surface, by their names in the cage."""
         return {name: channel.values for name, channel in self._channels.items()}
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -245,22 +237,23 @@ class ExactShading:
         along, mirrored = self._direction(si, wi), self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
         hits = self.kernel.line_hits(hit, to_world.inverse_direction(along), start, active)
         with dr.suspend_grad():
-            u, v = self._parameters(hits.location, active)
+            # Texture coordinates; parameters if the cage has none.
+            u, v = hits.location.u, hits.location.v
+            if self._texcoords is not None:
+                u, v = self._texcoords(hits.location, active)[0]
         is_other = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
         others = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_other)
         location = hits.location.chosen(is_other, others.location)
         if dr.grad_enabled(si.p):
             # The hit stays on that line. Along it, the interaction's point may be that of the triangle.
             is_held = dr.select(is_other, others.kind, hits.kind) == ON_LINE
-            location = self._following(location, si.p, dr.select(is_other, mirrored, along), is_held, active)
+            if dr.grad_enabled(self.to_world):
+                to_world = AffineMap.of(self.to_world)
+            d = to_world.inverse_direction(dr.select(is_other, mirrored, along))
+            lines = Lines(to_world.inverse_point(vector3(si.p)), d, is_held)
+            location = self.kernel.at(location, active, lines=lines).location
         value = self._attributes[name](location, active)[0]
         return self._upsampling(value) if self._upsampling and name in self._colors else value
-
-    def _following(self, location: Location, p: Vector3, d: Vector3, is_held: Mask, active: Mask) -> Location:
-        """A location with the derivatives of the hit of a line, given in the world by a point and a direction."""
-        to_world = AffineMap.of(self.to_world) if dr.grad_enabled(self.to_world) else self._map
-        lines = Lines(to_world.inverse_point(self.kernel.types.vector3(p)), to_world.inverse_direction(d), is_held)
-        return self.kernel.at(location, active, lines=lines).location
 
     def texcoords_of_corners(self, face_count: int) -> FloatArray:
         """Texture coordinates ``(3 n, 2)`` at the corners of all triangles, in their order in the mesh."""
@@ -285,12 +278,6 @@ class ExactShading:
         vector3 = self.kernel.types.vector3
         seen = vector3(dr.detach(si.to_world(wi)))
         return dr.select(dr.squared_norm(seen) > 0, seen, vector3(dr.detach(si.n)))
-
-    def _parameters(self, location: Location, active: Mask) -> Vector2:
-        """Texture coordinates at a location; its parameters if the cage has none."""
-        if self._texcoords is None:
-            return location.u, location.v
-        return self._texcoords(location, active)[0]
 
     def _fill_in(
         self,

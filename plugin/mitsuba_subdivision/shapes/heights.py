@@ -130,7 +130,9 @@ class TextureHeights:
         """
         s_0, t_0 = dr.detach(s), dr.detach(t)
         slopes = self._slopes(s_0, t_0, active)
-        step_s, step_t = self._texel()
+        # Steps that lead one texel on.
+        texels = abs(self._to_uv()) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
+        step_s, step_t = (1 / np.maximum(texels.max(axis=0), 1)).tolist()
         for parameter, ds, dt in ((s, step_s / 2, 0.0), (t, 0.0, step_t / 2)):
             with dr.suspend_grad():
                 behind = self._slopes(s_0 - ds, t_0 - dt, active)
@@ -139,11 +141,6 @@ class TextureHeights:
             per = 1 / (2 * (ds + dt))
             slopes = [slope + (b - a) * per * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
         return slopes
-
-    def _texel(self) -> list[float]:
-        """Steps of s and of t that lead one texel on."""
-        texels = abs(self._to_uv()) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
-        return (1 / np.maximum(texels.max(axis=0), 1)).tolist()
 
     def height(self, value: Value) -> Float:
         """The heights alone."""
@@ -222,8 +219,7 @@ class TextureHeights:
         return found
 
     def _difference(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
-        step = DIFFERENCE
         return (
-            (self._height(s + step, t, active) - self._height(s - step, t, active)) / (2 * step),
-            (self._height(s, t + step, active) - self._height(s, t - step, active)) / (2 * step),
+            (self._height(s + DIFFERENCE, t, active) - self._height(s - DIFFERENCE, t, active)) / (2 * DIFFERENCE),
+            (self._height(s, t + DIFFERENCE, active) - self._height(s, t - DIFFERENCE, active)) / (2 * DIFFERENCE),
         )

@@ -102,18 +102,9 @@ def read_parameters(props: mi.Properties) -> Parameters:
     if "filename" in props:
         source = os.path.basename(str(props["filename"]))
     surface = LimitSurface(cage, scheme)
+    shown = _shown(props, surface)
     return Parameters(
-        surface,
-        source,
-        to_world,
-        tessellation,
-        shading,
-        face_normals,
-        evaluator,
-        offset,
-        displacement,
-        scale,
-        _shown(props, surface),
+        surface, source, to_world, tessellation, shading, face_normals, evaluator, offset, displacement, scale, shown
     )
 
 
@@ -179,7 +170,6 @@ def _reject_unknown(props: mi.Properties) -> None:
 
 
 def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
-
     rules = {name: value_of(props, name) for name in RULES if name in props}
     strict = value_of(props, "strict")
     arrays = [name for name in (*ARRAYS, *TAGS, "cage_name") if name in props]
@@ -229,45 +219,23 @@ def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarr
 
 
 def cage_of_file(path: str, **options: Any) -> ControlCage:
-    """`ControlCage.from_file`, returning the cage of a living shape if the file is unchanged.
-
-    Warns
-    -----
-    CageWarning
-        Likewise, for each shape.
-    """
+    """`ControlCage.from_file`, returning the cage of a living shape if the file is unchanged. Warns for each shape."""
     found_format = FORMATS.get(os.path.splitext(path)[1].lower())
     if found_format is None or found_format.refers_to_files:
         return ControlCage.from_file(path, **options)
     found = os.stat(path)
     if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:
         return ControlCage.from_file(path, **options)
-    key = (
-        path,
-        found.st_dev,
-        found.st_ino,
-        found.st_size,
-        found.st_mtime_ns,
-        found.st_ctime_ns,
-        *sorted(options.items()),
-    )
+    state = found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    key = path, *state, *sorted(options.items())
     return _shared(key, lambda: ControlCage.from_file(path, **options))
 
 
 def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
     """`ControlCage.from_arrays`, returning the cage of a living shape if all arguments are equal.
 
-    Parameters
-    ----------
-    name : str or None
-        What messages call the cage. If there is one, the cage's warnings were given before, and are not repeated.
-    **arguments
-        Of `ControlCage.from_arrays`.
-
-    Warns
-    -----
-    CageWarning
-        Likewise, for each shape without a name.
+    Messages call the cage by its name. It warns for each shape without a name: the warnings of a cage with one were
+    given before.
     """
     if name is None:
         return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))

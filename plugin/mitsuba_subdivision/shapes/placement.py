@@ -46,13 +46,6 @@ class RecentredPoints:
 
     In single precision such points lose digits, as normals would show. A coordinate that still has the value with which
     it was loaded is replaced by its double-precision value relative to the centre.
-
-    Attributes
-    ----------
-    centre : (3,) float64, or None
-        None if the points stay as they are.
-    positions : (n, 3) float64
-        As they were loaded, relative to the centre.
     """
 
     def __init__(
@@ -64,8 +57,8 @@ class RecentredPoints:
         # are
         recentres: bool,
     ) -> None:
-        self.centre: NDArray[np.float64] | None = None
-        self.positions = positions
+        self.centre: NDArray[np.float64] | None = None  # (3,) float64; None if the points stay as they are
+        self.positions = positions  # (n, 3) float64: as they were loaded, relative to the centre
         # Reductions along columns of three are slow.
         columns = np.ascontiguousarray(positions.T)
         low, high = columns.min(axis=1), columns.max(axis=1)

@@ -172,8 +172,7 @@ def make_subdivision(
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
             """Choose triangles and the evaluator of their vertices."""
-            parameters = self._parameters
-            surface = parameters.surface
+            parameters, surface = self._parameters, self._parameters.surface
             bound = None if self._displacement is None else self._displacement.bound()
             table = self._tessellation.table(surface, control_points, to_world, bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
@@ -268,7 +267,8 @@ def make_subdivision(
                 return
             buffers = {**self._tessellate(moves_points="control_points" in keys), **self._cage.buffers(attributes)}
             if self._placement.mirrors != self._has_turned_faces:
-                buffers["faces"] = self._turned_faces()
+                turned = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)[:, [0, 2, 1]]
+                buffers["faces"] = mapped(variant.UInt32, turned) if is_jit else turned.ravel()
                 keys.append("faces")
                 self._has_turned_faces = self._placement.mirrors
                 self._has_outlines = False
@@ -385,11 +385,6 @@ def make_subdivision(
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
-
-        def _turned_faces(self) -> IndexBuffer:
-            """Triangles with reversed orientation."""
-            turned = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)[:, [0, 2, 1]]
-            return mapped(variant.UInt32, turned) if is_jit else turned.ravel()
 
         def surface_area(self) -> Float:
             """Area of the triangles, with derivatives, which Mitsuba's own method does not have."""

@@ -32,7 +32,6 @@ class ConstantVertices(NamedTuple):
     normals: FloatBuffer
 
     def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:  # noqa: ARG002
-        """The vertices."""
         return self.positions, self.normals
 
 
@@ -117,15 +116,13 @@ def vertices_of(
     is_exact: bool,  # Whether shading is exact
 ) -> Vertices:
     """Choose the evaluator of the shape's vertices."""
-    split = attributes
-    if displacement is not None:
-        # Copies along seams: their displacements differ, and are averaged.
-        split = parameters.surface.attribute_table(table)
     evaluate, is_differentiable = _evaluator(table, parameters, float_type)
     if displacement is None:
-        return Vertices(evaluate, is_differentiable, copied=split.surface_vertex, float_type=float_type)
+        return Vertices(evaluate, is_differentiable, copied=attributes.surface_vertex, float_type=float_type)
     from .displaced_vertices import DeviceDisplacement, HostDisplacement, VertexLocations
 
+    # With copies along seams: their displacements differ, and are averaged.
+    split = parameters.surface.attribute_table(table)
     found = split_weld_targets(table, split)
     weld_target = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
     locations = VertexLocations(*(split.locate or table.locations)(), weld_target)

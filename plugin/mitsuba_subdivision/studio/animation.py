@@ -30,15 +30,9 @@ PATTERN = re.compile(r"%(0\d+)?d")
 
 
 class SceneSource(Protocol[C]):
-    """Builds the scenes of a cage or a stage from its contents at a time and points that must be visible.
+    """Builds the scenes of a cage or a stage from its contents at a time and points that must be visible."""
 
-    Attributes
-    ----------
-    name : str
-        The cage or the stage as messages name it.
-    """
-
-    name: str
+    name: str  # The cage or the stage as messages name it
 
     def at(self, number: int | None = None) -> C:
         """Contents of a frame; by default, of a still picture."""
@@ -55,22 +49,15 @@ class SceneSource(Protocol[C]):
     def scene(
         self,
         contents: C,
+        # (n, 3): points that the camera must see in all frames; by default, the points of the contents
         points: NDArray[np.float64] | None = None,
         *,
+        # Whether only the scene's own sensor renders it, so that triangles may depend on the sensor
         follows_sensor: bool = False,
+        # (4, 4) each: of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
-        """Entries of a scene.
-
-        Parameters
-        ----------
-        points : (n, 3) float64, optional
-            Points that the camera must see in all frames; by default, the points of the contents.
-        follows_sensor : bool
-            Whether only the scene's own sensor renders it, so that triangles may depend on the sensor.
-        turns : list of (4, 4) float64
-            Transforms of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it.
-        """
+        """Entries of a scene."""
 
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
@@ -143,9 +130,8 @@ class Turntable:
         first = {name: np.array(parameters[name].matrix, dtype=np.float64).reshape(4, 4) for name in names}
         for number in numbers:
             around = np.linalg.inv(self.matrix(number))
-            set_parameters(
-                loaded.scene, {name: mi.ScalarTransform4f((around @ matrix).tolist()) for name, matrix in first.items()}
-            )
+            moved = {name: mi.ScalarTransform4f((around @ matrix).tolist()) for name, matrix in first.items()}
+            set_parameters(loaded.scene, moved)
             yield loaded
 
 

@@ -130,9 +130,8 @@ class CageScenes:
         up, view, size = self.framing(contents)
         bounds = np.stack([points.min(axis=0), points.max(axis=0)])
         staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points, name=self.name)
-        triangles = None
-        if follows_sensor and look.rate is None and look.shading == "exact":
-            triangles = model.triangles_for(staged["sensor"])
+        is_adaptive = follows_sensor and look.rate is None and look.shading == "exact"
+        triangles = model.triangles_for(staged["sensor"]) if is_adaptive else None
         first = {name: staged.pop(name) for name in ("integrator", "sensor")}
         return {"type": "scene", **first, **self._shapes(model, triangles), **staged}
 

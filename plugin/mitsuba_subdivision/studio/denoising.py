@@ -16,10 +16,7 @@ _AUXILIARY = "albedo:albedo,normal:sh_normal"
 
 
 def require_denoiser() -> None:
-    """Check that the package of the denoiser is installed, before a picture is rendered.
-
-    Raises ValueError if it is missing.
-    """
+    """Raise ValueError if the package of the denoiser is missing, before a picture is rendered."""
     try:
         import mitsuba_oidn  # noqa: F401 - only to find out whether it is there
     except ImportError as error:
@@ -77,10 +74,8 @@ def denoised(loaded: LoadedScene, pixels: NDArray[np.float32], seed: int = 0) ->
     if pixels.ndim != 3 or pixels.shape[2] < 3:
         raise ValueError(f'the film has the shape {pixels.shape}; expected R, G, B to denoise: pixel_format "rgb"')
     integrator = mi.load_dict({"type": "aov", "aovs": _AUXILIARY})
-    sensor = loaded.sensor_index
-    auxiliary = render_pixels(loaded.scene, seed, AUXILIARY_SPP, sensor=sensor, integrator=integrator)
-    images = pixels[..., :3], auxiliary[..., -6:-3], auxiliary[..., -3:]
-    color, albedo, normal = map(np.ascontiguousarray, images)
+    auxiliary = render_pixels(loaded.scene, seed, AUXILIARY_SPP, sensor=loaded.sensor_index, integrator=integrator)
+    color, albedo, normal = map(np.ascontiguousarray, (pixels[..., :3], auxiliary[..., -6:-3], auxiliary[..., -3:]))
     found = np.array(pixels)
     found[..., :3] = mitsuba_oidn.denoise(color, albedo, normal, hdr=True, clean_aux=True)
     return found

@@ -41,13 +41,7 @@ def frame_table(surface: LimitSurface) -> VertexTable:
 
 
 class Model:
-    """A cage and its limit surface.
-
-    Raises
-    ------
-    CageError, OSError, SchemeError
-        As `ControlCage.from_file` and `LimitSurface`.
-    """
+    """A cage and its limit surface. Raises what `ControlCage.from_file` and `LimitSurface` raise."""
 
     def __init__(
         self,
@@ -130,11 +124,8 @@ class Model:
         shape = {"type": "subdivision", **cage, **triangles}
         return shape if shading == "vertex" else {**shape, "shading": shading}
 
-    def triangles_for(
-        self,
-        sensor: SceneNode,  # Entry of the scene's sensor
-    ) -> SceneNode:
-        """Parameters of the coarsest exactly shaded tessellation whose facets this sensor does not see."""
+    def triangles_for(self, sensor: SceneNode) -> SceneNode:
+        """Parameters of the coarsest exactly shaded tessellation whose facets this sensor of a scene does not see."""
         outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
         segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
         highest = highest_rate(segments, np.array([corners]))

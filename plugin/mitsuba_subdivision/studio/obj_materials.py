@@ -53,9 +53,8 @@ class Picture:
         to_uv = to_uv.translate([*self.offset[:2], 0]).scale([*self.scale[:2], 1])
         picture: SceneNode = {"filename": str(self.path.resolve())}
         if (self.base, self.gain) != (0, 1):
-            bitmap = mi.Bitmap(str(self.path)).convert(
-                mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False
-            )
+            form = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
+            bitmap = mi.Bitmap(str(self.path)).convert(*form, srgb_gamma=False)
             values = np.clip(self.base + self.gain * np.array(bitmap), 0, 1)
             picture = {"bitmap": mi.Bitmap(values.astype(np.float32))}
         return {
@@ -73,10 +72,7 @@ Material = dict[str, list[float] | Picture]
 def read_materials(path: Path) -> dict[str, Material]:
     """Materials of an OBJ file by name; none if it names no library, or no library can be read.
 
-    Warns
-    -----
-    CageWarning
-        If there is no such library, or entries are left out.
+    Warns if there is no such library, or entries are left out.
     """
     content = path.read_bytes()
     found: dict[str, Material] = {}
@@ -187,14 +183,14 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
             warn(f'material "{name}": there is no picture "{texture.path}"; its colour is Kd')
     (exponent,), (illumination,) = _numbers(material, "Ns", [0.0]), _numbers(material, "illum", [2.0])
     specular = sum(_clipped(material.get("Ks", [0.0] * 3))) / 3
-    bsdf: SceneNode = {
+    glossy = {
         "type": "principled",
         "base_color": colour,
         "roughness": _numbers(material, "Pr", [(2 / (max(exponent, 0) + 2)) ** 0.25])[0],
         "metallic": _numbers(material, "Pm", [0.0])[0],
         "specular": 0.0 if illumination in _MATTE else specular,
     }
-    bsdf = {"type": "twosided", "bsdf": bsdf}
+    bsdf: SceneNode = {"type": "twosided", "bsdf": glossy}
     opacity = _numbers(material, "d", [1 - _numbers(material, "Tr", [0.0])[0]])[0]
     return bsdf if opacity >= 1 else {"type": "mask", "opacity": max(opacity, 0.0), "bsdf": bsdf}
 

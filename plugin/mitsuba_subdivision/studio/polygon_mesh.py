@@ -20,31 +20,20 @@ _COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "ve
 
 @dataclass(frozen=True, eq=False)
 class PolygonMesh:
-    """Triangles in the world, with their own normals or flat.
-
-    Parameters
-    ----------
-    triangles : (n_t, 3) int
-    vertices : dict of str to (n_v, k) array
-        Buffers of Mitsuba's mesh by name: ``vertex_positions``, and if it has them ``vertex_normals``,
-        ``vertex_texcoords`` and attributes.
-    """
+    """Triangles in the world, with their own normals or flat."""
 
     name: str
-    triangles: IntArray
+    triangles: IntArray  # (n_t, 3)
+    # (n_v, k) each: buffers of Mitsuba's mesh by name: `vertex_positions`, and if it has them `vertex_normals`,
+    # `vertex_texcoords` and attributes
     vertices: dict[str, NDArray]
 
     def entry(self, bsdf: SceneNode, emitter: SceneNode | None) -> SceneNode:
         """The mesh as an entry of a scene, for `with_meshes` and `save_scene`."""
         # Otherwise Mitsuba would make normals.
         facets = {} if "vertex_normals" in self.vertices else {"face_normals": True}
-        return {
-            "type": "ply",
-            "mesh": self,
-            **facets,
-            "bsdf": bsdf,
-            **({} if emitter is None else {"emitter": emitter}),
-        }
+        shining = {} if emitter is None else {"emitter": emitter}
+        return {"type": "ply", "mesh": self, **facets, "bsdf": bsdf, **shining}
 
     def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None, interior: mi.Medium | None = None) -> mi.Mesh:
         """The mesh as an object of Mitsuba."""

@@ -120,12 +120,8 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     if not contents.attributes and all(each.interpolation == "face_varying" for each in data.values()):
         return ".obj"
     has_tags = any(len(tags) for tags in (contents.creases, contents.corners, contents.holes))
-    if (
-        not has_tags
-        and all(each.interpolation == "vertex" for each in data.values())
-        and all(map(ply_reader.is_possible, contents.attributes))
-        and importlib.util.find_spec("plyfile")
-    ):
+    is_plain = not has_tags and all(each.interpolation == "vertex" for each in data.values())
+    if is_plain and all(map(ply_reader.is_possible, contents.attributes)) and importlib.util.find_spec("plyfile"):
         return ".ply"
     first = next(iter(data))
     if not importlib.util.find_spec("pxr"):

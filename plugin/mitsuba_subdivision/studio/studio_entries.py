@@ -43,14 +43,17 @@ GAP = 0.003
 
 
 def studio(
-    bounds: ArrayLike,
+    bounds: ArrayLike,  # (2, 3): least and greatest coordinates of the model, in the world
     *,
-    up: str = "z",
+    up: str = "z",  # Axis of the world that points up: "z" or "y"
+    # "front", "side", "back", "top", "three-quarter", or azimuth and elevation in degrees. Azimuth 0 is the front,
+    # which is -y where z is up, and +z where y is up; azimuth 90 is +x; elevation 90 is straight from above.
     view: View = DEFAULT_VIEW,
-    size: tuple[int, int] = DEFAULT_SIZE,
-    spp: int = DEFAULT_SPP,
+    size: tuple[int, int] = DEFAULT_SIZE,  # (width, height): of the film, in pixels
+    spp: int = DEFAULT_SPP,  # Samples per pixel
+    # (n, 3): of the model in the world, within the bounds. The camera frames these; by default, the box.
     points: ArrayLike | None = None,
-    name: str | None = None,
+    name: str | None = None,  # Of the model, or of its file, with which messages begin
 ) -> SceneNode:
     """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
 
@@ -59,30 +62,8 @@ def studio(
 
     Returns dict: "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and "ground". "ground"
     is missing in views from below. Raises ValueError if no variant is set; if bounds are not finite, or the least not
-    below the greatest; if view, axis, size or samples are invalid.
-
-    Parameters
-    ----------
-    bounds : (2, 3) array
-        Least and greatest coordinates of the model, in the world.
-    up : "z" or "y"
-        Axis of the world that points up.
-    view : str or (azimuth, elevation)
-        "front", "side", "back", "top", "three-quarter", or angles in degrees. Azimuth 0 is the front, which is -y where
-        z is up, and +z where y is up; azimuth 90 is +x; elevation 90 is straight from above.
-    size : (width, height)
-        Of the film, in pixels.
-    spp : int
-        Samples per pixel.
-    points : (n, 3) array, optional
-        Points of the model in the world, within the bounds. The camera frames these; by default, the box.
-    name : str, optional
-        Of the model, or of its file, with which messages begin.
-
-    Warns
-    -----
-    CageWarning
-        If the model is so small or large that Mitsuba's single precision does not render it.
+    below the greatest; if view, axis, size or samples are invalid. Warns if the model is so small or large that
+    Mitsuba's single precision does not render it.
     """
     variant_in_use()
     prefix = "" if name is None else f"{name}: "
@@ -107,12 +88,10 @@ def studio(
     rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
     for name, (position, half_sides, radiance, weight) in LIGHTS.items():
         origin = axes @ middle + radius * rig @ np.array(position)
-        to_world = _look_at(origin, axes @ middle, axes[:, 2]) @ mi.ScalarTransform4f().scale(
-            [radius * half_sides[0], radius * half_sides[1], 1.0]
-        )
+        scale = mi.ScalarTransform4f().scale([radius * half_sides[0], radius * half_sides[1], 1.0])
         scene[name] = {
             "type": "rectangle",
-            "to_world": to_world,
+            "to_world": _look_at(origin, axes @ middle, axes[:, 2]) @ scale,
             "emitter": {"type": "area", "radiance": _rgb(radiance), "sampling_weight": weight},
         }
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}

@@ -94,10 +94,7 @@ MOST_DIFFERENT_FACES = 64
 def require_valences(cage: ControlCage, scheme: Scheme) -> None:
     """Check that no vertex and no face of a cage has more neighbours than are evaluated.
 
-    Raises
-    ------
-    CageError
-        Names the vertex or the face, and the limit.
+    Raises CageError, which names the vertex or the face, and the limit.
     """
     t = cage.cut_mesh.topology
     is_different = np.zeros(t.vertex_count, dtype=bool)

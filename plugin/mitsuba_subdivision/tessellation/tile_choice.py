@@ -129,9 +129,9 @@ def _chosen(rates: TileRates, patches: Iterable[_Part]) -> Iterator[Tiles]:
                 continue
         waiting_count = 0
         while waiting:
-            # Pieces come last, unless there are many.
+            # Pieces wait until there are enough of them. The largest come first, which may be too many triangles.
             others = [kind for kind in waiting if not kind.is_piece]
-            are_many = sum(len(own.tiles) for kind in waiting if kind.is_piece for own in waiting[kind]) > MOST_WAITING
+            are_many = sum(len(own.tiles) for kind in waiting if kind.is_piece for own in waiting[kind]) > TILES_AT_ONCE
             for kind in list(waiting) if are_many or not others else others:
                 taken = _taken(waiting[kind])
                 if not waiting[kind]:

@@ -196,10 +196,7 @@ class InteractionHook:
         return self._object_at(self._variant.Mask, value)
 
     def _answer_interaction(self, entries: list[int]) -> None:
-        """Override ``compute_surface_interaction``."""
-        variant = self._variant
-        result_type, ray_type = variant.SurfaceInteraction3f, variant.Ray3f
-        preliminary_type = variant.PreliminaryIntersection3f
+        variant, result_type = self._variant, self._variant.SurfaceInteraction3f
 
         def answer(result: int, this: int, ray: int, preliminary: int, flags: int, _depth: int, active: int) -> None:
             answers, tag = self._answers.get(this), flags & _TAG
@@ -209,8 +206,8 @@ class InteractionHook:
             # A scene that is collected while a function is being frozen ends the process.
             with paused_collection():
                 hit = TriangleHit(
-                    self._object_at(ray_type, ray),
-                    self._object_at(preliminary_type, preliminary),
+                    self._object_at(variant.Ray3f, ray),
+                    self._object_at(variant.PreliminaryIntersection3f, preliminary),
                     flags & _FLAGS,
                     self._mask_at(active),
                 )
@@ -239,13 +236,7 @@ class InteractionHook:
         replace_function(table + _WORD * (index - _BEFORE), trampoline.address)
 
     def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> None:
-        """Override one of the three functions that evaluate an attribute.
-
-        Parameters
-        ----------
-        sizes : container of int
-            Sizes of values that the function overrides; for others, it keeps Mitsuba's result.
-        """
+        """Override a function that evaluates an attribute; for values of other sizes, it keeps Mitsuba's result."""
         variant = self._variant
 
         def answer(result: int, this: int, length: int, text: int, si: int, active: int, _: int) -> None:
