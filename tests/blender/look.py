@@ -72,6 +72,10 @@ class Tile:
             self.tree.links.new(coordinates, found.inputs["Vector"])
         return found.outputs
 
+    def color(self, image, coordinates=None, **values):
+        self.set("Base Color", self.picture(image, coordinates, **values)["Color"])
+        return self
+
     def set(self, name, output):
         self.tree.links.new(output, self.surface.inputs[name])
 
@@ -100,16 +104,12 @@ def tiles(folder):
     dents = image(
         "dents", lambda u, v: (0.5 + 0.3 * math.sin(12 * u), 0.5 + 0.3 * math.cos(12 * v), 0.9), folder, is_data=True
     )
-    tile = Tile()
-    tile.set("Base Color", tile.picture(ramp)["Color"])
+    Tile().color(ramp)
     tile = Tile()
     texcoord = tile.node("ShaderNodeTexCoord").outputs["UV"]
-    placed = mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1))
-    tile.set("Base Color", tile.picture(ramp, placed, extension=EXTENSION)["Color"])
-    tile = Tile()
-    tile.set("Base Color", tile.picture(stripes)["Color"])
-    tile = Tile()
-    tile.set("Base Color", tile.picture(leaf)["Color"])
+    tile.color(ramp, mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1)), extension=EXTENSION)
+    Tile().color(stripes)
+    tile = Tile().color(leaf)
     tile.set("Alpha", tile.surface.inputs["Base Color"].links[0].from_node.outputs["Alpha"])
     tile = Tile()
     channels = tile.node("ShaderNodeSeparateColor")
@@ -124,12 +124,10 @@ def tiles(folder):
     tile.tree.links.new(tile.picture(dents)["Color"], turned.inputs["Color"])
     tile.set("Normal", turned.outputs["Normal"])
     tile = Tile()
-    second = tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"]
-    tile.set("Base Color", tile.picture(ramp, second)["Color"])
+    tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"])
     Tile(Alpha=0.5, Base_Color=(0.9, 0.2, 0.1, 1.0))
     tile = Tile()
-    main = tile.node("ShaderNodeUVMap", uv_map="Main").outputs["UV"]
-    tile.set("Base Color", tile.picture(ramp, main)["Color"])
+    tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Main").outputs["UV"])
 
 
 def what_is_left_out():
@@ -146,14 +144,8 @@ def what_is_left_out():
     tile.tree.links.new(noise.outputs[0], bump.inputs["Height"])
     tile.set("Normal", bump.outputs["Normal"])
     if bpy.app.version >= (4, 0):
-        values = {
-            "Anisotropic": 0.5,
-            "Sheen Weight": 0.3,
-            "Coat Weight": 0.5,
-            "Coat IOR": 1.8,
-            "Subsurface Weight": 0.1,
-        }
-        for name, value in values.items():
+        values = {"Sheen Weight": 0.3, "Coat Weight": 0.5, "Coat IOR": 1.8, "Subsurface Weight": 0.1}
+        for name, value in {**values, "Anisotropic": 0.5}.items():
             tile.surface.inputs[name].default_value = value
     lamp = bpy.data.lights.new("Lamp", "AREA")
     lamp.spread, lamp.energy = 1.0, 0.0
@@ -174,13 +166,11 @@ def sky(folder):
         world.use_nodes = True
     tree = world.node_tree
     picture = tree.nodes.new("ShaderNodeTexEnvironment")
-    picture.image = image(
-        "sky",
-        lambda u, v: (0.2 + (abs(u - 0.5) < 0.1), 0.3 + 0.5 * (v > 0.5) + (abs(u - 0.75) < 0.05), 0.5 + 0.5 * v),
-        folder,
-        is_data=True,
-        is_float=True,
-    )
+
+    def light(u, v):
+        return 0.2 + (abs(u - 0.5) < 0.1), 0.3 + 0.5 * (v > 0.5) + (abs(u - 0.75) < 0.05), 0.5 + 0.5 * v
+
+    picture.image = image("sky", light, folder, is_data=True, is_float=True)
     directions = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]
     tree.links.new(mapping(tree, directions, rotation=(0.2, 0.1, 0.9)), picture.inputs["Vector"])
     background = tree.nodes["Background"]

@@ -23,14 +23,8 @@ FACES = [*SIDES, *((i, (i + 1) % 5, 14) for i in range(5)), (6, 5, 10, 13, 11), 
 EDGE_CREASES = {(0, 1): 1.0, (1, 2): 0.5, (2, 7): 0.3, (5, 10): 0.6, (10, 13): 0.4, (0, 5): 0.2, (8, 9): 0.7}
 VERTEX_CREASES = {4: 0.55, 9: 1.0, 13: 0.3}
 TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-BOUNDARIES = ("ALL", "PRESERVE_CORNERS")
-UV_RULES = (
-    "NONE",
-    "PRESERVE_CORNERS",
-    "PRESERVE_CORNERS_AND_JUNCTIONS",
-    "PRESERVE_CORNERS_JUNCTIONS_AND_CONCAVE",
-    "PRESERVE_BOUNDARIES",
-    "SMOOTH_ALL",
+BOUNDARIES, UV_RULES = (
+    bpy.types.SubsurfModifier.bl_rna.properties[name].enum_items.keys() for name in ("boundary_smooth", "uv_smooth")
 )
 
 
@@ -74,10 +68,15 @@ def set_creases(mesh, domain, values):
         editable.to_mesh(mesh)
 
 
-def add(name, data, **settings):
-    """A new object with a subdivision modifier."""
+def place(name, data):
     thing = bpy.data.objects.new(name, data)
     bpy.context.scene.collection.objects.link(thing)
+    return thing
+
+
+def add(name, data, **settings):
+    """A new object with a subdivision modifier."""
+    thing = place(name, data)
     subdivide(thing, **settings)
     return thing
 
@@ -114,11 +113,9 @@ def dress(mesh):
         things[kind] = bpy.data.lights.new(kind, kind)
         things[kind].energy = 100.0
     things["Camera"].lens = 80.0
-    for place, (name, data) in enumerate(things.items()):
-        thing = bpy.data.objects.new(name, data)
-        thing.location = (0.0, -8.0, 3.0 + place)
-        thing.rotation_euler = (1.2, 0.0, 0.0)
-        bpy.context.scene.collection.objects.link(thing)
+    for number, (name, data) in enumerate(things.items()):
+        thing = place(name, data)
+        thing.location, thing.rotation_euler = (0.0, -8.0, 3.0 + number), (1.2, 0.0, 0.0)
     bpy.context.scene.camera = bpy.data.objects["Camera"]
     bpy.context.scene.world = bpy.data.worlds.new("World")
     if bpy.app.version < (5, 0):
@@ -138,25 +135,23 @@ def main(model, answers):
     moved = add("Würfel 1.001", mesh)
     moved.location, moved.rotation_euler, moved.scale = (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), (-1.0, 1.5, 2.0)
     moved.modifiers.new("Thickness", "SOLIDIFY")
-    mirrored = bpy.data.objects.new("mirrored", mesh)
-    bpy.context.scene.collection.objects.link(mirrored)
+    mirrored = place("mirrored", mesh)
     mirrored.modifiers.new("Mirror", "MIRROR").use_axis = (False, True, False)
     subdivide(mirrored)
     add("hidden", mesh).hide_render = True
     part, parts = add("part", mesh), bpy.data.collections.new("Parts")
     bpy.context.scene.collection.objects.unlink(part)
     parts.objects.link(part)
-    for place in (5.0, 7.0):
-        holder = bpy.data.objects.new("holder", None)
-        holder.instance_type, holder.instance_collection, holder.location = "COLLECTION", parts, (0.0, 0.0, place)
-        bpy.context.scene.collection.objects.link(holder)
+    for height in (5.0, 7.0):
+        holder = place("holder", None)
+        holder.instance_type, holder.instance_collection, holder.location = "COLLECTION", parts, (0.0, 0.0, height)
     ground = bpy.data.meshes.new("Ground")
     ground.from_pydata([(-9, -9, -1), (9, -9, -1), (9, 9, -1), (-9, 9, -1)], [], [(0, 1, 2, 3)])
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Ground", ground))
+    place("Ground", ground)
     smooth = bpy.data.meshes.new("Smooth")
     smooth.from_pydata([(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)], [], TETRAHEDRON)
     smooth.polygons.foreach_set("use_smooth", [True] * len(TETRAHEDRON))
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Smooth", smooth))
+    place("Smooth", smooth)
     dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
     # Versions before 4.0 round creases when they save.

@@ -1,7 +1,5 @@
 """Fixtures of the tests of `evaluation`."""
 
-from __future__ import annotations
-
 import pytest
 from mitsuba_subdivision import LimitSurface
 from reference.exact_samples import SCHEMES, ExactSamples, samples_at

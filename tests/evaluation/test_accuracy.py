@@ -1,85 +1,33 @@
 """The evaluators against explicit refinement in decimal arithmetic, down to u, v = 2^-45 and at the point itself."""
 
-from __future__ import annotations
-
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError, limit_stencil
+from evaluation.common import EVERY_SCHEME, assert_exact, curvatures
+from mitsuba_subdivision import LimitSurface, SchemeError, limit_stencil
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from patches.closed_cages import cage_of
-from reference.bars import (
-    CURVATURE,
-    CURVATURE_LEVELS,
-    DERIVATIVE,
-    NORMAL,
-    NORMAL_FLOAT32,
-    NORMAL_FLOAT32_NARROW,
-    NORMAL_FLOAT32_VALENCES,
-    POINT,
-    POINT_FLOAT32,
-    SECOND_DERIVATIVE,
-)
+from reference import bars
+from reference.bars import CURVATURE, DERIVATIVE, NORMAL, POINT, SECOND_DERIVATIVE
 from reference.brute_force import BruteForce
 from reference.decimals import precision
-from reference.exact_samples import (
-    DIGITS,
-    SCHEMES,
-    angle,
-    bumpy,
-    bumpy_ball,
-    curvature_error,
-    exact_curvature,
-    faces_of,
-    samples_at,
-)
+from reference.exact_samples import DIGITS, angle, bumpy, curvature_error, exact_curvature, faces_of, samples_at
 
 pytestmark = pytest.mark.core
 
 # Limit stencils are eigenvectors, by LAPACK, whose libraries differ in what rounding leaves: 1.6e-14 with that of NumPy
 # 2.5. Then they are sums of about 2 n products of size one.
 STENCIL = 4e-14
-EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
-# Valences on both sides of the ordinary one.
-SOME_POINTS = pytest.mark.parametrize(("scheme", "valence"), [(s, n) for s in SCHEMES for n in (3, 5, 8)])
+SAMPLES = 36
 
 
-def curvatures(found):
-    return np.stack([found.gaussian_curvature, found.mean_curvature])
-
-
-def seconds(found):
-    return np.stack([found.d2p_duu, found.d2p_duv, found.d2p_dvv])
-
-
-def test_points_match_explicit_refinement(exact, surface):
-    found = surface.evaluate(0, exact.uv)
-    assert np.abs(found.p - exact.p).max() <= POINT * exact.size
-
-
-def test_derivatives_match_explicit_refinement(exact, surface):
-    found = surface.evaluate(0, exact.uv)
-    scale = exact.derivative_scale(found.level)[:, None] * exact.size
-    assert np.abs((found.dp_du - exact.dp_du) / scale).max() <= DERIVATIVE
-    assert np.abs((found.dp_dv - exact.dp_dv) / scale).max() <= DERIVATIVE
-
-
-def test_second_derivatives_match_explicit_refinement(exact, surface):
-    found = surface.evaluate(0, exact.uv, derivatives=2)
-    scale = exact.derivative_scale(found.level, 2)[:, None] * exact.size
-    assert np.abs((seconds(found) - exact.second) / scale).max() <= SECOND_DERIVATIVE
-
-
-def test_curvatures_match_explicit_refinement(exact, surface):
-    found = surface.evaluate(0, exact.uv, derivatives=2)
-    near = found.level <= CURVATURE_LEVELS
-    assert curvature_error(curvatures(found)[:, near], exact.curvature[:, near]).max() <= CURVATURE
-
-
-def test_normals_match_explicit_refinement(exact, surface):
-    assert angle(surface.evaluate(0, exact.uv).n, exact.n).max() <= NORMAL
+@pytest.mark.parametrize("derivatives", [1, 2])
+def test_samples_match_explicit_refinement(exact, surface, derivatives):
+    """Points, normals, derivatives and curvatures."""
+    assert_exact(surface.evaluate(0, exact.uv, derivatives=derivatives), exact)
 
 
 def test_point_and_normal_at_the_extraordinary_point_are_the_limits(exact, surface):
@@ -93,12 +41,14 @@ def test_float32_normals_stay_right_at_every_level(exact, surface):
     found = surface.evaluate(0, np.concatenate([exact.uv, uv]), dtype=np.float32)
     precise = surface.evaluate(0, np.concatenate([exact.uv, uv]))
     assert found.n.dtype == np.float32
-    bar = NORMAL_FLOAT32 if exact.valence <= NORMAL_FLOAT32_VALENCES else NORMAL_FLOAT32_NARROW
+    is_narrow = exact.valence > bars.NORMAL_FLOAT32_VALENCES
+    bar = bars.NORMAL_FLOAT32_NARROW if is_narrow else bars.NORMAL_FLOAT32
     assert angle(found.n, precise.n).max() <= bar
-    assert np.abs(found.p - precise.p).max() <= POINT_FLOAT32 * exact.size
+    assert np.abs(found.p - precise.p).max() <= bars.POINT_FLOAT32 * exact.size
 
 
-@SOME_POINTS
+@EVERY_SCHEME
+@pytest.mark.parametrize("valence", [3, 5, 8])
 def test_powers_of_the_matrix_give_the_same_points(scheme, valence):
     exact = samples_at(scheme, valence)
     found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, evaluator="power")
@@ -108,26 +58,15 @@ def test_powers_of_the_matrix_give_the_same_points(scheme, valence):
 def test_stam_agrees_far_from_the_extraordinary_vertex(exact, surface):
     # Term 1 of (11) is about 2^n times the rounding error, of float64 and at n = 1 nothing.
     far = np.flatnonzero(exact.uv.max(axis=1) > 0.25)
-    found = surface.evaluate(0, exact.uv[far], evaluator="stam", derivatives=2)
-    scale = exact.derivative_scale(found.level, 2)[:, None] * exact.size
-    assert np.abs((seconds(found) - exact.second[:, far]) / scale).max() <= SECOND_DERIVATIVE
-    assert curvature_error(curvatures(found), exact.curvature[:, far]).max() <= CURVATURE
-    assert angle(found.n, exact.n[far]).max() <= NORMAL
-    assert np.abs(found.p - exact.p[far]).max() <= POINT * exact.size
+    assert_exact(surface.evaluate(0, exact.uv[far], evaluator="stam", derivatives=2), exact, far)
 
 
-def test_stam_in_float32_loses_the_normal_at_valence_3():
-    # plugin/MATHEMATICS.md, section 5: kappa eps |c1| / lambda_2^n, above 5 degrees from n = 17 on with |c1| = 1.
-    surface = LimitSurface(extraordinary(3))
+@pytest.mark.parametrize(("valence", "first_level"), [(3, 17), (5, 28)])
+def test_stam_in_float32_loses_the_normal(valence, first_level):
+    # plugin/MATHEMATICS.md, section 5: kappa eps |c1| / lambda_2^n, above 5 degrees from a level on with |c1| = 1.
+    surface = LimitSurface(extraordinary(valence))
     assert np.linalg.norm(surface.evaluate(0, [[0.0, 0.0]]).p) == pytest.approx(1, abs=0.1)
-    uv = np.ldexp([[0.9, 0.6]], -np.arange(17, 41)[:, None])
-    error = angle(surface.evaluate(0, uv, evaluator="stam", dtype=np.float32).n, surface.evaluate(0, uv).n)
-    assert (np.isnan(error) | (error > 5)).all()
-
-
-def test_stam_in_float32_loses_the_normal_at_valence_5():
-    surface = LimitSurface(extraordinary(5))
-    uv = np.ldexp([[0.9, 0.6]], -np.arange(28, 41)[:, None])
+    uv = np.ldexp([[0.9, 0.6]], -np.arange(first_level, 41)[:, None])
     error = angle(surface.evaluate(0, uv, evaluator="stam", dtype=np.float32).n, surface.evaluate(0, uv).n)
     assert (np.isnan(error) | (error > 5)).all()
 
@@ -153,15 +92,18 @@ def test_limit_evaluator_gives_the_extraordinary_point_for_every_sample(scheme, 
 def test_tangents_at_the_extraordinary_point_run_along_the_edges(scheme, valence):
     # Directions converge as (lambda_4 / lambda_2)^n, too slowly to see at higher valences.
     surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
-    at_point = surface.evaluate(0, [[0.0, 0.0]])
-    deep = surface.evaluate(0, [[2.0**-200, 0.0], [0.0, 2.0**-200]])
-    for tangent, end in ((at_point.dp_du[0], deep.p[0]), (at_point.dp_dv[0], deep.p[1])):
-        assert np.isfinite(tangent).all()
-        assert abs(tangent @ at_point.n[0]) <= POINT * np.linalg.norm(tangent)
-        assert np.abs(end - at_point.p[0]).max() <= POINT
-    near = surface.evaluate(0, [[2.0**-60, 0.0], [0.0, 2.0**-60]])
-    assert angle(at_point.dp_du[0], near.dp_du[0]) < 1e-3
-    assert angle(at_point.dp_dv[0], near.dp_dv[1]) < 1e-3
+    every = surface.evaluate(np.arange(surface.patches.elements.face_count), [[0.0, 0.0]])
+    # That of element 0, which may be an ordinary one, and all extraordinary ones.
+    elements = np.unique([0, *np.flatnonzero(every.level == -1)])
+    assert len(elements) > 1 or valence == 4
+    at_point = surface.evaluate(elements, [[0.0, 0.0]])
+    for field, direction in (("dp_du", (1, 0)), ("dp_dv", (0, 1))):
+        near, deep = (surface.evaluate(elements, [np.ldexp(direction, -level)]) for level in (60, 200))
+        tangents = getattr(at_point, field)
+        assert np.isfinite(tangents).all()
+        assert (np.abs((tangents * at_point.n).sum(axis=1)) <= POINT * np.linalg.norm(tangents, axis=1)).all()
+        assert np.abs(deep.p - at_point.p).max() <= POINT
+        assert angle(tangents, getattr(near, field)).max() < 1e-3
 
 
 def test_normals_stay_finite_at_any_level(surface):
@@ -184,55 +126,30 @@ def test_any_element_and_corner_match_explicit_refinement(scheme, name, np_rng):
     reference = BruteForce(scheme, cage.positions, faces_of(cage))
     surface = LimitSurface(cage, scheme)
     sizes = surface.patches.elements.face_sizes
-    element = np_rng.integers(0, len(sizes), 30)
+    # Every element of cages that have not too many.
+    element = np.resize(np_rng.permutation(len(sizes)), SAMPLES)
     corner = np_rng.integers(0, sizes[element])
-    uv = np_rng.random((30, 2))
+    uv = np_rng.random((SAMPLES, 2))
     if scheme == "loop":
         uv[uv.sum(axis=1) > 1] = 1 - uv[uv.sum(axis=1) > 1]
-    uv *= 2.0 ** -np_rng.integers(0, 20, (30, 1))
+    else:
+        uv[:8] = 1 - uv[:8] * 1e-4
+    uv[8:] *= 2.0 ** -np_rng.integers(0, 20, (SAMPLES - 8, 1))
     found = surface.evaluate(element, uv, corner, derivatives=2)
-    exact = [
-        reference.evaluate(int(e), int(c), u, v, derivatives=2)
-        for e, c, (u, v) in zip(element, corner, uv, strict=True)
+    samples = [
+        reference.evaluate(int(e), int(c), *at, derivatives=2) for e, c, at in zip(element, corner, uv, strict=True)
     ]
-    size = np.ptp(cage.positions, axis=0).max()
+    fields = ("p", "n", "dp_du", "dp_dv", "d2p_duu", "d2p_duv", "d2p_dvv")
     with precision(DIGITS):
-        points, du, dv, normals, duu, duv, dvv = (
-            np.array([getattr(s, field) for s in exact], dtype=float)
-            for field in ("p", "dp_du", "dp_dv", "n", "d2p_duu", "d2p_duv", "d2p_dvv")
-        )
-        curvature = np.array([exact_curvature(s) for s in exact], dtype=float).T
-    assert np.abs(found.p - points).max() <= POINT * size
-    assert angle(found.n, normals).max() <= NORMAL
-    for values, bar in (
-        ((found.dp_du, du), DERIVATIVE),
-        ((found.dp_dv, dv), DERIVATIVE),
-        ((seconds(found), [duu, duv, dvv]), SECOND_DERIVATIVE),
-    ):
+        exact = {field: np.array([getattr(s, field) for s in samples], dtype=float) for field in fields}
+        curvature = np.array([exact_curvature(s) for s in samples], dtype=float).T
+    assert np.abs(found.p - exact["p"]).max() <= POINT * np.ptp(cage.positions, axis=0).max()
+    assert angle(found.n, exact["n"]).max() <= NORMAL
+    for field in fields[2:]:
         # Of the derivatives' size at the sample, whatever its level is.
-        a, b = (np.asarray(value) for value in values)
-        assert (np.abs(a - b) / np.abs(b).max(axis=-1, keepdims=True)).max() <= 10 * bar
+        error = np.abs(getattr(found, field) - exact[field]) / np.abs(exact[field]).max(axis=-1, keepdims=True)
+        assert error.max() <= 10 * (SECOND_DERIVATIVE if field.startswith("d2p") else DERIVATIVE)
     assert curvature_error(curvatures(found), curvature).max() <= CURVATURE
-
-
-def test_faces_of_all_sizes_and_valences_match_explicit_refinement(np_rng):
-    # A pentagonal prism with one lid cut into triangles about a centre: faces of 3, 4, 5 corners, valences 3, 4, 5.
-    turn = 2 * np.pi * np.arange(5) / 5
-    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    positions = np.concatenate([np.c_[ring, np.zeros(5)], np.c_[ring, np.ones(5)], [[0.1, 0, 1.3]]])
-    faces = [[4, 3, 2, 1, 0]] + [[i, (i + 1) % 5, 5 + (i + 1) % 5, 5 + i] for i in range(5)]
-    faces += [[5 + i, 5 + (i + 1) % 5, 10] for i in range(5)]
-    reference = BruteForce("catmull_clark", positions, faces)
-    surface = LimitSurface(ControlCage(positions, faces))
-    for element, face in enumerate(faces):
-        corner = np_rng.integers(0, len(face), 4)
-        uv = np_rng.random((4, 2))
-        uv[0] = 1 - uv[0] * 1e-4
-        found = surface.evaluate(element, uv, corner)
-        exact = [reference.evaluate(element, int(c), u, v) for c, (u, v) in zip(corner, uv, strict=True)]
-        with precision(120):
-            assert np.abs(found.p - np.array([s.p for s in exact], dtype=float)).max() <= POINT * 2
-            assert angle(found.n, np.array([s.n for s in exact], dtype=float)).max() <= NORMAL
 
 
 def test_a_torus_grid_is_a_bicubic_spline(np_rng):
@@ -242,17 +159,16 @@ def test_a_torus_grid_is_a_bicubic_spline(np_rng):
     column, row = np_rng.integers(0, 9, 50), np_rng.integers(0, 7, 50)
     found = surface.evaluate(column * 7 + row, uv)
     expected = np.zeros((50, 3))
-    for i in range(-1, 3):
-        for j in range(-1, 3):
-            weight = _cubic_hat(uv[:, 0] - i) * _cubic_hat(uv[:, 1] - j)
-            expected += weight[:, None] * cage.positions[(column + i) % 9 * 7 + (row + j) % 7]
+
+    def spline(t):
+        """Cardinal cubic B-spline centred at 0, from truncated powers."""
+        return sum(c * np.maximum(t + 2 - k, 0) ** 3 for k, c in enumerate((1, -4, 6, -4, 1))) / 6
+
+    for i, j in product(range(-1, 3), repeat=2):
+        weight = spline(uv[:, 0] - i) * spline(uv[:, 1] - j)
+        expected += weight[:, None] * cage.positions[(column + i) % 9 * 7 + (row + j) % 7]
     assert np.abs(found.p - expected).max() <= POINT * 6
     assert (found.level == 0).all()
-
-
-def _cubic_hat(t):
-    """Cardinal cubic B-spline centred at 0, from truncated powers."""
-    return sum(c * np.maximum(t + 2 - k, 0) ** 3 for k, c in enumerate((1, -4, 6, -4, 1))) / 6
 
 
 def test_evaluation_commutes_with_affine_maps(exact, np_rng):
@@ -284,11 +200,8 @@ def test_limit_stencils_match_the_published_numbers(scheme, valence):
     published = json.loads((Path(__file__).parents[1] / "data" / "limit_stencils.json").read_text())
     entry = published[scheme][str(valence)]
     found = limit_stencil(scheme, valence)
-    for name, weights in (
-        ("limit_position", found.position),
-        ("tangent1", found.tangents[0]),
-        ("tangent2", found.tangents[1]),
-    ):
+    names = ("limit_position", "tangent1", "tangent2")
+    for name, weights in zip(names, (found.position, *found.tangents), strict=True):
         # The extraordinary point of Doo-Sabin is a face's, and has no vertex in its centre.
         centre = [] if scheme == "doo_sabin" else [entry[name]["centre"]]
         expected = [*centre, *entry[name]["edge_ring"], *entry[name]["face_ring"]]
@@ -297,24 +210,16 @@ def test_limit_stencils_match_the_published_numbers(scheme, valence):
 
 @EVERY_SCHEME
 @pytest.mark.parametrize("valence", [3, 4, 5, 12, 50])
-def test_limit_stencil_of_a_position_sums_to_one_and_of_tangents_to_zero(scheme, valence):
+def test_limit_stencil_agrees_with_evaluation_and_is_affine(scheme, valence):
     found = limit_stencil(scheme, valence)
     assert found.position.sum() == pytest.approx(1, abs=STENCIL)
     assert np.abs(found.tangents.sum(axis=1)).max() <= STENCIL * valence
-
-
-@EVERY_SCHEME
-@pytest.mark.parametrize("valence", [3, 5, 12])
-def test_limit_stencil_agrees_with_evaluation(scheme, valence):
-    cage = bumpy_ball(scheme, valence)
+    cage = samples_at(scheme, valence).cage
     faces = faces_of(cage)
-    ring = np.array(faces[:valence]) if scheme != "doo_sabin" else None
-    slots = {
-        "catmull_clark": lambda: [0, *ring[:, 1], *ring[:, 2]],
-        "loop": lambda: [0, *ring[:, 1]],
-        "doo_sabin": lambda: faces[0],
-    }[scheme]()
-    found = limit_stencil(scheme, valence)
+    slots = faces[0]
+    if scheme != "doo_sabin":
+        ring = np.array(faces[:valence])
+        slots = [0, *ring[:, 1], *(ring[:, 2] if scheme == "catmull_clark" else [])]
     points = cage.positions[slots]
     sample = LimitSurface(cage, scheme).evaluate(0, [[0.0, 0.0]])
     assert np.abs(found.position @ points - sample.p[0]).max() <= POINT

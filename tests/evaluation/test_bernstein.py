@@ -1,51 +1,35 @@
 """Bernstein form: the same polynomials, with coefficients that bound them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import EVERY_SCHEME_OBJECT, inside
 from mitsuba_subdivision.evaluation.bernstein import regular_bernstein, times
-from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
 
 pytestmark = pytest.mark.core
 
 # Sums of some tens of products of numbers up to some units.
 ROUNDING = 5e-14
 
-SCHEMES = {"catmull_clark": CatmullClark(), "loop": Loop(), "doo_sabin": DooSabin()}
-EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES.keys())
 
-
-def inside(scheme, rng, count=300):
-    return rng.dirichlet(np.ones(scheme.domain.corner_count), count) @ scheme.domain.corners
-
-
-@EVERY_SCHEME
+@EVERY_SCHEME_OBJECT
 def test_functions_are_non_negative_and_sum_to_one(scheme, np_rng):
     values = regular_bernstein(scheme).basis.values(inside(scheme, np_rng))
     assert values.min() >= 0
     np.testing.assert_allclose(values.sum(axis=1), 1, rtol=0, atol=ROUNDING)
 
 
-@EVERY_SCHEME
-def test_patches_are_the_schemes(scheme, np_rng):
+@EVERY_SCHEME_OBJECT
+def test_patches_are_the_schemes_and_weights_of_coefficients_non_negative(scheme, np_rng):
     form, uv = regular_bernstein(scheme), inside(scheme, np_rng)
     expected = scheme.regular_basis(uv, 2)
-    coefficients = [form.of_controls]
-    u, v = form.basis.derivatives
-    coefficients += [u @ coefficients[0], v @ coefficients[0]]
-    coefficients += [u @ coefficients[1], v @ coefficients[1], v @ coefficients[2]]
-    for own, wanted in zip(coefficients, expected, strict=True):
-        np.testing.assert_allclose(form.basis.values(uv) @ own, wanted, rtol=0, atol=ROUNDING)
+    own, (u, v) = form.of_controls, form.basis.derivatives
+    for product, wanted in zip((own, u @ own, v @ own, u @ u @ own, v @ u @ own, v @ v @ own), expected, strict=True):
+        np.testing.assert_allclose(form.basis.values(uv) @ product, wanted, rtol=0, atol=ROUNDING)
+    # B-splines and box splines are means of Bernstein polynomials: the patch's hull contains its coefficients.
+    assert own.min() >= 0
 
 
-@EVERY_SCHEME
-def test_weights_of_coefficients_are_non_negative(scheme):
-    """B-splines and box splines are means of Bernstein polynomials: the patch's hull contains its coefficients."""
-    assert regular_bernstein(scheme).of_controls.min() >= 0
-
-
-@EVERY_SCHEME
+@EVERY_SCHEME_OBJECT
 def test_halves_are_the_same_polynomials_over_copies_of_the_domain(scheme, np_rng):
     basis = regular_bernstein(scheme).basis
     coefficients = np_rng.normal(size=(len(basis.indices), 3))
@@ -55,7 +39,7 @@ def test_halves_are_the_same_polynomials_over_copies_of_the_domain(scheme, np_rn
         np.testing.assert_allclose(found, basis.values(child.inverse()(uv)) @ coefficients, rtol=0, atol=ROUNDING)
 
 
-@EVERY_SCHEME
+@EVERY_SCHEME_OBJECT
 def test_coefficients_at_corners_are_values(scheme):
     basis = regular_bernstein(scheme).basis
     np.testing.assert_array_equal(basis.values(scheme.domain.corners)[:, basis.corners], np.eye(len(basis.corners)))

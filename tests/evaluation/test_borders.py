@@ -1,11 +1,11 @@
 """Open cages, creases, darts and corners: exact on every class of patch."""
 
-from __future__ import annotations
-
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from evaluation.common import both_sides, evaluate_from
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
 from mitsuba_subdivision.evaluation import irregular_patch
@@ -109,9 +109,11 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     places = at_corners(surface, np_rng)
     expected = surface.evaluate(*places)
     computed = irregular_patch.eigenbasis
-    monkeypatch.setattr(
-        irregular_patch, "eigenbasis", lambda *given: with_vectors_turned_over(computed(*given), np_rng)
-    )
+
+    def turned(*given):
+        return with_vectors_turned_over(computed(*given), np_rng)
+
+    monkeypatch.setattr(irregular_patch, "eigenbasis", turned)
     irregular_patch.irregular_patch.cache_clear()
     try:
         found = surface.evaluate(*places)
@@ -125,13 +127,11 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
 
 @EVERY_CAGE
 def test_refined_vertices_approach_the_surface(scheme, cage):
-    surface = LimitSurface(with_bumps(cage), scheme)
+    surface, errors = LimitSurface(with_bumps(cage), scheme), []
     limit = surface.tessellate(1).positions[: surface.patches.topology.vertex_count]
-    errors = []
-    finer = surface
     for _ in range(4):
-        finer = refined(finer)
-        errors.append(np.abs(finer.cage.positions[: len(limit)] - limit).max())
+        surface = refined(surface)
+        errors.append(np.abs(surface.cage.positions[: len(limit)] - limit).max())
     # By 1/4 to 0.62 a level, the subdominant eigenvalue at high valence.
     assert errors[3] <= 0.45 * errors[1] + POSITION
     assert errors[1] < 0.1
@@ -171,17 +171,10 @@ def test_corners_stay_and_other_ends_of_the_border_do_not():
 
 def test_a_crease_has_one_position_and_two_normals():
     cage = tagged(cube(), creases=[(4, 5, INFINITE), (5, 7, INFINITE), (7, 6, INFINITE), (6, 4, INFINITE)])
-    surface = LimitSurface(cage)
     half_edge = int(np.flatnonzero((cage.face_vertices == 4) & (cage.face_vertices[cage.topology.next] == 5))[0])
-    twin = int(cage.topology.twin[half_edge])
-    t = np.linspace(0, 1, 7)
-    sides = []
-    for side, along in ((half_edge, t), (twin, 1 - t)):
-        face = cage.topology.face[side]
-        uv = np.stack([along, np.zeros_like(along)], axis=1)
-        sides.append(surface.evaluate(face, uv, int(side - cage.topology.face_offsets[face])))
-    assert np.abs(sides[0].p - sides[1].p).max() <= POSITION
-    assert angle(sides[0].n, sides[1].n).min() > 10
+    one, other = both_sides(LimitSurface(cage), half_edge, np.linspace(0, 1, 7))
+    assert np.abs(one.p - other.p).max() <= POSITION
+    assert angle(one.n, other.n).min() > 10
 
 
 def test_a_dart_is_smooth_at_its_end():
@@ -223,12 +216,9 @@ def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, ends, co
     # Turned, so that the edges of the corner are parallel but for rounding where they are.
     turn, _ = np.linalg.qr(np.array([[1, 2, 3], [0, 1, 5], [2, 0, 1]]))
     turn *= np.linalg.det(turn)
-    cage = ControlCage(
-        flat.positions @ turn.T,
-        faces_of(flat),
-        creases=[(MIDDLE, end, INFINITE) for end in ends],
-        corners=[] if corner is None else [(corner, INFINITE)],
-    )
+    creases = [(MIDDLE, end, INFINITE) for end in ends]
+    corners = [] if corner is None else [(corner, INFINITE)]
+    cage = tagged(flat, creases=creases, corners=corners).with_positions(flat.positions @ turn.T)
     assert angle(LimitSurface(cage, scheme).tessellate(2).normals, turn[:, 2]).max() <= NORMAL
 
 
@@ -239,38 +229,30 @@ def test_the_normal_at_a_corner_on_a_bent_crease_is_not_across_the_bend(scheme):
     flat = sheet(4, 4, triangles=scheme == "loop")
     roof = flat.positions - [0, 0, 0.1] * np.abs(flat.positions[:, :1] - 2)
     creases = [(MIDDLE, spoke, INFINITE) for spoke in (LEFT, RIGHT, BELOW)]
-    surface = LimitSurface(ControlCage(roof, faces_of(flat), creases=creases), scheme)
-    for face, vertices in enumerate(faces_of(flat)):
-        if MIDDLE in vertices:
-            normal = surface.evaluate(face, [[0.0, 0.0]], list(vertices).index(MIDDLE)).n
-            assert angle(normal, np.array([0, 0, 1])).max() <= STEEPEST
+    surface = LimitSurface(tagged(flat, creases=creases).with_positions(roof), scheme)
+    normals = evaluate_from(surface, np.flatnonzero(flat.face_vertices == MIDDLE), [[0.0, 0.0]]).n
+    assert angle(normals, np.array([0, 0, 1])).max() <= STEEPEST
 
 
-def test_cut_sides_keep_faces_and_half_edges():
+def test_cut_sides_keep_faces_and_half_edges_and_uncreased_cages_are_not_cut():
     cage = star_of_creases(extraordinary(6), 6, [0, 2, 4])
     cut = cage.cut_mesh
     assert np.array_equal(cut.vertex[cut.topology.face_vertices], cage.face_vertices)
     assert (cut.vertex == 0).sum() == 3
     assert (cut.topology.vertex_rules[cut.vertex == 0] == VertexRule.CORNER).all()
     assert (cut.topology.vertex_rules == VertexRule.DART).sum() == 3
-
-
-def test_an_uncreased_cage_is_not_cut():
-    cage = extraordinary(5)
-    assert np.array_equal(cage.cut_mesh.topology.twin, cage.topology.twin)
+    smooth = extraordinary(5)
+    assert np.array_equal(smooth.cut_mesh.topology.twin, smooth.topology.twin)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"creases": [(0, 1, -1)]}, "crease along .* has sharpness -1; expected 0 for smooth"),
+        ({"creases": [(0, 1, -1)]}, "crease along edge (0, 1) has sharpness -1; expected 0 for smooth"),
         ({"creases": [(0, 1, np.nan)]}, "sharpness nan"),
         ({"creases": [(0, 1)]}, "creases are not a table"),
-        (
-            {"creases": [(0, 1.5, 10)]},
-            r"creases have the row \[0.0, 1.5, 10.0\]; expected \(vertex, vertex, sharpness\)",
-        ),
-        ({"corners": [(float("nan"), 10)]}, r"corners have the row \[nan, 10.0\]; expected \(vertex, sharpness\)"),
+        ({"creases": [(0, 1.5, 10)]}, "creases have the row [0.0, 1.5, 10.0]; expected (vertex, vertex, sharpness)"),
+        ({"corners": [(float("nan"), 10)]}, "corners have the row [nan, 10.0]; expected (vertex, sharpness)"),
         ({"corners": [(0, -5)]}, "corner at vertex 0 has sharpness -5"),
         ({"boundary": "round"}, 'boundary "round"; expected one of edge_and_corner, edge_only, none'),
         ({"crease_method": "normal"}, 'crease_method "normal"; expected one of uniform, chaikin'),
@@ -282,21 +264,13 @@ def test_an_uncreased_cage_is_not_cut():
     ],
 )
 def test_wrong_tags_are_errors_that_say_where(options, message):
-    with pytest.raises(CageError, match=message):
+    with pytest.raises(CageError, match=re.escape(message)):
         ControlCage(cube().positions, faces_of(cube()), **options)
 
 
-def test_doo_sabin_has_no_rules_for_creases():
-    with pytest.raises(SchemeError, match="the scheme doo_sabin has no rules for creases and corners"):
-        LimitSurface(tagged(cube(), creases=[(0, 1, 10)]), "doo_sabin")
-
-
-def test_doo_sabin_needs_an_inner_vertex():
+def test_doo_sabin_ends_at_the_faces_of_the_border_and_needs_an_inner_vertex():
+    found = LimitSurface(sheet(3, 3), "doo_sabin").tessellate(2).positions
+    np.testing.assert_allclose(found.min(axis=0), [0.5, 0.5, 0], rtol=0, atol=POSITION)
+    np.testing.assert_allclose(found.max(axis=0), [2.5, 2.5, 0], rtol=0, atol=POSITION)
     with pytest.raises(SchemeError, match="the scheme doo_sabin makes no surface of a cage without inner vertices"):
         LimitSurface(sheet(3, 1), "doo_sabin")
-
-
-def test_doo_sabin_ends_at_the_faces_of_the_border():
-    found = LimitSurface(sheet(3, 3), "doo_sabin").tessellate(2)
-    np.testing.assert_allclose(found.positions.min(axis=0), [0.5, 0.5, 0], rtol=0, atol=POSITION)
-    np.testing.assert_allclose(found.positions.max(axis=0), [2.5, 2.5, 0], rtol=0, atol=POSITION)

@@ -1,24 +1,22 @@
 """Laws of curvature; its values are compared with explicit refinement in `test_accuracy`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import EVERY_SCHEME, curvatures, seconds
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_face, extraordinary_triangles, torus
 from mitsuba_subdivision.evaluation.element import curvature
 from patches.closed_cages import triangulated
 from reference.bars import CURVATURE, CURVATURE_LEVELS
-from reference.exact_samples import ORDINARY, SCHEMES, curvature_error, samples_at
+from reference.exact_samples import ORDINARY, curvature_error, samples_at, subdominant
 
-EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
+BALLS = [("catmull_clark", extraordinary), ("loop", extraordinary_triangles), ("doo_sabin", extraordinary_face)]
 # (|lambda_4| / lambda_2^2) is approached as the next eigenvalues fade, within 100 levels and more.
 GROWTH = 1e-3
 
 
-def curvatures(surface, uv, **options):
-    found = surface.evaluate(0, uv, derivatives=2, **options)
-    return np.stack([found.gaussian_curvature, found.mean_curvature])
+def curvatures_at(surface, uv):
+    return curvatures(surface.evaluate(0, uv, derivatives=2))
 
 
 def size(curvature):
@@ -28,19 +26,13 @@ def size(curvature):
 
 def growth(scheme, valence):
     """``|lambda_4| / lambda_2^2`` where lambda_4 belongs to the second Fourier mode, in closed form."""
-    c, c2 = np.cos(2 * np.pi / valence), np.cos(4 * np.pi / valence)
-    if scheme == "catmull_clark":
-        first, second = ((x + 5 + np.sqrt((x + 9) * (x + 1))) / 16 for x in (c, c2))
-    else:
-        first, second = 3 / 8 + c / 4, 3 / 8 + c2 / 4
-    return second / first**2
+    return subdominant(scheme, valence / 2) / subdominant(scheme, valence) ** 2
 
 
 @pytest.mark.parametrize("radius", [0.5, 3.0])
 def test_curvature_of_a_sphere_by_its_derivatives(radius):
     a, b = np.random.default_rng(0).uniform(0.3, 1.2, (2, 10))
-    ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-    zero = 0 * a
+    ca, sa, cb, sb, zero = np.cos(a), np.sin(a), np.cos(b), np.sin(b), 0 * a
     # (u, v) = (longitude a, latitude b): du x dv points outward.
     first = radius * np.array([[-sa * cb, ca * cb, zero], [-ca * sb, -sa * sb, cb]])
     second = radius * np.array([[-ca * cb, -sa * cb, zero], [sa * sb, -ca * sb, zero], [-ca * cb, -sa * cb, -sb]])
@@ -58,21 +50,17 @@ def test_curvature_tends_to_that_of_the_torus_a_cage_is_taken_from(scheme, np_rn
         elements = surface.patches.elements.face_count
         uv = np_rng.random((300, 2)) / 2
         found = surface.evaluate(np_rng.integers(0, elements, 300), uv, derivatives=2)
-        cosine = (np.hypot(found.p[:, 0], found.p[:, 1]) - 2) / np.hypot(
-            np.hypot(found.p[:, 0], found.p[:, 1]) - 2, found.p[:, 2]
-        )
+        out = np.hypot(found.p[:, 0], found.p[:, 1]) - 2
+        cosine = out / np.hypot(out, found.p[:, 2])
         gaussian, mean = cosine / (2 + cosine), -(1 + cosine) / (2 + cosine)
-        errors.append([np.abs(found.gaussian_curvature - gaussian).max(), np.abs(found.mean_curvature - mean).max()])
+        errors.append(np.abs(curvatures(found) - [gaussian, mean]).max(axis=1))
     # Second derivatives of quadratic splines converge once, those of smoother ones twice.
     rate = 1.7 if scheme == "doo_sabin" else 3
-    assert (np.array(errors[0]) > rate * np.array(errors[1])).all()
+    assert (errors[0] > rate * errors[1]).all()
     assert np.max(errors[1]) < 0.15
 
 
-@pytest.mark.parametrize(
-    ("scheme", "make"),
-    [("catmull_clark", extraordinary), ("loop", extraordinary_triangles), ("doo_sabin", extraordinary_face)],
-)
+@pytest.mark.parametrize(("scheme", "make"), BALLS)
 @pytest.mark.parametrize("valence", [3, 4, 5, 6])
 def test_mean_curvature_of_a_ball_is_negative_by_its_outward_normal(scheme, make, valence, np_rng):
     surface = LimitSurface(make(valence), scheme)
@@ -83,37 +71,26 @@ def test_mean_curvature_of_a_ball_is_negative_by_its_outward_normal(scheme, make
     assert np.median(found.gaussian_curvature) == pytest.approx(1, abs=0.3)
 
 
-@EVERY_SCHEME
-@pytest.mark.parametrize("valence", [3, 5, 8])
-def test_turning_and_moving_keep_curvature(scheme, valence, np_rng):
-    exact = samples_at(scheme, valence)
-    turn, _ = np.linalg.qr(np_rng.standard_normal((3, 3)))
-    turn *= np.linalg.det(turn)
-    moved = exact.cage.with_positions(exact.cage.positions @ turn.T + [1.0, -2.0, 3.0])
-    near = exact.uv.max(axis=1) > 2.0**-CURVATURE_LEVELS
-    found = curvatures(LimitSurface(moved, scheme), exact.uv[near])
-    assert curvature_error(found, exact.curvature[:, near]).max() <= CURVATURE
+# Maps of a cage, and what they multiply Gaussian and mean curvature by. A mirror image keeps the faces' order, so that
+# normals turn inward.
+TURN = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+TURN *= np.linalg.det(TURN)
+MAPS = {
+    "turned and moved": (TURN, [1.0, -2.0, 3.0], (1, 1)),
+    "small": (1e-3 * np.eye(3), 0, (1e6, 1e3)),
+    "large": (8 * np.eye(3), 0, (1 / 64, 1 / 8)),
+    "mirrored": (np.diag([1, 1, -1]), 0, (1, -1)),
+}
 
 
 @EVERY_SCHEME
 @pytest.mark.parametrize("valence", [3, 5, 8])
-@pytest.mark.parametrize("scale", [1e-3, 8.0])
-def test_scaling_divides_gaussian_curvature_by_the_square_and_mean_by_the_scale(scheme, valence, scale):
+@pytest.mark.parametrize(("linear", "shift", "factors"), MAPS.values(), ids=MAPS)
+def test_curvature_follows_maps_of_the_cage(scheme, valence, linear, shift, factors):
     exact = samples_at(scheme, valence)
-    scaled = exact.cage.with_positions(scale * exact.cage.positions)
     near = exact.uv.max(axis=1) > 2.0**-CURVATURE_LEVELS
-    found = curvatures(LimitSurface(scaled, scheme), exact.uv[near]) * [[scale**2], [scale]]
-    assert curvature_error(found, exact.curvature[:, near]).max() <= CURVATURE
-
-
-@EVERY_SCHEME
-@pytest.mark.parametrize("valence", [3, 5, 8])
-def test_turning_the_surface_inside_out_negates_the_mean_curvature(scheme, valence):
-    exact = samples_at(scheme, valence)
-    # A mirror image keeps the faces' order, so that normals turn inward.
-    mirrored = exact.cage.with_positions(exact.cage.positions * [1, 1, -1])
-    near = exact.uv.max(axis=1) > 2.0**-CURVATURE_LEVELS
-    found = curvatures(LimitSurface(mirrored, scheme), exact.uv[near]) * [[1], [-1]]
+    mapped = LimitSurface(exact.cage.with_positions(exact.cage.positions @ linear.T + shift), scheme)
+    found = curvatures_at(mapped, exact.uv[near]) / np.reshape(factors, (2, 1))
     assert curvature_error(found, exact.curvature[:, near]).max() <= CURVATURE
 
 
@@ -126,9 +103,9 @@ def test_the_sign_is_right_where_the_surface_turns_away_from_the_limit_normal(sc
     found = surface.evaluate(np_rng.integers(0, 7, 400), np_rng.random((400, 2)) / 2, derivatives=2)
     turned = found.n @ surface.evaluate(0, [[0.0, 0.0]]).n[0] < 0
     assert 10 < turned.sum() < 390
-    by_forms = curvature(np.stack([found.dp_du, found.dp_dv]), np.stack([found.d2p_duu, found.d2p_duv, found.d2p_dvv]))
+    by_forms = curvature(np.stack([found.dp_du, found.dp_dv]), seconds(found))
     # Far from the point the fundamental forms lose little.
-    assert curvature_error(np.stack([found.gaussian_curvature, found.mean_curvature]), by_forms).max() <= CURVATURE
+    assert curvature_error(curvatures(found), by_forms).max() <= CURVATURE
 
 
 @pytest.mark.parametrize(
@@ -147,7 +124,7 @@ def test_curvature_grows_with_the_level_by_its_eigenvalues(scheme, valence, expe
     # plugin/MATHEMATICS.md, section 9: (|lambda_4| / lambda_2^2)^n.
     surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
     uv = np.array([[0.55, 0.3], [0.2, 0.7], [0.4, 0.4]])
-    shallow, deep = (size(curvatures(surface, uv * 2.0**-level)) for level in (150, 250))
+    shallow, deep = (size(curvatures_at(surface, uv * 2.0**-level)) for level in (150, 250))
     np.testing.assert_allclose((deep / shallow) ** (1 / 100), expected, rtol=GROWTH)
 
 
@@ -155,15 +132,14 @@ def test_curvature_grows_with_the_level_by_its_eigenvalues(scheme, valence, expe
 def test_curvature_of_defective_doo_sabin_grows_linearly_with_the_level(valence):
     surface = LimitSurface(samples_at("doo_sabin", valence).cage, "doo_sabin")
     levels = np.array([100, 200, 300])
-    found = np.array([size(curvatures(surface, np.array([[0.55, 0.3]]) * 2.0**-level))[0] for level in levels])
-    assert np.diff(found)[0] == pytest.approx(np.diff(found)[1], rel=1e-2)
-    assert np.diff(found)[0] > 0
+    first, second = np.diff(size(curvatures_at(surface, np.ldexp([[0.55, 0.3]], -levels[:, None]))))
+    assert 0 < first == pytest.approx(second, rel=1e-2)
 
 
 def test_curvature_vanishes_at_a_catmull_clark_vertex_of_valence_3():
     surface = LimitSurface(samples_at("catmull_clark", 3).cage)
-    np.testing.assert_array_equal(curvatures(surface, [[0.0, 0.0]]), 0)
-    assert np.abs(curvatures(surface, [[0.0, 2.0**-900]])).max() < 1e-2
+    np.testing.assert_array_equal(curvatures_at(surface, [[0.0, 0.0]]), 0)
+    assert np.abs(curvatures_at(surface, [[0.0, 2.0**-900]])).max() < 1e-2
 
 
 @pytest.mark.parametrize(
@@ -174,40 +150,31 @@ def test_curvature_vanishes_at_a_catmull_clark_vertex_of_valence_3():
         *(("doo_sabin", n) for n in (3, 5, 6, 8)),
     ],
 )
-def test_there_is_no_curvature_at_other_extraordinary_points(scheme, valence):
+def test_there_are_no_second_derivatives_and_no_curvature_at_other_extraordinary_points(scheme, valence):
     surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
-    assert np.isnan(curvatures(surface, [[0.0, 0.0]])).all()
-    assert np.isfinite(curvatures(surface, [[0.0, 2.0**-100]])).all()
-
-
-@EVERY_SCHEME
-def test_there_are_no_second_derivatives_at_an_extraordinary_point(scheme):
-    found = LimitSurface(samples_at(scheme, 5).cage, scheme).evaluate(0, [[0.0, 0.0]], derivatives=2)
-    for second in (found.d2p_duu, found.d2p_duv, found.d2p_dvv):
-        assert np.isnan(second).all()
+    found = surface.evaluate(0, [[0.0, 0.0]], derivatives=2)
+    assert np.isnan(curvatures(found)).all()
+    assert np.isnan(seconds(found)).all()
+    assert np.isfinite(curvatures_at(surface, [[0.0, 2.0**-100]])).all()
 
 
 @EVERY_SCHEME
 def test_there_is_curvature_at_an_ordinary_point(scheme):
     surface = LimitSurface(samples_at(scheme, ORDINARY[scheme]).cage, scheme)
-    at_point, beside = (curvatures(surface, [[t, 0.0]]) for t in (0.0, 2.0**-40))
+    at_point, beside = (curvatures_at(surface, [[t, 0.0]]) for t in (0.0, 2.0**-40))
     assert curvature_error(at_point, beside).max() < 1e-6
 
 
 @EVERY_SCHEME
 def test_float32_curvature_is_that_of_float64_within_its_precision(scheme):
     exact = samples_at(scheme, 5)
-    surface = LimitSurface(exact.cage, scheme)
-    found = surface.evaluate(0, exact.uv, derivatives=2, dtype=np.float32)
+    found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, derivatives=2, dtype=np.float32)
     assert found.gaussian_curvature.dtype == found.d2p_duu.dtype == np.float32
-    both = np.stack([found.gaussian_curvature, found.mean_curvature])
     # Some 20 roundings of 6e-8, over second derivatives of a tenth of the cage.
-    assert curvature_error(both, exact.curvature).max() < 1e-4
+    assert curvature_error(curvatures(found), exact.curvature).max() < 1e-4
 
 
 def test_one_derivative_leaves_second_derivatives_and_curvature_out():
     found = LimitSurface(extraordinary(5)).evaluate(0, [[0.5, 0.5]])
     assert found.d2p_duu is None
     assert found.gaussian_curvature is None
-    with pytest.raises(ValueError, match="derivatives 3; expected 1 or 2"):
-        LimitSurface(extraordinary(5)).evaluate(0, [[0.5, 0.5]], derivatives=3)

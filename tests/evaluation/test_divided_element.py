@@ -1,9 +1,8 @@
 """Elements divided completely: parts cover them once, and what lies beyond a level of a tip stays within its bound."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import classes
 from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
@@ -11,7 +10,7 @@ from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_ele
 from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows, transition
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
 from mitsuba_subdivision.evaluation.refined_rings import refined_ring
-from mitsuba_subdivision.mesh import ragged
+from mitsuba_subdivision.evaluation.sampled_polynomials import sampled_polynomials
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
 from mitsuba_subdivision.schemes.domain import AffineMap
@@ -24,22 +23,12 @@ EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 ROUNDED = 1 + 1e-9
 
 
-def classes(surface):
-    patches = surface.patches if surface.patches.refined is None else surface.patches.refined.table
-    return [(patches.scheme, each.signature) for each in patches.classes]
-
-
-def size(domain_map):
-    return abs(np.linalg.det(domain_map.matrix))
+def divided(surface):
+    return divided_elements(*classes(surface))
 
 
 def tips(surface):
     return [tip for element in divided(surface) for tip in element.tips]
-
-
-def divided(surface):
-    patches = surface.patches if surface.patches.refined is None else surface.patches.refined.table
-    return divided_elements(patches.scheme, [each.signature for each in patches.classes])
 
 
 def outward(element):
@@ -55,21 +44,17 @@ def area(domain_map):
 
 
 @EVERY_SURFACE
-def test_pieces_and_tips_cover_an_element_once(name):
-    for element in divided(surface_named(name)):
-        # Halves of halves.
-        assert sum(area(each) for kind in outward(element) for each in kind) == 1
-
-
-@EVERY_SURFACE
-def test_nodes_lead_to_pieces_by_copies_of_the_domain(name):
+def test_nodes_lead_to_pieces_by_copies_of_the_domain_and_pieces_cover_an_element_once(name):
     surface = surface_named(name)
     domain = surface.scheme.domain
     for element in divided(surface):
         pieces = dict(zip((PartKind.REGULAR, PartKind.TIP), outward(element), strict=True))
-        waiting, met = [(0, AffineMap(np.eye(2), np.zeros(2)))], []
+        # Halves of halves.
+        assert sum(area(each) for kind in pieces.values() for each in kind) == 1
+        waiting, met, parts = [(0, AffineMap(np.eye(2), np.zeros(2)))], [], []
         while waiting:
             node, inward = waiting.pop()
+            parts.append(node)
             kind, turn, first = element.nodes[node].tolist()
             inward = domain.rotation(turn) @ inward
             if kind in pieces:
@@ -80,17 +65,9 @@ def test_nodes_lead_to_pieces_by_copies_of_the_domain(name):
                 waiting.append((first, inward))
             else:
                 waiting += [(first + number, copy @ inward) for number, copy in enumerate(domain.children)]
-        expected = [(kind, number) for kind, found in pieces.items() for number in range(len(found))]
-        assert sorted(met) == expected
-
-
-@EVERY_SURFACE
-def test_every_part_but_the_element_is_a_child_once(name):
-    for element in divided(surface_named(name)):
-        kinds, _, first = element.nodes.T
-        is_inner = np.isin(kinds, (PartKind.DIVIDED, PartKind.ONLY_CHILD))
-        counts = np.where(kinds[is_inner] == PartKind.ONLY_CHILD, 1, 4)
-        np.testing.assert_array_equal(np.sort(ragged.ranges(first[is_inner], counts)), np.arange(1, len(kinds)))
+        assert sorted(met) == [(kind, number) for kind, found in pieces.items() for number in range(len(found))]
+        # Every part but the element is a child once.
+        assert sorted(parts) == list(range(len(element.nodes)))
 
 
 def below(elements):
@@ -146,15 +123,9 @@ def test_weights_of_control_points_sum_to_one(name):
 
 
 @EVERY_SURFACE
-def test_levels_and_the_rest_cover_a_tip(name):
+def test_levels_and_the_rest_cover_a_tip_and_bounds_of_the_rest_contain_all_later_levels(name, np_rng):
     for tip in tips(surface_named(name)):
-        covered = [size(each) for level in range(4) for each in level_domains(tip.patch, level)]
-        assert sum(covered) == 1 - 4.0**-4
-
-
-@EVERY_SURFACE
-def test_bounds_of_the_rest_contain_all_later_levels(name, np_rng):
-    for tip in tips(surface_named(name)):
+        assert sum(area(each) for level in range(4) for each in level_domains(tip.patch, level)) == 1 - 4.0**-4
         coordinates = tip.coordinates @ np_rng.normal(size=(tip.coordinates.shape[1], 3))
         for level in (0, 1, 4):
             reach = (rest_rows(tip.patch) @ np.abs(transition(tip.patch, level) @ coordinates)).max(axis=0)
@@ -167,10 +138,8 @@ class Skewed(CatmullClark):
     """States children in other places than they are."""
 
     def children(self, topology, refined, half_edge):
-        return [
-            (type(each)(each.matrix, each.offset + 0.25), half_edge)
-            for each, half_edge in super().children(topology, refined, half_edge)
-        ]
+        parts = super().children(topology, refined, half_edge)
+        return [(AffineMap(each.matrix, each.offset + 0.25), child) for each, child in parts]
 
 
 def test_children_that_are_no_copies_of_the_domain_are_an_error():
@@ -180,12 +149,20 @@ def test_children_that_are_no_copies_of_the_domain_are_an_error():
 
 
 @pytest.mark.usefixtures("nothing_divided")
-def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda scheme, signature: divided_elements(scheme, [signature]),
+        lambda *own: sampled_polynomials(element_of(*own), np.array([[0.0, 1e-30]]), {}),
+    ],
+    ids=["divided", "sampled"],
+)
+def test_patches_that_no_refinement_isolates_are_an_error(use, monkeypatch):
     def only_regular(scheme, signature):
         piece = whole_piece(scheme, signature)
         return None if piece is None or piece.patch is not None else piece
 
     monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)
-    scheme, signature = classes(surface_named("cube"))[0]
+    scheme, (signature, *_) = classes(surface_named("cube"))
     with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
-        divided_elements(scheme, [signature])
+        use(scheme, signature)

@@ -6,9 +6,10 @@ import pytest
 from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
 from mitsuba_subdivision.evaluation.equations import times_powers
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
-from mitsuba_subdivision.mesh.signature import Signature
+from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
 from mitsuba_subdivision.schemes import CatmullClark
+from reference.exact_samples import subdominant
+from scipy.linalg import block_diag
 
 VALENCES = [*range(3, 13), 20, 50, 100]
 # Measured: a subdivision matrix of valence 100 keeps its defining equations within 1e-13.
@@ -24,12 +25,11 @@ EVERY_VALENCE = pytest.mark.parametrize("valence", VALENCES)
 
 @cache
 def basis_of(valence):
-    return eigenbasis(subdivision_matrix(valence))
+    return eigenbasis(structure_of(valence).matrix)
 
 
-def subdivision_matrix(valence):
-    fans = ((4,) * valence, *((4,) * 4,) * 3)
-    return irregular_structure(CatmullClark(), Signature("face", fans)).matrix
+def structure_of(valence):
+    return irregular_structure(CatmullClark(), isolated_signature(CatmullClark(), valence))
 
 
 def similar(block_matrix, seed=1):
@@ -38,15 +38,6 @@ def similar(block_matrix, seed=1):
     vectors = np.linalg.qr(np.random.default_rng(seed).standard_normal((size, size)))[0]
     vectors[:, 0] = 1
     return vectors @ block_matrix @ np.linalg.inv(vectors)
-
-
-def block_diagonal(*blocks):
-    size = sum(len(block) for block in blocks)
-    matrix, begin = np.zeros((size, size)), 0
-    for block in map(np.array, blocks):
-        matrix[begin : begin + len(block), begin : begin + len(block)] = block
-        begin += len(block)
-    return matrix
 
 
 def jordan(eigenvalue, size):
@@ -58,88 +49,64 @@ def turning(modulus, angle):
 
 
 HIDDEN = {
-    "diagonal": block_diagonal([[1]], [[0.6]], [[0.5]], [[0.25]], [[-0.125]], [[0]]),
-    "repeated": block_diagonal([[1]], 0.5 * np.eye(2), 0.25 * np.eye(3), np.zeros((2, 2))),
-    "jordan 2": block_diagonal([[1]], 0.5 * np.eye(2), jordan(0.25, 2), [[0.125]]),
-    "two jordans": block_diagonal([[1]], 0.5 * np.eye(2), jordan(0.25, 2), jordan(0.25, 2), 0.25 * np.eye(2), [[0]]),
-    "subdominant jordan": block_diagonal([[1]], jordan(0.5, 2), [[0.25]]),
-    "nilpotent": block_diagonal([[1]], [[0.5]], jordan(0, 2)),
-    "complex pair": block_diagonal([[1]], 0.5 * np.eye(2), turning(0.4, 1.0), [[0.125]]),
-    "imaginary pair": block_diagonal([[1]], [[0.5]], turning(0.25, np.pi / 2)),
-    "pair beside its real part": block_diagonal([[1]], [[0.5]], turning(0.4, 1.0), [[0.4 * np.cos(1.0)]], [[0.125]]),
-    "opposite to the subdominant": block_diagonal([[1]], 0.25 * np.eye(2), [[-0.25]], [[0.125]]),
-    "opposite": block_diagonal([[1]], [[0.5]], [[0.25]], [[0.25]], [[-0.25]]),
+    "diagonal": block_diag(1, 0.6, 0.5, 0.25, -0.125, 0),
+    "repeated": block_diag(1, 0.5 * np.eye(2), 0.25 * np.eye(3), np.zeros((2, 2))),
+    "jordan 2": block_diag(1, 0.5 * np.eye(2), jordan(0.25, 2), 0.125),
+    "two jordans": block_diag(1, 0.5 * np.eye(2), jordan(0.25, 2), jordan(0.25, 2), 0.25 * np.eye(2), 0),
+    "subdominant jordan": block_diag(1, jordan(0.5, 2), 0.25),
+    "nilpotent": block_diag(1, 0.5, jordan(0, 2)),
+    "complex pair": block_diag(1, 0.5 * np.eye(2), turning(0.4, 1.0), 0.125),
+    "imaginary pair": block_diag(1, 0.5, turning(0.25, np.pi / 2)),
+    "pair beside its real part": block_diag(1, 0.5, turning(0.4, 1.0), 0.4 * np.cos(1.0), 0.125),
+    "opposite to the subdominant": block_diag(1, 0.25 * np.eye(2), -0.25, 0.125),
+    "opposite": block_diag(1, 0.5, 0.25, 0.25, -0.25),
 }
 EVERY_HIDDEN = pytest.mark.parametrize("hidden", HIDDEN.values(), ids=HIDDEN)
-# Eigenvalues of which the basis keeps a block of their own.
-BLOCK_SIZES = {
-    "jordan 2": [2],
-    "two jordans": [6],
-    "subdominant jordan": [2],
-    "nilpotent": [2],
-    "complex pair": [2],
-    "imaginary pair": [2],
-    "pair beside its real part": [2],
-}
+# Of these the basis needs no block; of others one of two, but for "two jordans".
+WITHOUT_BLOCKS = ("diagonal", "repeated", "opposite to the subdominant", "opposite")
 
 
 @pytest.mark.core
 @EVERY_VALENCE
-def test_subdominant_eigenvalue_has_its_closed_form_and_is_double(valence):
-    c = np.cos(2 * np.pi / valence)
-    expected = (c + 5 + np.sqrt((c + 9) * (c + 1))) / 16
-    basis = basis_of(valence)
-    assert basis.subdominant == pytest.approx(expected, abs=EIGENVALUE)
-    assert basis.eigenvalues[0] == 1
-    assert basis.eigenvalues[1] == basis.eigenvalues[2]
-    assert abs(basis.eigenvalues[3]) < basis.subdominant - 1e-4
-
-
-@pytest.mark.core
-@EVERY_VALENCE
-def test_basis_of_a_subdivision_matrix_satisfies_its_equations(valence):
-    matrix, basis = subdivision_matrix(valence), basis_of(valence)
+def test_basis_of_a_subdivision_matrix_satisfies_its_equations_and_has_closed_forms(valence):
+    matrix, basis, n = structure_of(valence).matrix, basis_of(valence), valence
     blocks = basis.block_matrix()
     assert np.abs(basis.inverse @ basis.vectors - np.eye(len(matrix))).max() < RESIDUAL
     assert np.abs(matrix @ basis.vectors - basis.vectors @ blocks).max() < RESIDUAL
     assert np.abs(basis.inverse @ matrix - blocks @ basis.inverse).max() < RESIDUAL
     assert basis.blocks == ()
     assert np.linalg.cond(basis.vectors) < 500
-
-
-@EVERY_VALENCE
-def test_first_vector_is_one_and_its_dual_sums_to_one(valence):
-    basis = basis_of(valence)
+    # The subdominant eigenvalue is double.
+    assert basis.subdominant == pytest.approx(subdominant("catmull_clark", n), abs=EIGENVALUE)
+    assert basis.eigenvalues[0] == 1
+    assert basis.eigenvalues[1] == basis.eigenvalues[2]
+    assert abs(basis.eigenvalues[3]) < basis.subdominant - 1e-4
+    # The first vector is one, and its dual the limit stencil.
     np.testing.assert_array_equal(basis.vectors[:, 0], 1)
-    sums = basis.inverse.sum(axis=1)
-    assert sums[0] == pytest.approx(1, abs=RESIDUAL)
-    np.testing.assert_allclose(sums[1:], 0, rtol=0, atol=RESIDUAL)
-
-
-@pytest.mark.core
-@EVERY_VALENCE
-def test_dual_of_the_first_vector_is_the_limit_stencil(valence):
-    weights = basis_of(valence).inverse[0]
-    n = valence
-    expected = np.sort([n * n, *[4] * n, *[1] * n, *[0] * (len(weights) - 2 * n - 1)]) / (n * (n + 5))
-    np.testing.assert_allclose(np.sort(weights), expected, rtol=0, atol=RESIDUAL)
+    np.testing.assert_allclose(basis.inverse.sum(axis=1), np.eye(len(matrix))[0], rtol=0, atol=RESIDUAL)
+    expected = np.sort([n * n, *[4] * n, *[1] * n, *[0] * (len(matrix) - 2 * n - 1)]) / (n * (n + 5))
+    np.testing.assert_allclose(np.sort(basis.inverse[0]), expected, rtol=0, atol=RESIDUAL)
 
 
 @pytest.mark.core
 @EVERY_HIDDEN
-def test_hidden_blocks_are_found(hidden, request):
+def test_hidden_blocks_are_found_and_their_powers_are_those_of_the_matrix(hidden, request):
     matrix = similar(hidden)
     basis = eigenbasis(matrix)
     name = request.node.callspec.id
-    assert sorted(len(block) for _, block in basis.blocks) == BLOCK_SIZES.get(name, [])
+    sizes = [] if name in WITHOUT_BLOCKS else [6 if name == "two jordans" else 2]
+    assert [len(block) for _, block in basis.blocks] == sizes
     expected = np.linalg.eigvals(hidden)
     np.testing.assert_allclose(np.sort(basis.eigenvalues), np.sort(expected.real), rtol=0, atol=DEFECTIVE_EIGENVALUE)
     np.testing.assert_allclose(basis.moduli, -np.sort(-np.abs(expected)), rtol=0, atol=DEFECTIVE_EIGENVALUE)
     blocks = basis.block_matrix()
     np.testing.assert_allclose(basis.vectors @ blocks @ basis.inverse, matrix, rtol=0, atol=POWER)
-    moduli = np.abs(np.linalg.eigvals(blocks))
     assert basis.eigenvalues[0] == 1
-    assert moduli.max() == pytest.approx(1)
+    assert np.abs(np.linalg.eigvals(blocks)).max() == pytest.approx(1)
+    # ``V T^n L`` is ``A^n``, which is all that evaluation wants.
+    for level in (0, 1, 2, 5, 30):
+        rows = times_powers(basis.vectors[None], np.full(len(matrix), level), basis, 1.0)[0]
+        np.testing.assert_allclose(rows @ basis.inverse, np.linalg.matrix_power(matrix, level), rtol=0, atol=POWER)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -151,9 +118,11 @@ def test_of_opposite_eigenvalues_the_positive_comes_first(seed):
 
 def test_subdominant_pair_of_valence_2_is_that_of_the_ring():
     # The ring's two modes have 1/4; -1/4 belongs to the rows beyond it.
-    matrix = subdivision_matrix(2)
-    basis = eigenbasis(matrix)
-    np.testing.assert_allclose(basis.eigenvalues[:4], [1, 0.25, 0.25, -0.25], rtol=0, atol=EIGENVALUE)
+    np.testing.assert_allclose(basis_of(2).eigenvalues[:4], [1, 0.25, 0.25, -0.25], rtol=0, atol=EIGENVALUE)
+
+
+def times_matrix_powers(rows, levels, matrix):
+    return np.stack([rows[:, k] @ np.linalg.matrix_power(matrix, level) for k, level in enumerate(levels)], axis=1)
 
 
 @pytest.mark.core
@@ -164,24 +133,10 @@ def test_scaled_powers_are_matrix_powers(hidden, place):
     base = basis.moduli[min(place, np.flatnonzero(basis.moduli > EIGENVALUE)[-1])]
     levels = np.array([0, 1, 2, 3, 7, 20, 3, 0])
     rows = np.random.default_rng(2).standard_normal((3, len(levels), len(hidden)))
-    expected = np.empty_like(rows)
-    for sample, level in enumerate(levels):
-        expected[:, sample] = rows[:, sample] @ np.linalg.matrix_power(basis.block_matrix() / base, level)
+    expected = times_matrix_powers(rows, levels, basis.block_matrix() / base)
     # Columns of larger eigenvalues than the base are left out.
     expected[..., basis.moduli > base * (1 + DEFECTIVE_EIGENVALUE)] = 0
     np.testing.assert_allclose(times_powers(rows, levels, basis, base), expected, rtol=0, atol=POWER)
-
-
-@EVERY_HIDDEN
-def test_scaled_powers_of_coordinates_are_powers_of_the_matrix(hidden):
-    """``V T^n L`` is ``A^n``, which is all that evaluation wants."""
-    matrix = similar(hidden)
-    basis = eigenbasis(matrix)
-    for level in (0, 1, 2, 5, 30):
-        rows = times_powers(basis.vectors[None], np.full(len(matrix), level), basis, 1.0)[0]
-        np.testing.assert_allclose(
-            rows @ basis.inverse, np.linalg.matrix_power(matrix, level), rtol=0, atol=POWER, err_msg=f"level {level}"
-        )
 
 
 @EVERY_HIDDEN
@@ -197,15 +152,13 @@ def test_scaled_powers_keep_the_precision_of_the_rows(hidden, dtype):
 
 @pytest.mark.parametrize("size", [2, 3, 4])
 def test_powers_of_a_long_jordan_block_are_matrix_powers(size):
-    matrix = block_diagonal([[1]], [[0.5]], jordan(0.25, size))
+    matrix = block_diag(1, 0.5, jordan(0.25, size))
     means = np.diag(matrix)
     basis = Eigenbasis(np.eye(len(matrix)), np.eye(len(matrix)), means, means, ((slice(2, 2 + size), matrix[2:, 2:]),))
     levels = np.array([0, 1, 2, 3, 4, 7, 20])
     rows = np.random.default_rng(4).standard_normal((2, len(levels), len(matrix)))
     found = times_powers(rows, levels, basis, 1.0)
-    for sample, level in enumerate(levels):
-        expected = rows[:, sample] @ np.linalg.matrix_power(matrix, level)
-        np.testing.assert_allclose(found[:, sample], expected, rtol=0, atol=POWER, err_msg=f"level {level}")
+    np.testing.assert_allclose(found, times_matrix_powers(rows, levels, matrix), rtol=0, atol=POWER)
 
 
 def test_scaled_powers_underflow_to_zero():
@@ -219,13 +172,11 @@ def test_scaled_powers_underflow_to_zero():
 @pytest.mark.parametrize("valence", [2, 3, 5, 8])
 def test_orientation_of_the_computed_eigenvectors_does_not_matter(valence, monkeypatch):
     # It is up to rounding, and differs between libraries.
-    fans = ((4,) * valence, *((4,) * 4,) * 3)
-    structure = irregular_structure(CatmullClark(), Signature("face", fans))
     uv = np.array([(0.0, 0.0), (0.3, 0.7), (2.0**-20, 2.0**-21)])
     found = []
     for turn in (Eigenbasis.turned_over, lambda basis: basis):
         monkeypatch.setattr(irregular_patch, "eigenbasis", lambda *given, turn=turn: turn(eigenbasis(*given)))
-        patch = irregular_patch.irregular_patch.__wrapped__(CatmullClark(), structure)
+        patch = irregular_patch.irregular_patch.__wrapped__(CatmullClark(), structure_of(valence))
         found.append(patch.rows(uv, "stabilized", np.float64).rows @ patch.basis.inverse)
     np.testing.assert_allclose(*found, rtol=0, atol=RESIDUAL)
 
@@ -241,36 +192,37 @@ def test_turned_over_basis_has_its_third_vector_negated(hidden):
     np.testing.assert_allclose(matrix, similar(hidden), rtol=0, atol=POWER)
 
 
+DOES_NOT_CONTRACT = "the second eigenvalue has modulus 1.*; expected below 1, or there is no"
+
+
 @pytest.mark.parametrize(
-    "matrix",
+    ("matrix", "message"),
     [
-        pytest.param(similar(block_diagonal([[1]], jordan(0.5, 8))), id="long Jordan chain"),
-        pytest.param(2 * similar(HIDDEN["diagonal"]), id="rows sum to two"),
-        pytest.param(np.diag([1, 0.5, 0.25]), id="rows do not sum to one"),
+        (similar(block_diag(1, jordan(0.5, 8))), "subdivision matrix|second eigenvalue"),
+        # Rows that sum to two, and that do not sum to one.
+        (2 * similar(HIDDEN["diagonal"]), "subdivision matrix|second eigenvalue"),
+        (np.diag([1, 0.5, 0.25]), "subdivision matrix|second eigenvalue"),
+        *((similar(np.diag([1, second, 0.5])), DOES_NOT_CONTRACT) for second in (1, -1, 1 + 1e-3)),
     ],
 )
-def test_matrix_it_cannot_handle_is_an_error(matrix):
-    with pytest.raises(EigenbasisError, match=r"subdivision matrix|second eigenvalue"):
+def test_matrix_it_cannot_handle_is_an_error(matrix, message):
+    with pytest.raises(EigenbasisError, match=message):
         eigenbasis(matrix)
 
 
+def test_a_matrix_that_contracts_slowly_has_a_basis():
+    slow = eigenbasis(similar(np.diag([1, 1 - 1e-3, 0.5])))
+    np.testing.assert_allclose(slow.eigenvalues, [1, 1 - 1e-3, 0.5], rtol=0, atol=EIGENVALUE)
+
+
 @pytest.mark.parametrize("gap", 10.0 ** -np.arange(2, 14))
-def test_a_basis_of_nearly_defective_matrices_holds_or_is_an_error(gap):
-    """Eigenvalues apart by more than rounding splits a defective pair, with vectors that are nearly parallel."""
-    matrix = similar(block_diagonal([[1]], [[0.5, 1], [0, 0.5 - gap]], [[0.3]]))
-    try:
-        basis = eigenbasis(matrix)
-    except EigenbasisError:
-        return
-    found = basis.vectors @ basis.block_matrix() @ basis.inverse
-    np.testing.assert_allclose(found, matrix, rtol=0, atol=POWER)
+@pytest.mark.parametrize(("size", "seed"), [(2, 1), (3, 0), (3, 1), (3, 2)])
+def test_a_basis_of_a_nearly_defective_matrix_holds_or_the_error_says_where(gap, size, seed):
+    """Eigenvalues apart by more than rounding splits defective ones, with vectors that are nearly parallel.
 
-
-@pytest.mark.parametrize(("gap", "seed"), [(gap, seed) for gap in 10.0 ** -np.arange(3, 13) for seed in range(3)])
-def test_a_basis_of_a_nearly_defective_triple_holds_or_the_error_says_where(gap, seed):
-    """Rounding moves the eigenvalues by 1e-5, and inverse iteration may be shifted onto one of them."""
-    triple = np.diag(0.5 - gap * np.arange(3)) + np.eye(3, k=1)
-    matrix = similar(block_diagonal([[1]], triple, [[0.3]]), seed)
+    Rounding moves those of a triple by 1e-5, and inverse iteration may be shifted onto one of them.
+    """
+    matrix = similar(block_diag(1, np.diag(0.5 - gap * np.arange(size)) + np.eye(size, k=1), 0.3), seed)
     try:
         basis = eigenbasis(matrix)
     except EigenbasisError as error:
@@ -279,7 +231,7 @@ def test_a_basis_of_a_nearly_defective_triple_holds_or_the_error_says_where(gap,
         found = basis.vectors @ basis.block_matrix() @ basis.inverse
         np.testing.assert_allclose(found, matrix, rtol=0, atol=POWER)
         return
-    assert "eigenbasis of a 5 x 5 subdivision matrix" in message
+    assert f"eigenbasis of a {size + 2} x {size + 2} subdivision matrix" in message
     if near := re.search(r"the closest eigenvalues are (\S+) and (\S+);", message):
         assert [complex(each) for each in near.groups()] == pytest.approx([0.5, 0.5], abs=1e-3)
 
@@ -292,13 +244,3 @@ def test_a_matrix_that_inverse_iteration_cannot_invert_is_an_error(monkeypatch):
     monkeypatch.setattr(np.linalg, "inv", singular)
     with pytest.raises(EigenbasisError, match=r"6 x 6 .* closest eigenvalues are 0\.\d+\S* and 0\.\d+\S*; expected"):
         eigenbasis(matrix)
-
-
-@pytest.mark.parametrize("second", [1, -1, 1 + 1e-3])
-def test_a_matrix_that_does_not_contract_is_an_error(second):
-    with pytest.raises(
-        EigenbasisError, match=r"the second eigenvalue has modulus 1.*; expected below 1, or there is no"
-    ):
-        eigenbasis(similar(block_diagonal([[1]], [[second]], [[0.5]])))
-    slow = eigenbasis(similar(block_diagonal([[1]], [[1 - 1e-3]], [[0.5]])))
-    np.testing.assert_allclose(slow.eigenvalues, [1, 1 - 1e-3, 0.5], rtol=0, atol=EIGENVALUE)

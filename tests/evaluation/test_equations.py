@@ -41,15 +41,19 @@ def rows_of(patch, tables):
     return child_rows(patch.scheme, uv, tables, 2)
 
 
-def sums(patch, first_term, base, derivative):
-    """Of each sample, the sum over i of ``(b^T P_k Abar v_i) (lambda_i / base)^n c_i``; c_i are the unit vectors."""
-    basis, found = patch.basis, []
+def at_samples(patch, derivative):
+    """Of each sample, its level and ``b^T P_k``."""
     for n, k, local, _ in samples_of(patch.scheme):
         b = patch.scheme.regular_basis(local[None], 2)[derivative, 0]
-        terms = np.zeros(len(basis.eigenvalues))
-        for i in range(first_term - 1, len(terms)):
-            terms[i] = b @ patch.structure.children[k - 1] @ basis.vectors[:, i] * (basis.eigenvalues[i] / base) ** n
-        found.append(terms)
+        yield n, b @ patch.structure.children[k - 1]
+
+
+def sums(patch, first_term, base, derivative):
+    """Of each sample, the sum over i of ``(b^T P_k Abar v_i) (lambda_i / base)^n c_i``; c_i are the unit vectors."""
+    found, eigenvalues = [], patch.basis.eigenvalues
+    for n, row in at_samples(patch, derivative):
+        terms = row @ patch.basis.vectors * (eigenvalues / base) ** n
+        found.append(np.where(np.arange(len(terms)) < first_term - 1, 0, terms))
     return np.array(found)
 
 
@@ -78,12 +82,8 @@ def test_equation_4(scheme, valence):
     level, rows = rows_of(patch, patch.structure.children)
     found = power_rows(rows, level, patch.structure.matrix)
     for derivative, order in enumerate(ORDERS):
-        expected = [
-            patch.scheme.regular_basis(local[None], 2)[derivative, 0]
-            @ patch.structure.children[k - 1]
-            @ np.linalg.matrix_power(patch.structure.matrix, n)
-            for n, k, local, _ in samples_of(patch.scheme)
-        ]
+        samples = at_samples(patch, derivative)
+        expected = [row @ np.linalg.matrix_power(patch.structure.matrix, n) for n, row in samples]
         scale = factors(patch, order)[:, None]
         np.testing.assert_allclose(found[derivative] / scale, expected, rtol=0, atol=ROUNDING)
 
@@ -126,7 +126,5 @@ def test_equation_13(scheme, valence):
     assert characteristic_jacobian(patch.scheme, patch.structure.children, patch.basis.vectors) > 0
     near = patch.rows(np.array([(2.0**-300, 2.0**-300)]), "stabilized", np.float64).rows[:, 0] @ coordinates
     np.testing.assert_allclose(near[0], point, rtol=0, atol=ROUNDING)
-    found = np.cross(near[1], near[2])
-    np.testing.assert_allclose(
-        found / np.linalg.norm(found), normal / np.linalg.norm(normal), rtol=0, atol=100 * ROUNDING
-    )
+    found, expected = (each / np.linalg.norm(each) for each in (np.cross(near[1], near[2]), normal))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=100 * ROUNDING)

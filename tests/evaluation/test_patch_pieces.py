@@ -3,17 +3,16 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from evaluation.common import ChangedCatmullClark
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
-from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Signature, signature_at
-from mitsuba_subdivision.schemes import CatmullClark, Refinement, SchemeError, StencilTable
+from mitsuba_subdivision.schemes import CatmullClark, SchemeError
 from mitsuba_subdivision.schemes.domain import SQUARE
 from patches.closed_cages import CLOSED_CAGES
-from scipy import sparse
 
 pytestmark = pytest.mark.core
 
@@ -53,56 +52,41 @@ def all_signatures():
 SIGNATURES = all_signatures()
 
 
-def test_pieces_cover_the_domain_once():
+def test_pieces_cover_the_domain_once_and_lie_inside_and_stencils_sum_to_one():
+    uv = np.random.default_rng(1).random((200, 2))
     for signature in SIGNATURES:
         found = pieces(signature)
         areas = [1 / np.linalg.det(piece.domain.matrix) for piece in found]
         assert min(areas) > 0
         assert sum(areas) == 1
-        uv = np.random.default_rng(1).random((200, 2))
         inside = np.array([SQUARE.inside(piece.domain(uv)) for piece in found])
         assert ((inside > 0).sum(axis=0) == 1).all()
-
-
-def test_pieces_lie_inside_the_domain():
-    for signature in SIGNATURES:
-        for piece in pieces(signature):
-            corners = piece.domain.inverse()(SQUARE.corners)
-            assert (SQUARE.inside(corners) >= 0).all()
-
-
-def test_stencils_sum_to_one():
-    for signature in SIGNATURES:
         count = one_ring(signature).vertex_count
-        for piece in pieces(signature):
-            regular = piece.patch is None
-            own = 16 if regular else one_ring(piece.patch.structure.signature).vertex_count
+        for piece in found:
+            assert (SQUARE.inside(piece.domain.inverse()(SQUARE.corners)) >= 0).all()
+            sums = [piece.stencils.sum(axis=1)]
+            own = 16
+            if piece.patch is not None:
+                structure = piece.patch.structure
+                own = one_ring(structure.signature).vertex_count
+                sums += [structure.matrix.sum(axis=1), structure.children.sum(axis=2).ravel()]
             assert piece.stencils.shape == (own, count)
-            np.testing.assert_allclose(piece.stencils.sum(axis=1), 1, rtol=0, atol=ROUNDING)
-            if not regular:
-                np.testing.assert_allclose(piece.patch.structure.matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
-                np.testing.assert_allclose(piece.patch.structure.children.sum(axis=2), 1, rtol=0, atol=ROUNDING)
+            np.testing.assert_allclose(np.concatenate(sums), 1, rtol=0, atol=ROUNDING)
 
 
-def test_a_piece_has_at_most_one_extraordinary_point_which_is_its_origin():
+def test_a_piece_has_at_most_one_extraordinary_point_at_its_origin_and_all_of_the_element_have_one():
+    """They sit at corners of the element and, for a polygon's sub-quad, at the middle of the polygon."""
+    corners = [tuple(corner) for corner in SQUARE.corners.tolist()]
     for signature in SIGNATURES:
+        found = Counter()
         for piece in pieces(signature):
             if piece.patch is not None:
                 fan, *others = piece.patch.structure.signature.fans
                 assert set(fan) == {4}
                 assert len(fan) != 4
                 assert others == [REGULAR_FAN] * 3
-
-
-def test_extraordinary_points_are_those_of_the_element():
-    """They sit at corners of the element and, for a polygon's sub-quad, at the middle of the polygon."""
-    for signature in SIGNATURES:
-        found = Counter()
-        for piece in pieces(signature):
-            if piece.patch is not None:
                 origin = piece.domain.inverse()(np.zeros((1, 2)))[0]
-                found[tuple(origin.tolist()), len(piece.patch.structure.signature.fans[0])] += 1
-        corners = [tuple(corner) for corner in SQUARE.corners.tolist()]
+                found[tuple(origin.tolist()), len(fan)] += 1
         if len(signature.fans) == 4:
             valences = dict(zip(corners, signature.valences, strict=True))
         else:
@@ -117,11 +101,9 @@ def test_isolated_extraordinary_vertex_needs_no_refinement(valence, corner):
     assert piece.patch.structure.signature == isolated(valence)
     np.testing.assert_array_equal(piece.domain(SQUARE.corners[corner]), [0, 0])
     # A permutation, which turns the one-ring.
-    np.testing.assert_array_equal(np.sort(piece.stencils, axis=1)[:, :-1], 0)
-    np.testing.assert_array_equal(piece.stencils.sum(axis=0), 1)
-    np.testing.assert_array_equal(
-        piece.stencils, np.eye(len(piece.stencils))[rotation_order(isolated(valence, corner), corner)]
-    )
+    order = rotation_order(isolated(valence, corner), corner)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(piece.stencils)))
+    np.testing.assert_array_equal(piece.stencils, np.eye(len(order))[order])
 
 
 @pytest.mark.parametrize("valence", VALENCES)
@@ -185,26 +167,15 @@ def test_scheme_that_isolates_nothing_is_refused():
 
 
 def test_refined_children_run_the_rules_of_the_scheme():
-    """Stencils are read off the scheme's own matrix, here one that averages them with those of vertex 0."""
-
-    class Marked(CatmullClark):
-        def refine(self, topology: Topology) -> Refinement:
-            refinement = super().refine(topology)
-            matrix = refinement.stencils.matrix.toarray()
-            return refinement._replace(stencils=StencilTable.from_matrix(sparse.csr_array((matrix + matrix[0]) / 2)))
-
+    # Stencils averaged with those of vertex 0.
+    marked_scheme = ChangedCatmullClark("marked", lambda matrix, _: (matrix + matrix[0]) / 2)
     first = SCHEME.refine(one_ring(isolated(5)).topology).stencils.matrix.toarray()[0]
-    for (_, _, marked), (_, _, stencils) in zip(
-        refined_children(Marked(), isolated(5)), refined_children(SCHEME, isolated(5)), strict=True
-    ):
+    children = (refined_children(scheme, isolated(5)) for scheme in (marked_scheme, SCHEME))
+    for (_, _, marked), (_, _, stencils) in zip(*children, strict=True):
         np.testing.assert_allclose(marked, (stencils + first) / 2, rtol=0, atol=1e-15)
 
 
 def test_weights_that_do_not_sum_to_one_are_an_error():
-    class Halved(CatmullClark):
-        def refine(self, topology: Topology) -> Refinement:
-            refinement = super().refine(topology)
-            return refinement._replace(stencils=StencilTable.from_matrix(0.5 * refinement.stencils.matrix))
-
-    with pytest.raises(SchemeError, match=r"catmull_clark: a refined vertex near a face .* sum to 0\.5; expected 1"):
-        refined_children(Halved(), isolated(5))
+    halved = ChangedCatmullClark("halved", lambda matrix, _: 0.5 * matrix)
+    with pytest.raises(SchemeError, match=r"halved: a refined vertex near a face .* sum to 0\.5; expected 1"):
+        refined_children(halved, isolated(5))

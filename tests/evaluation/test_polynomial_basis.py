@@ -1,12 +1,11 @@
 """The regular basis as polynomials is the scheme's own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import EVERY_SCHEME_OBJECT, inside
 from mitsuba_subdivision import SchemeError
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
-from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop
+from mitsuba_subdivision.schemes import CatmullClark
 
 pytestmark = pytest.mark.core
 
@@ -15,13 +14,6 @@ ROUNDING = 2e-14
 SECOND = 1e-12
 # Of the coefficients of the highest powers, which are at most 2^-6 on the domain.
 COEFFICIENT = 2e-13
-
-SCHEMES = {"catmull_clark": CatmullClark(), "loop": Loop(), "doo_sabin": DooSabin()}
-EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES.values(), ids=SCHEMES.keys())
-
-
-def inside(scheme, rng, count=300):
-    return rng.dirichlet(np.ones(scheme.domain.corner_count), count) @ scheme.domain.corners
 
 
 def derived(basis, uv, order_u, order_v):
@@ -34,7 +26,7 @@ def derived(basis, uv, order_u, order_v):
     return found @ basis.matrix
 
 
-@EVERY_SCHEME
+@EVERY_SCHEME_OBJECT
 def test_values_and_derivatives_are_the_schemes(scheme, np_rng):
     basis, uv = polynomial_basis(scheme), inside(scheme, np_rng)
     expected = scheme.regular_basis(uv, 2)
@@ -43,7 +35,7 @@ def test_values_and_derivatives_are_the_schemes(scheme, np_rng):
         np.testing.assert_allclose(derived(basis, uv, *orders), of_scheme, rtol=0, atol=SECOND)
 
 
-@EVERY_SCHEME
+@EVERY_SCHEME_OBJECT
 def test_the_functions_sum_to_one(scheme):
     """So does the constant's row, the first, and all others sum to zero."""
     basis = polynomial_basis(scheme)
@@ -51,7 +43,7 @@ def test_the_functions_sum_to_one(scheme):
     np.testing.assert_allclose(basis.matrix.sum(axis=1), np.arange(len(basis.powers)) == 0, rtol=0, atol=COEFFICIENT)
 
 
-@EVERY_SCHEME
+@EVERY_SCHEME_OBJECT
 def test_powers_are_those_of_the_splines_and_each_occurs_once(scheme):
     """Of cubic and quadratic tensor products, and at most 4 in all for the quartic box spline."""
     powers = [tuple(power) for power in polynomial_basis(scheme).powers.tolist()]
@@ -87,5 +79,4 @@ def test_a_basis_that_is_no_polynomial_is_an_error(power, half):
 
 
 def test_a_polynomial_of_another_degree_is_found():
-    basis = polynomial_basis(Bent(5, False))
-    assert basis.powers[:, 0].max() == 5
+    assert polynomial_basis(Bent(5, False)).powers[:, 0].max() == 5

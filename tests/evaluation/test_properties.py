@@ -1,26 +1,28 @@
 """Laws of evaluation on random closed cages."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import EVERY_SCHEME, evaluate_from
 from evaluation.random_cages import cages
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.evaluation.element import element_stencils
 from reference.bars import NORMAL, POINT
-from reference.exact_samples import SCHEMES, angle, faces_of
+from reference.exact_samples import angle, faces_of
 
 # The same examples in every run, and few: each random cage has some ten new classes to prepare.
 FEW = settings(derandomize=True, deadline=None, database=None, max_examples=8)
-EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
-SEED = st.integers(0, 99)
 # Sums of products of some fifty weights.
 WEIGHTS = 1e-13
 SAMPLES = 12
 # Derivatives relative to their own size, which near extraordinary points may be anything.
 DERIVATIVE = 1e-11
+
+
+def of_random_cages(law):
+    """Parametrise a law by scheme, and give it data to draw cages from and a seed for what else is random."""
+    return EVERY_SCHEME(given(data=st.data(), seed=st.integers(0, 99))(FEW(law)))
 
 
 def some_samples(surface, rng, count=SAMPLES):
@@ -30,21 +32,12 @@ def some_samples(surface, rng, count=SAMPLES):
     return half_edge, uv
 
 
-def evaluate_from(surface, half_edge, uv):
-    """Evaluate parameters from corners of the element mesh."""
-    elements = surface.patches.elements
-    element = elements.face[half_edge]
-    return surface.evaluate(element, uv, half_edge - elements.face_offsets[element])
-
-
-def assert_equal_derivatives(found, expected):
+def assert_equal_derivatives(found, expected, rounding=1):
     length = np.linalg.norm(expected, axis=1, keepdims=True)
-    assert (np.abs(found - expected) / length).max() <= DERIVATIVE
+    assert (np.abs(found - expected) / length).max() <= DERIVATIVE * rounding
 
 
-@EVERY_SCHEME
-@given(data=st.data(), seed=SEED)
-@FEW
+@of_random_cages
 def test_turning_moving_and_scaling_the_cage_do_so_to_the_surface(scheme, data, seed):
     cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
     surface = LimitSurface(cage, scheme)
@@ -59,16 +52,12 @@ def test_turning_moving_and_scaling_the_cage_do_so_to_the_surface(scheme, data, 
     assert np.abs(scale * (before.p @ turn.T) + shift - after.p).max() <= POINT * size
     # The moved cage is rounded to its distance from the origin, which is the larger the smaller it is.
     rounding = 1 + 1 / scale
-    for name in ("dp_du", "dp_dv"):
-        expected = scale * (getattr(before, name) @ turn.T)
-        length = np.linalg.norm(expected, axis=1, keepdims=True)
-        assert (np.abs(getattr(after, name) - expected) / length).max() <= DERIVATIVE * rounding
+    assert_equal_derivatives(after.dp_du, scale * (before.dp_du @ turn.T), rounding)
+    assert_equal_derivatives(after.dp_dv, scale * (before.dp_dv @ turn.T), rounding)
     assert angle(before.n @ turn.T, after.n).max() <= NORMAL * rounding
 
 
-@EVERY_SCHEME
-@given(data=st.data(), seed=SEED)
-@FEW
+@of_random_cages
 def test_the_order_of_vertices_faces_and_corners_does_not_matter(scheme, data, seed):
     cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
     faces = [face.tolist() for face in faces_of(cage)]
@@ -100,64 +89,38 @@ def along_edge(surface, half_edge, t):
     whole = surface.patches.is_whole[elements.face[half_edge]]
     first_half = whole | (t < 0.5)
     corner = np.where(first_half, half_edge, elements.next[half_edge])
-    zero = np.zeros_like(t)
-    uv = np.where(
-        first_half[:, None], np.stack([np.where(whole, t, 2 * t), zero], axis=1), np.stack([zero, 2 - 2 * t], axis=1)
-    )
-    return corner, uv
+    u, v = np.where(first_half, np.where(whole, t, 2 * t), 0), np.where(first_half, 0, 2 - 2 * t)
+    return corner, np.stack([u, v], axis=1)
+
+
+def assert_agree(surface, one, other):
+    one, other = evaluate_from(surface, *one), evaluate_from(surface, *other)
+    assert np.abs(one.p - other.p).max() <= POINT
+    assert angle(one.n, other.n).max() <= NORMAL
 
 
 @pytest.mark.core
-@EVERY_SCHEME
-@given(data=st.data(), seed=SEED)
-@FEW
-def test_neighbours_agree_along_the_edge_they_share(scheme, data, seed):
+@of_random_cages
+def test_elements_and_their_sub_patches_agree_where_they_meet(scheme, data, seed):
     cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
     surface = LimitSurface(cage, scheme)
     elements = surface.patches.elements
     half_edge = rng.integers(0, elements.half_edge_count, SAMPLES)
     # The other side is counted from the other end: few bits, so that both have the same point.
     t = rng.integers(1, 2**20, SAMPLES) / 2**20
-    one = evaluate_from(surface, *along_edge(surface, half_edge, t))
-    two = evaluate_from(surface, *along_edge(surface, elements.twin[half_edge], 1 - t))
-    assert np.abs(one.p - two.p).max() <= POINT
-    assert angle(one.n, two.n).max() <= NORMAL
-
-
-@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
-@given(data=st.data(), seed=SEED)
-@FEW
-def test_sub_patches_of_an_element_agree_along_the_edge_they_share(scheme, data, seed):
-    cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
-    surface = LimitSurface(cage, scheme)
-    elements = surface.patches.elements
+    assert_agree(surface, along_edge(surface, half_edge, t), along_edge(surface, elements.twin[half_edge], 1 - t))
+    # All limits at a corner are those of the first half-edge there.
+    _, first, number = np.unique(elements.face_vertices, return_index=True, return_inverse=True)
+    at_corner = np.zeros((elements.half_edge_count, 2))
+    assert_agree(surface, (np.arange(elements.half_edge_count), at_corner), (first[number], at_corner))
     partial = np.flatnonzero(~surface.patches.is_whole[elements.face])
-    assume(len(partial) > 0)
-    half_edge = rng.choice(partial, SAMPLES)
-    t, one = rng.random(SAMPLES), np.ones(SAMPLES)
-    first = evaluate_from(surface, half_edge, np.stack([one, t], axis=1))
-    second = evaluate_from(surface, elements.next[half_edge], np.stack([t, one], axis=1))
-    assert np.abs(first.p - second.p).max() <= POINT
-    assert angle(first.n, second.n).max() <= NORMAL
-
-
-@EVERY_SCHEME
-@given(data=st.data())
-@FEW
-def test_elements_agree_in_the_limit_at_the_corner_they_share(scheme, data):
-    surface = LimitSurface(data.draw(cages(scheme)), scheme)
-    elements = surface.patches.elements
-    found = evaluate_from(surface, np.arange(elements.half_edge_count), np.zeros((elements.half_edge_count, 2)))
-    order = np.argsort(elements.face_vertices)
-    first = order[np.searchsorted(elements.face_vertices[order], elements.face_vertices)]
-    assert np.abs(found.p - found.p[first]).max() <= POINT
-    assert angle(found.n, found.n[first]).max() <= NORMAL
+    if len(partial):
+        half_edge, t = rng.choice(partial, SAMPLES), np.stack([np.ones(SAMPLES), rng.random(SAMPLES)], axis=1)
+        assert_agree(surface, (half_edge, t), (elements.next[half_edge], t[:, ::-1]))
 
 
 @pytest.mark.core
-@EVERY_SCHEME
-@given(data=st.data(), seed=SEED)
-@FEW
+@of_random_cages
 def test_weights_sum_to_one_and_those_of_tangents_to_zero(scheme, data, seed):
     surface, rng = LimitSurface(data.draw(cages(scheme)), scheme), np.random.default_rng(seed)
     for group in surface.patches.classes[:4]:

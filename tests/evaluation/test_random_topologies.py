@@ -1,7 +1,5 @@
 """A few of the random topologies of `fuzz.topologies`, and that its laws notice what is wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fuzz import topologies

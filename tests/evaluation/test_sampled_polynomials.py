@@ -1,18 +1,15 @@
 """Points and tangents of polynomials that hold samples are limit stencils, found sample by sample."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import classes
 from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.evaluation.sampled_polynomials import PLANE_POWERS, sampled_polynomials
-from mitsuba_subdivision.schemes import SchemeError
 from reference.refined_cages import tagged
 
 pytestmark = pytest.mark.core
@@ -23,11 +20,6 @@ EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 ROUNDED = 1e-11
 # Parts of the length of a normal, made of tangents that lose a binary digit with each refinement.
 PARALLEL = 1e-8
-
-
-def classes(surface):
-    patches = surface.patches if surface.patches.refined is None else surface.patches.refined.table
-    return patches.scheme, [each.signature for each in patches.classes]
 
 
 def grid(scheme, rate):
@@ -80,30 +72,11 @@ def test_few_samples_have_planes_and_many_a_polynomial():
 
 
 def test_equal_parts_are_found_once():
-    surface = LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING]))
-    scheme, signatures = classes(surface)
-    uv, known = grid(scheme, 8), {}
-    for signature in signatures:
-        sampled_polynomials(element_of(scheme, signature), uv, known)
-    count = len(known)
-    alone = 0
+    scheme, signatures = classes(LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING])))
+    uv, together, alone = grid(scheme, 8), {}, 0
     for signature in signatures:
         own = {}
-        sampled_polynomials(element_of(scheme, signature), uv, own)
+        for known in (together, own):
+            sampled_polynomials(element_of(scheme, signature), uv, known)
         alone += len(own)
-    assert count < alone
-
-
-def test_patches_that_no_refinement_isolates_are_an_error(monkeypatch):
-    def only_regular(scheme, signature):
-        piece = whole_piece(scheme, signature)
-        return None if piece is None or piece.patch is not None else piece
-
-    scheme, signatures = classes(surface_named("cube"))
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)
-    element_of.cache_clear()
-    try:
-        with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
-            sampled_polynomials(element_of(scheme, signatures[0]), np.array([[0.0, 1e-30]]), {})
-    finally:
-        element_of.cache_clear()
+    assert len(together) < alone

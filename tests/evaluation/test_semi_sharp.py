@@ -1,17 +1,15 @@
 """Semi-sharp creases and corners, the smooth triangle rule, holes, and the boundary rule `none`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from evaluation.common import both_sides, evaluate_from
 from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import Topology
-from mitsuba_subdivision.mesh.signature import signature_at
 from mitsuba_subdivision.schemes import CatmullClark
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, upper_half, with_bumps
@@ -25,8 +23,12 @@ LADDER = (0.3, 0.5, 1, 1.7, 2.5, 4)
 
 TOP = ((4, 5), (5, 7), (7, 6), (6, 4))
 BALLS = {"catmull_clark": cube(), "loop": ControlCage(*octahedron())}
-# Segments per edge of a tessellation.
-RATE = 8
+
+
+def ring(*sharpness, **options):
+    """A cube with creases around its top, of one sharpness or of one each."""
+    each = zip(TOP, sharpness * 4 if len(sharpness) == 1 else sharpness, strict=True)
+    return tagged(cube(), creases=[(a, b, s) for (a, b), s in each], **options)
 
 
 def sharp_ball(scheme, sharpness, spread, method, **options):
@@ -40,16 +42,10 @@ def sharp_ball(scheme, sharpness, spread, method, **options):
 
 
 CAGES = {
-    **{f"cube, ring of {s}": ("catmull_clark", tagged(cube(), creases=[(a, b, s) for a, b in TOP])) for s in LADDER},
-    "cube, one sharpness after the other": (
-        "catmull_clark",
-        tagged(cube(), creases=[(a, b, s) for (a, b), s in zip(TOP, (0.4, 1.3, 2.2, 3.1), strict=True)]),
-    ),
+    **{f"cube, ring of {s}": ("catmull_clark", ring(s)) for s in LADDER},
+    "cube, one sharpness after the other": ("catmull_clark", ring(0.4, 1.3, 2.2, 3.1)),
     "sharp vertices": ("catmull_clark", tagged(cube(), corners=[(0, 0.7), (1, 1.0), (3, 2.4)])),
-    "sharp vertex on a crease": (
-        "catmull_clark",
-        tagged(cube(), creases=[(a, b, 10) for a, b in TOP], corners=[(4, 1.6)]),
-    ),
+    "sharp vertex on a crease": ("catmull_clark", ring(10, corners=[(4, 1.6)])),
     "sharp vertex on a border": ("catmull_clark", sheet(3, 3, corners=[(1, 1.4), (5, 0.6)])),
     "along a border and from it": ("catmull_clark", sheet(3, 3, creases=[(1, 2, 0.7), (2, 3, 2.5), (2, 6, 1.5)])),
     "crease into a border": ("catmull_clark", sheet(3, 3, creases=[(1, 5, 1.5), (5, 9, 0.5)])),
@@ -72,12 +68,9 @@ for kind, sharpness in {
     CAGES[kind] = ("catmull_clark", spokes(extraordinary(5, closed=False), 5, sharpness))
     CAGES[f"loop {kind}"] = ("loop", spokes(upper_half(extraordinary_triangles(5)), 5, sharpness))
 for name, (scheme, cage) in list(CAGES.items()):
-    if len(cage.tags.creases(cage.topology)) > 1 and "ring of" not in name:
-        creases = cage.tags.creases(cage.topology)
-        CAGES[f"chaikin {name}"] = (
-            scheme,
-            tagged(cage, creases=creases, corners=cage.tags.corners(), crease_method="chaikin"),
-        )
+    creases, corners = cage.tags.creases(cage.topology), cage.tags.corners()
+    if len(creases) > 1 and "ring of" not in name:
+        CAGES[f"chaikin {name}"] = scheme, tagged(cage, creases=creases, corners=corners, crease_method="chaikin")
 
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
 
@@ -111,34 +104,14 @@ def test_neighbours_agree_along_edges(scheme, cage, np_rng):
     t = cage.topology
     whole = (cage.face_sizes == surface.scheme.domain.corner_count)[t.face]
     half_edge = np_rng.choice(np.flatnonzero((t.twin >= 0) & whole & whole[t.twin]), 60)
-    along = np_rng.random(60)
-    sides = []
-    for side, u in ((half_edge, along), (t.twin[half_edge], 1 - along)):
-        face = t.face[side]
-        sides.append(surface.evaluate(face, np.stack([u, np.zeros(60)], axis=1), side - t.face_offsets[face]))
-    assert np.abs(sides[0].p - sides[1].p).max() <= POSITION * 4
+    one, other = both_sides(surface, half_edge, np_rng.random(60))
+    assert np.abs(one.p - other.p).max() <= POSITION * 4
     smooth = cage.tags.edges[half_edge] < 10
-    assert angle(sides[0].n[smooth], sides[1].n[smooth]).max() <= NORMAL
-
-
-@EVERY_CAGE
-def test_patches_of_a_class_have_one_signature_and_others_another(scheme, cage):
-    table = LimitSurface(cage, scheme).patches
-    kind, corners = table.scheme.element, table.scheme.domain.corner_count
-    seen = set()
-    for group in table.classes:
-        found = {
-            signature_at(table.topology, half_edge, kind) for half_edge in table.half_edge_of_corner[group.corners]
-        }
-        assert found == {group.signature}
-        turned = {group.signature.rotated(k) for k in range(corners if len(group.signature.fans) == corners else 1)}
-        assert not turned & seen
-        seen |= turned
+    assert angle(one.n[smooth], other.n[smooth]).max() <= NORMAL
 
 
 def test_sharpness_10_is_infinite_and_9_nearly():
-    cages = [with_bumps(tagged(cube(), creases=[(a, b, s) for a, b in TOP])) for s in (10, 9, 0)]
-    infinite, nearly, smooth = (LimitSurface(cage).tessellate(4).positions for cage in cages)
+    infinite, nearly, smooth = (LimitSurface(with_bumps(ring(s))).tessellate(4).positions for s in (10, 9, 0))
     assert np.abs(smooth.max(axis=0) - infinite.max(axis=0)).max() > 0.05
     # The crease of 9 follows the other to half a thousandth of an edge.
     distance = np.linalg.norm(infinite[:, None] - nearly[None], axis=2).min(axis=1)
@@ -149,30 +122,20 @@ def test_sharpness_10_is_infinite_and_9_nearly():
 def test_a_vertex_of_sharpness_10_stays_and_one_of_9_nearly(scheme):
     for sharpness, stays in ((10, True), (9, False)):
         surface = LimitSurface(tagged(BALLS[scheme], corners=[(0, sharpness)]), scheme)
-        half_edge = int(surface.cage.topology.vertex_half_edge[0])
-        face = surface.cage.topology.face[half_edge]
-        corner = half_edge - int(surface.cage.topology.face_offsets[face])
-        moved = np.abs(surface.evaluate(face, [[0.0, 0.0]], corner).p[0] - surface.cage.positions[0]).max()
+        found = evaluate_from(surface, surface.cage.topology.vertex_half_edge[:1], [[0.0, 0.0]])
+        moved = np.abs(found.p[0] - surface.cage.positions[0]).max()
         # A cusp draws near its tip more slowly than by halves.
         assert (moved <= POSITION) if stays else (1e-5 < moved < 2e-2)
 
 
 def test_greater_sharpness_pulls_further():
-    heights = [
-        LimitSurface(tagged(cube(), creases=[(a, b, s) for a, b in TOP])).tessellate(8).positions[:, 2].mean()
-        for s in (0, *LADDER)
-    ]
+    heights = [LimitSurface(ring(s)).tessellate(8).positions[:, 2].mean() for s in (0, *LADDER)]
     assert (np.diff(heights) > 0).all()
 
 
 @pytest.mark.core
 def test_smooth_triangles_are_those_of_the_rules_and_differ():
-    octahedron = ControlCage(
-        [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],
-        [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [1, 0, 5], [2, 1, 5], [3, 2, 5], [0, 3, 5]],
-        triangle_rule="smooth",
-    )
-    cage = with_bumps(octahedron)
+    cage = with_bumps(tagged(BALLS["loop"], triangle_rule="smooth"))
     surface, slow = LimitSurface(cage), slow_mesh("catmull_clark", cage)
     for _ in range(3):
         surface, slow = refined(surface), slow.refined()
@@ -183,44 +146,49 @@ def test_smooth_triangles_are_those_of_the_rules_and_differ():
 
 
 def test_rules_that_change_nothing_keep_the_scheme():
-    assert (
-        LimitSurface(tagged(cube(), triangle_rule="smooth", crease_method="chaikin")).scheme
-        is LimitSurface(cube()).scheme
-    )
+    unchanged = LimitSurface(tagged(cube(), triangle_rule="smooth", crease_method="chaikin"))
+    assert unchanged.scheme is LimitSurface(cube()).scheme
 
 
 def test_chaikin_mixes_what_uniform_keeps_apart():
-    creases = [(4, 5, 0.5), (5, 7, 3.5)]
-    uniform, chaikin = (
-        LimitSurface(tagged(cube(), creases=creases, crease_method=method)).tessellate(4).positions
-        for method in ("uniform", "chaikin")
-    )
+    cages = (tagged(cube(), creases=[(4, 5, 0.5), (5, 7, 3.5)], crease_method=m) for m in ("uniform", "chaikin"))
+    uniform, chaikin = (LimitSurface(cage).tessellate(4).positions for cage in cages)
     assert np.abs(uniform - chaikin).max() > 1e-3
 
 
-def test_a_scheme_without_rules_for_sharpness_refuses_it():
-    with pytest.raises(SchemeError, match="the scheme doo_sabin has no rules for creases and corners"):
-        LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), "doo_sabin")
+class Plain(CatmullClark):
+    name, crease_method = "plain", None
 
-    class Plain(CatmullClark):
-        name, crease_method = "plain", None
 
-    with pytest.raises(SchemeError, match="the scheme plain has no rules for semi-sharp creases and corners"):
-        LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), Plain())
+@pytest.mark.parametrize(
+    ("scheme", "sharpness", "message"),
+    [
+        ("doo_sabin", 10, "the scheme doo_sabin has no rules for creases and corners"),
+        ("doo_sabin", 2.5, "the scheme doo_sabin has no rules for creases and corners"),
+        (Plain(), 2.5, "the scheme plain has no rules for semi-sharp creases and corners"),
+    ],
+)
+def test_a_scheme_without_rules_for_sharpness_refuses_it(scheme, sharpness, message):
+    with pytest.raises(SchemeError, match=message):
+        LimitSurface(tagged(cube(), creases=[(0, 1, sharpness)]), scheme)
+
+
+def assert_part(found, whole, faces):
+    """That a tessellation is that of some faces of another."""
+    assert set(found.element) == faces
+    kept = whole.triangles[np.isin(whole.element, list(faces))]
+    # Another patch may be the one that evaluates what they share with others.
+    assert np.abs(found.positions[found.triangles] - whole.positions[kept]).max() <= POSITION
+    assert np.abs(found.normals[found.triangles] - whole.normals[kept]).max() <= POSITION
+    # No vertex is left that no triangle uses.
+    assert len(np.unique(found.triangles)) == len(found.positions)
 
 
 @pytest.mark.core
 def test_holes_shape_the_surface_but_are_not_part_of_it():
     cage = with_bumps(sheet(3, 3))
-    whole = LimitSurface(cage).tessellate(3)
     pierced = LimitSurface(tagged(cage, holes=[4, 0])).tessellate(3)
-    assert set(pierced.element) == set(range(9)) - {0, 4}
-    kept = ~np.isin(whole.element, [0, 4])
-    # Another patch may be the one that evaluates what they share.
-    assert np.abs(pierced.positions[pierced.triangles] - whole.positions[whole.triangles[kept]]).max() <= POSITION
-    assert np.abs(pierced.normals[pierced.triangles] - whole.normals[whole.triangles[kept]]).max() <= POSITION
-    # No vertex is left that no triangle uses.
-    assert len(np.unique(pierced.triangles)) == len(pierced.positions)
+    assert_part(pierced, LimitSurface(cage).tessellate(3), set(range(9)) - {0, 4})
 
 
 def test_holes_are_no_elements():
@@ -233,27 +201,18 @@ def test_holes_are_no_elements():
 def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
     cage = with_bumps(sheet(4, 4))
     inner = LimitSurface(tagged(cage, boundary="none")).tessellate(2)
-    assert set(inner.element) == {5, 6, 9, 10}
-    whole = LimitSurface(cage).tessellate(2)
-    kept = np.isin(whole.element, [5, 6, 9, 10])
-    assert np.abs(inner.positions[inner.triangles] - whole.positions[whole.triangles[kept]]).max() <= POSITION
+    assert_part(inner, LimitSurface(cage).tessellate(2), {5, 6, 9, 10})
     with pytest.raises(SchemeError, match='boundary "none" leaves no face'):
         LimitSurface(sheet(2, 2, boundary="none"))
 
 
 def test_the_pieces_of_a_long_lasting_crease_still_evaluate(np_rng):
     """Sharpness 9.5 takes ten refinements to go; each leaves the pieces along the crease to the next."""
-    surface = LimitSurface(with_bumps(tagged(cube(), creases=[(a, b, 9.5) for a, b in TOP])))
-    finer = surface
-    uv = np_rng.random((50, 2)) * 2.0**-4
+    surface, uv = LimitSurface(with_bumps(ring(9.5))), np_rng.random((50, 2)) * 2.0**-4
     here = surface.evaluate(1, uv)
-    element = 4
-    for _ in range(4):
-        finer = refined(finer)
-        uv = 2 * uv
-        there = finer.evaluate(element, uv)
-        assert np.abs(here.p - there.p).max() <= POSITION * 4
-        element *= 4
+    for level in range(1, 5):
+        surface = refined(surface)
+        assert np.abs(here.p - surface.evaluate(4**level, 2**level * uv).p).max() <= POSITION * 4
 
 
 def around(mesh, vertex):
@@ -272,14 +231,6 @@ def around(mesh, vertex):
         mesh.method,
     )
     return kept, number[vertex]
-
-
-def slow_limit(mesh, vertex):
-    """Where a vertex comes to lie after many refinements of what is around it."""
-    for _ in range(LASTING):
-        mesh, vertex = around(mesh, vertex)
-        mesh = mesh.refined()
-    return mesh.points[vertex]
 
 
 # Refinements, after which a vertex is nearer to its limit than this: ten with a crease, then each divides the distance,
@@ -303,13 +254,11 @@ def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng)
             face, mesh = face * int(sizes[0]) + corner, mesh.refined()
         for corner in corners[::-1]:
             uv = surface.scheme.domain.rotation(corner)(uv / 2)
-        expected = slow_limit(mesh, mesh.faces[face][0])
-        assert np.abs(surface.evaluate(element, uv).p[0] - expected).max() <= CLOSE
-
-
-def grid_of(scheme, rate=RATE):
-    uv = np.stack(np.meshgrid(np.arange(rate + 1), np.arange(rate + 1)), axis=-1).reshape(-1, 2) / rate
-    return uv[scheme.domain.inside(uv) >= 0]
+        vertex = mesh.faces[face][0]
+        for _ in range(LASTING):
+            mesh, vertex = around(mesh, vertex)
+            mesh = mesh.refined()
+        assert np.abs(surface.evaluate(element, uv).p[0] - mesh.points[vertex]).max() <= CLOSE
 
 
 class RolledFaces(CatmullClark):
@@ -347,16 +296,13 @@ class LastingCreases(CatmullClark):
         t = refinement.topology
         if t.semi_sharpness is None:
             return refinement
-        edges, edges_refined = (
-            np.where(sharp > 0, 2.5, 0) for sharp in (t.semi_sharpness.edges, t.semi_sharpness.edges_refined)
-        )
-        semi = replace(t.semi_sharpness, edges=edges, edges_refined=edges_refined)
+        sharpness = {each: getattr(t.semi_sharpness, each) for each in ("edges", "edges_refined")}
+        semi = replace(t.semi_sharpness, **{each: np.where(s > 0, 2.5, 0) for each, s in sharpness.items()})
         return refinement._replace(topology=t.with_rules(t.rules, semi))
 
 
-def test_a_scheme_that_keeps_creases_semi_sharp_is_refused():
+@pytest.mark.parametrize("use", [lambda s: s.evaluate(np.arange(6), np.zeros((6, 2))), lambda s: s.tessellate(2)])
+def test_a_scheme_that_keeps_creases_semi_sharp_is_refused(use):
     surface = LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), LastingCreases())
     with pytest.raises(SchemeError, match="18 refinements leave something of a face semi-sharp"):
-        surface.evaluate(np.arange(6), np.zeros((6, 2)))
-    with pytest.raises(SchemeError, match="18 refinements leave something of a face semi-sharp"):
-        surface.tessellate(2)
+        use(surface)

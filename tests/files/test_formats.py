@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageError, ControlCage, LimitSurface
+from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface
+from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
 from mitsuba_subdivision.files import triangle_writer
 from mitsuba_subdivision.files.formats import FORMATS, Format, function_named
 
@@ -42,14 +43,15 @@ def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
 
 
 def modules_after(code):
-    """Modules of cages and of files that are imported after some code has run in a new process."""
-    packages = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files")
+    """Modules of cages, of files and of their formats that are imported after some code has run in a new process."""
+    packages = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files", "pxr", "plyfile")
     code = f"import sys; {code}; print(*(name for name in sys.modules if name.startswith({packages})))"
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
 
 
-def test_neither_cages_nor_files_are_imported_with_the_package():
+def test_neither_cages_nor_files_are_imported_with_the_package_and_formats_only_where_they_are_used():
     assert modules_after("import mitsuba_subdivision") == []
+    assert not {"pxr", "plyfile"} & set(modules_after("import mitsuba_subdivision.surface"))
 
 
 def test_readers_are_imported_when_a_file_is_read(tmp_path):
@@ -71,6 +73,85 @@ def test_folders_and_circles_of_links_are_named(suffix, tmp_path):
         link.symlink_to(link)
         with pytest.raises(CageError, match="is a link that leads back to itself"):
             ControlCage.from_file(link)
+
+
+def skip_without_package(suffix):
+    if suffix != ".obj":
+        pytest.importorskip("plyfile" if suffix == ".ply" else "pxr")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_missing_files_and_folders_are_os_errors(suffix, tmp_path):
+    skip_without_package(suffix)
+    with pytest.raises(FileNotFoundError, match=rf"missing\{suffix}"):
+        ControlCage.from_file(tmp_path / f"missing{suffix}")
+    if FORMATS[suffix].write:
+        with pytest.raises(FileNotFoundError, match=rf'cage\{suffix}": there is no folder ".*missing"'):
+            cube().save(tmp_path / "missing" / f"cage{suffix}")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("suffix", "step"), [(".ply", 11), (".usda", 101), (".usdc", 101)])
+def test_every_cut_of_a_file_names_the_file(suffix, step, tmp_path):
+    skip_without_package(suffix)
+    cube().save(tmp_path / f"cube{suffix}")
+    content = (tmp_path / f"cube{suffix}").read_bytes()
+    kind = "PLY" if suffix == ".ply" else "USD"
+    # Without its last two bytes, a text file of USD is complete.
+    for length in range(0, len(content) - 2 * (kind == "USD"), step):
+        path = tmp_path / f"{length}{suffix}"
+        path.write_bytes(content[:length])
+        with pytest.raises(CageError, match=rf'"{path}".*; expected a {kind} file'):
+            ControlCage.from_file(path)
+
+
+@pytest.mark.parametrize(("suffix", "module", "name"), [(".ply", "plyfile", "plyfile"), (".usda", "pxr", "usd-core")])
+def test_a_missing_package_is_named(suffix, module, name, tmp_path, monkeypatch):
+    skip_without_package(suffix)
+    path = tmp_path / f"cube{suffix}"
+    cube().save(path)
+    monkeypatch.setitem(sys.modules, module, None)
+    message = rf'the package {name}, .* pip install "mitsuba-subdivision\[{suffix[1:4]}\]"'
+    for act in (ControlCage.from_file, *([cube().save] if module == "pxr" else [])):
+        with pytest.raises(CageError, match=message):
+            act(path)
+
+
+ONE, TWO = (Attribute(np.zeros((4, size))) for size in (1, 2))
+TAGS = {"creases": [(0, 1, 2)], "corners": [(0, 2)], "holes": [1]}
+RULES = {"boundary": "edge_only", "triangle_rule": "smooth", "scheme": "loop"}
+OF_CORNERS = {"texcoords": Attribute(np.zeros((12, 2)), "face_varying")}
+VARYING = {"a b": ONE, "kept": ONE, "v": Attribute(np.zeros((4, 1)), "varying")}
+# What a cage has, what of it has no place in a file, and which attributes are read back.
+NO_PLACE = {
+    ".obj": (
+        {"texcoords": TWO, "attributes": {"colour": TWO, "weight": TWO}, "scheme": "loop"},
+        'texcoords, attribute "colour", attribute "weight", scheme',
+        [],
+    ),
+    ".ply": (
+        {**TAGS, **RULES, **OF_CORNERS, "attributes": VARYING},
+        'creases, corners, holes, boundary, triangle_rule, scheme, texcoords, attribute "a b", attribute "v"',
+        ["kept"],
+    ),
+    ".usda": (
+        {"crease_method": "chaikin", "scheme": "doo_sabin", "attributes": {"a b": ONE}},
+        'crease_method "chaikin", scheme "doo_sabin", attribute "a b"',
+        [],
+    ),
+}
+
+
+@pytest.mark.parametrize("suffix", NO_PLACE)
+def test_a_warning_names_what_has_no_place(suffix, tmp_path):
+    skip_without_package(suffix)
+    given, lost, kept = NO_PLACE[suffix]
+    cage = ControlCage(tetrahedron().positions, tetrahedron().face_vertices.reshape(-1, 3), **given)
+    message = rf'cage\{suffix}": {suffix} files have no place for {lost} of the cage; written without'
+    with pytest.warns(CageWarning, match=message):
+        cage.save(tmp_path / f"cage{suffix}")
+    again = ControlCage.from_file(tmp_path / f"cage{suffix}")
+    assert (again.texcoords, list(again.attributes)) == (None, kept)
 
 
 OTHER_FILES = {

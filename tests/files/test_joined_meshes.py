@@ -36,9 +36,7 @@ HOUSE = """def Mesh "house" {
     float[] creaseSharpnesses = [10]
     int[] cornerIndices = [4]
     float[] cornerSharpnesses = [10]
-    texCoord2f[] primvars:UVMap = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 0), (1, 0), (1, 1)] (
-        interpolation = "faceVarying"
-    )
+    texCoord2f[] primvars:UVMap = [(0,0), (1,0), (1,1), (0,1), (0,0), (1,0), (1,1)] (interpolation = "faceVarying")
     float[] primvars:w = [5, 6, 7, 8, 9] (interpolation = "vertex")
     <more>
 }
@@ -59,8 +57,7 @@ def read(tmp_path):
 
 def test_the_surface_of_joined_meshes_is_that_of_each(read):
     whole = LimitSurface(read(SHEET, HOUSE))
-    assert whole.cage.face_count == 4
-    assert whole.cage.holes.tolist() == [1]
+    assert (whole.cage.face_count, whole.cage.holes.tolist()) == (4, [1])
     for name, first in (("/sheet", 0), ("/house", 2)):
         alone = LimitSurface(read(SHEET, HOUSE, prim=name))
         for face in (0, 1):
@@ -70,24 +67,16 @@ def test_the_surface_of_joined_meshes_is_that_of_each(read):
             found, expected = (each.evaluate(element=at, uv=uv) for each, at in ((whole, first + face), (alone, face)))
             np.testing.assert_array_equal(found.p, expected.p)
             for data in ("texcoords", "w"):
-                found, expected = (
-                    whole.evaluate_attribute(data, first + face, uv),
-                    alone.evaluate_attribute(data, face, uv),
-                )
+                found = whole.evaluate_attribute(data, first + face, uv)
                 # Alone they may be cut apart at every edge, and are linear then.
-                np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
+                np.testing.assert_allclose(found, alone.evaluate_attribute(data, face, uv), rtol=0, atol=ROUNDING)
 
 
-def test_one_mesh_is_joined_to_none(read):
+def test_one_mesh_is_joined_to_none_and_a_mesh_among_others_is_still_an_error(read):
     cage = read(SHEET)
-    assert cage.source.name.endswith("prim /sheet")
-    assert cage.face_count == 2
-
-
-def test_a_mesh_among_others_is_still_an_error(read):
-    with pytest.raises(
-        CageError, match=r'there are 2 meshes; expected prim to name one of /sheet, /house, or "\*" for'
-    ):
+    assert (cage.source.name.partition("prim ")[2], cage.face_count) == ("/sheet", 2)
+    message = r'there are 2 meshes; expected prim to name one of /sheet, /house, or "\*" for'
+    with pytest.raises(CageError, match=message):
         read(SHEET, HOUSE, prim=None)
 
 
@@ -96,8 +85,7 @@ def test_data_that_not_all_meshes_have_is_left_out_with_a_warning(read):
     message = 'cage.usda": texture coordinates, "w", "UVs", "v" left out; expected them in all 2 meshes, with the same'
     with pytest.warns(CageWarning, match=message):
         cage = read(SHEET, other)
-    assert cage.texcoords is None
-    assert cage.attributes == {}
+    assert (cage.texcoords, cage.attributes) == (None, {})
     with pytest.warns(CageWarning, match='"w" left out'):
         assert read(SHEET, HOUSE.replace('"vertex"', '"varying"')).texcoords is not None
 
@@ -138,77 +126,56 @@ def test_what_is_not_to_be_smoothed_is_left_out_with_a_warning(read):
         assert read(SHEET, flat, scheme="catmull_clark").face_count == 4
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        # Numbers that are another mesh's.
-        ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at position 6; expected 0 to 5"),
-        (
-            "holeIndices = [1]",
-            "holeIndices = [2]",
-            "prim /sheet: holes have the index 2 at position 0; expected 0 to 1",
-        ),
-        (
-            "[0, 1, 2, 3, 4, 5]",
-            "[0, 1, 2, 3, 4]",
-            'sheet: attribute "w" has 5 values or indices; expected 6, one per v',
-        ),
-        (
-            "3, 0, 1, 2, 3]",
-            "3, 0, 1, 2]",
-            'sheet: attribute "texcoords" has 7 values or indices; expected 8, one per f',
-        ),
-        (
-            "3, 0, 1, 2, 3]",
-            "3, 0, 1, 2, 4]",
-            'prim /sheet: attribute "texcoords" has the index 4 at position 7; expected 0 to 3',
-        ),
-        # Mistakes that only the whole cage shows.
-        (
-            "cornerSharpnesses = [3]",
-            "cornerSharpnesses = [-1]",
-            "prim /sheet: value 0 of cornerSharpnesses has sharpness -1; expected 0 for smooth",
-        ),
-        ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),
-        ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 of /sheet more than once"),
-        ("1, 2, 5, 4]", "4, 5, 2, 1]", "face 0 and face 1 of /sheet both run along edge .1, 4. of /sheet in this dir"),
-    ],
-)
+ERRORS = [
+    # Numbers that are another mesh's.
+    ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at position 6; expected 0 to 5"),
+    ("holeIndices = [1]", "holeIndices = [2]", "prim /sheet: holes have the index 2 at position 0; expected 0 to 1"),
+    ("3, 4, 5]", "3, 4]", 'sheet: attribute "w" has 5 values or indices; expected 6, one per v'),
+    ("0, 1, 2, 3]", "0, 1, 2]", 'sheet: attribute "texcoords" has 7 values or indices; expected 8, one per f'),
+    ("0, 1, 2, 3]", "0, 1, 2, 4]", 'prim /sheet: attribute "texcoords" has the index 4 at position 7; expected 0 to 3'),
+    # Mistakes that only the whole cage shows.
+    (
+        "cornerSharpnesses = [3]",
+        "cornerSharpnesses = [-1]",
+        "prim /sheet: value 0 of cornerSharpnesses has sharpness -1; expected 0 for smooth",
+    ),
+    ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),
+    ("1, 2, 5, 4]", "1, 2, 5, 1]", "prim /sheet: face 1 has vertex 1 of /sheet more than once"),
+    ("1, 2, 5, 4]", "4, 5, 2, 1]", "face 0 and face 1 of /sheet both run along edge .1, 4. of /sheet in this dir"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), ERRORS)
 def test_errors_tell_the_mesh_and_its_own_numbers(read, old, new, message):
     assert old in SHEET
     with pytest.raises(CageError, match=message):
         read(HOUSE, SHEET.replace(old, new, 1), strict=True)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            "creaseIndices = [1, 4]",
-            "creaseIndices = [1, 7]",
-            r"prim /sheet: crease at \(1, 7\) is ignored; expected vertices from 0 to 5 \(1 such crease\)",
-        ),
-        (
-            "creaseIndices = [1, 4]",
-            "creaseIndices = [0, 4]",
-            r"prim /sheet: crease along edge \(0, 4\) of /sheet, which is no edge of a face, is ignored",
-        ),
-        (
-            "cornerIndices = [5]",
-            "cornerIndices = [6]",
-            r"prim /sheet: corner at \(6\) is ignored; expected vertices from 0 to 5 \(1 such corner\)",
-        ),
-    ],
-)
+IGNORED_TAGS = [
+    (
+        "creaseIndices = [1, 4]",
+        "[1, 7]",
+        r"crease at \(1, 7\) is ignored; expected vertices from 0 to 5 \(1 such crease\)",
+    ),
+    (
+        "creaseIndices = [1, 4]",
+        "[0, 4]",
+        r"crease along edge \(0, 4\) of /sheet, which is no edge of a face, is ignored",
+    ),
+    ("cornerIndices = [5]", "[6]", r"corner at \(6\) is ignored; expected vertices from 0 to 5 \(1 such corner\)"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), IGNORED_TAGS)
 def test_tags_of_what_their_own_mesh_lacks_are_ignored_and_told(read, old, new, message):
     """A number that is a vertex of another mesh, too."""
-    whole = read(SHEET, HOUSE).tags
-    with pytest.warns(CageWarning, match=message):
-        tags = read(SHEET.replace(old, new, 1), HOUSE).tags
-    kept, cut = (tags.vertices, tags.edges) if "crease" in old else (tags.edges, tags.vertices)
-    expected = (whole.vertices, whole.edges) if "crease" in old else (whole.edges, whole.vertices)
-    np.testing.assert_array_equal(kept, expected[0])
-    assert np.count_nonzero(cut) < np.count_nonzero(expected[1])
+    whole, is_crease = read(SHEET, HOUSE).tags, "crease" in old
+    with pytest.warns(CageWarning, match=f"prim /sheet: {message}"):
+        tags = read(SHEET.replace(old, old.partition("[")[0] + new, 1), HOUSE).tags
+    kept, cut = ("vertices", "edges") if is_crease else ("edges", "vertices")
+    np.testing.assert_array_equal(getattr(tags, kept), getattr(whole, kept))
+    assert np.count_nonzero(getattr(tags, cut)) < np.count_nonzero(getattr(whole, cut))
 
 
 def test_faces_of_several_meshes_are_named(read):

@@ -65,25 +65,19 @@ def read_quietly(path):
         return read_obj(path)
 
 
-def arrays(path):
-    found = read_quietly(path)
-    return found.positions, found.face_sizes, found.face_vertices, found.source
-
-
 def assert_reads_as(content, path):
-    positions, sizes, vertices, source = arrays(path)
-    expected = slow_read(content)
-    np.testing.assert_array_equal(positions, expected[0])
-    np.testing.assert_array_equal(sizes, expected[1])
-    np.testing.assert_array_equal(vertices, expected[2])
-    np.testing.assert_array_equal(source.vertex_lines, expected[3])
-    np.testing.assert_array_equal(source.face_lines, expected[4])
-    texcoords = read_quietly(path).texcoords
-    if not expected[5] or None in expected[6]:
-        assert texcoords is None
+    found = read_quietly(path)
+    positions, sizes, vertices, vertex_lines, face_lines, values, indices = slow_read(content)
+    np.testing.assert_array_equal(found.positions, positions)
+    np.testing.assert_array_equal(found.face_sizes, sizes)
+    np.testing.assert_array_equal(found.face_vertices, vertices)
+    np.testing.assert_array_equal(found.source.vertex_lines, vertex_lines)
+    np.testing.assert_array_equal(found.source.face_lines, face_lines)
+    if not values or None in indices:
+        assert found.texcoords is None
     else:
-        np.testing.assert_array_equal(texcoords.values, expected[5])
-        np.testing.assert_array_equal(texcoords.indices, expected[6])
+        np.testing.assert_array_equal(found.texcoords.values, values)
+        np.testing.assert_array_equal(found.texcoords.indices, indices)
 
 
 @pytest.mark.parametrize("few_breaks", [0, 1000])
@@ -117,9 +111,8 @@ def obj_files(draw):
     """Well-formed OBJ text with vertices, faces and noise in any order."""
     space = st.sampled_from([b" ", b"  ", b"\t", b" \\\n ", b"\\\r\n"])
     number = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: repr(x).encode())
-    noise = st.sampled_from(
-        [b"", b"  ", b"# v 1 2", b"vn 0 0 1", b"g a b", b"usemtl \xff", b"s 1", b"vp 1", b"fo 1", b"#\\", b"\x0c"]
-    )
+    noises = [b"", b"  ", b"# v 1 2", b"vn 0 0 1", b"g a b", b"usemtl \xff", b"s 1", b"vp 1", b"fo 1", b"#\\", b"\x0c"]
+    noise = st.sampled_from(noises)
     lines, vertex_count, texcoord_count = [], draw(st.integers(1, 5)), draw(st.integers(0, 3))
     tails = [b"", b"//1"] if draw(st.booleans()) or not texcoord_count else []
     tails += [b"/%d", b"/%d/7"] if texcoord_count else []
@@ -172,111 +165,92 @@ def test_a_million_digits_are_read_as_fast_as_any_text(obj_file, statement, end)
     assert len(str(caught.value)) < 600
 
 
-def test_old_mac_line_ends(obj_file):
-    positions, _, vertices, source = arrays(obj_file(b"# old\rv 0 0 0\rv 1 0 0\rv 0 1 0\rf 1 2 3\r"))
-    np.testing.assert_array_equal(positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    np.testing.assert_array_equal(vertices, [0, 1, 2])
-    np.testing.assert_array_equal(source.face_lines, [5])
+def test_old_mac_line_ends_and_faces_before_their_vertices(obj_file):
+    found = read_quietly(obj_file(b"# old\rf 1 2 3\rv 0 0 0\rv 1 0 0\rv 0 1 0\rf 3 2 1\r"))
+    np.testing.assert_array_equal(found.positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(found.face_vertices, [0, 1, 2, 2, 1, 0])
+    np.testing.assert_array_equal(found.source.face_lines, [2, 6])
 
 
-def test_faces_may_come_before_their_vertices(obj_file):
-    np.testing.assert_array_equal(arrays(obj_file("f 1 2 3\n" + TRIANGLE))[2], [0, 1, 2])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", [': there are no vertices ("v" statements)', "expected at least one"]),
-        ("# nothing\n", ["there are no vertices", "expected at least one"]),
-        ("f 1 2 3\n", ["there are no vertices", "expected at least one"]),
-        (TRIANGLE, [': there are no faces ("f" statements)', "expected at least one"]),
-        (TRIANGLE + "f\n", ["line 4: 0 face corners", "expected at least 3"]),
-        (TRIANGLE + "\nf 1 2\nf 1 2 3\n", ["line 5: 2 face corners", "expected at least 3"]),
-        ("v 0 0\nf 1 2 3\n", ["line 1: 2 coordinates", "expected at least 3"]),
-        ("v\n" + TRIANGLE + "f 1 2 3\n", ["line 1: 0 coordinates", "expected at least 3"]),
-        ("v 0 0 0\nv 0 1,5 0\nf 1 2 3\n", ['line 2: malformed number "1,5"', "expected a decimal number"]),
-        ("v 0 0 0\nv 0 1-5 0\nf 1 2 3\n", ['line 2: malformed number "1-5"', "expected a decimal number"]),
-        ("v 0 0 0 \\\n 1 0x1\nf 1 2 3\n", ['line 2: malformed number "0x1"', "expected a decimal number"]),
-        ("v 0 0 0 white\nf 1 2 3\n", ['line 1: malformed number "white"', "expected a decimal number"]),
-        ("v 0 0 1_0\nf 1 2 3\n", ['line 1: malformed number "1_0"', "expected a decimal number"]),
-        (
-            "v 0 0 " + "x" * 999 + "\nf 1 2 3\n",
-            [f'line 1: malformed number "{"x" * 80}..."', "expected a decimal number"],
-        ),
-        (b"v 0 0 1\xe2\x80\xa8\nf 1 2 3\n", [r'line 1: malformed number "1\xe2\x80\xa8"', "expected a decimal number"]),
-        (b"v 0 0 \xff\nf 1 2 3\n", [r'line 1: malformed number "\xff"', "expected a decimal number"]),
-        *(
-            (
-                f"{TRIANGLE}f 1 2 3\nf 1 {corner} 3\n",
-                [f'line 5: malformed number "{corner}"', "expected integers as v, v/vt, v//vn or v/vt/vn"],
-            )
-            for corner in (
-                "x",
-                "2.0",
-                "2/",
-                "2//",
-                "/2",
-                "//2",
-                "2/1/",
-                "2/1/1/1",
-                "2///1",
-                "1-2",
-                "2/x",
-                "--2",
-                "2/1-1",
-            )
-        ),
-        (TRIANGLE + "f 1 0 3\n", ["line 4: vertex index 0 is out of range", "expected 1 to 3", "has 3 vertices"]),
-        (TRIANGLE + "f 1 2 \\\n 4\n", ["line 5: vertex index 4 is out of range", "expected 1 to 3", "has 3 vertices"]),
-        (TRIANGLE + "f 1 2 99999999999999999999\n", ["line 4: vertex index", "expected 1 to 3"]),
-        (
-            f"{TRIANGLE}f -1 -2 -4\nv 0 0 1\n",
-            ["line 4: vertex index -4 is out of range", "expected -3 to -1", "3 vertices are above"],
-        ),
-        (TRIANGLE + "vt\nf 1 2 3\n", ["line 4: 0 texture coordinates", "expected at least 1"]),
-        (TRIANGLE + "vt 0 o\nf 1 2 3\n", ['line 4: malformed number "o"', "expected a decimal number"]),
-        (
-            TRIANGLE + "vt 0 1\nf 1 2/2 3\n",
-            ["line 5: texture coordinate index 2 is out of range", "expected 1 to 1", "has 1 texture coordinates"],
-        ),
-        (
-            TRIANGLE + "vt 0 1\nf 1/1 2/-2 3//1\nvt 0 1\n",
-            ["line 5: texture coordinate index -2 is out of range", "expected -1 to -1", "are above this line"],
-        ),
-        (TRIANGLE + "vt 0 1\nf 1/0 2/1 3/1\n", ["line 5: texture coordinate index 0 is out of range"]),
-        (TRIANGLE + "f 1 2", ["line 4: 2 face corners", "expected at least 3", "the file ends here"]),
-        (TRIANGLE + "f 1 2 3/", ['line 4: malformed number "3/"', "the file ends here"]),
-        ("f 1 2 3\nv 0 0", ["line 2: 2 coordinates", "the file ends here"]),
-        ("f 1 2 3\nv 0 0 1e", ['line 2: malformed number "1e"', "the file ends here"]),
-        (TRIANGLE + "f 1 2 3 \\\n", ["line 4: the file ends in a line continuation", "expected another line"]),
-        (TRIANGLE + "f 1 2 3\\", ["line 4: the file ends in a line continuation", "expected another line"]),
-    ],
+AT_LEAST_3, DECIMAL, FORMS = (
+    "expected at least 3",
+    "expected a decimal number",
+    "expected integers as v, v/vt, v//vn or v/vt/vn",
 )
+NO_CORNERS = ("x", "2.0", "2/", "2//", "/2", "//2", "2/1/", "2/1/1/1", "2///1", "1-2", "2/x", "--2", "2/1-1")
+MALFORMED = [
+    ("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n", ["line 2: vertex 2 has the coordinates (1.0, nan, 0.0)"]),
+    ("", [': there are no vertices ("v" statements)', "expected at least one"]),
+    ("# nothing\n", ["there are no vertices", "expected at least one"]),
+    ("f 1 2 3\n", ["there are no vertices", "expected at least one"]),
+    (TRIANGLE, [': there are no faces ("f" statements)', "expected at least one"]),
+    (TRIANGLE + "f\n", ["line 4: 0 face corners", AT_LEAST_3]),
+    (TRIANGLE + "\nf 1 2\nf 1 2 3\n", ["line 5: 2 face corners", AT_LEAST_3]),
+    ("v 0 0\nf 1 2 3\n", ["line 1: 2 coordinates", AT_LEAST_3]),
+    ("v\n" + TRIANGLE + "f 1 2 3\n", ["line 1: 0 coordinates", AT_LEAST_3]),
+    ("v 0 0 0\nv 0 1,5 0\nf 1 2 3\n", ['line 2: malformed number "1,5"', DECIMAL]),
+    ("v 0 0 0\nv 0 1-5 0\nf 1 2 3\n", ['line 2: malformed number "1-5"', DECIMAL]),
+    ("v 0 0 0 \\\n 1 0x1\nf 1 2 3\n", ['line 2: malformed number "0x1"', DECIMAL]),
+    ("v 0 0 0 white\nf 1 2 3\n", ['line 1: malformed number "white"', DECIMAL]),
+    ("v 0 0 1_0\nf 1 2 3\n", ['line 1: malformed number "1_0"', DECIMAL]),
+    (f"v 0 0 {'x' * 999}\nf 1 2 3\n", [f'line 1: malformed number "{"x" * 80}..."', DECIMAL]),
+    (b"v 0 0 1\xe2\x80\xa8\nf 1 2 3\n", [r'line 1: malformed number "1\xe2\x80\xa8"', DECIMAL]),
+    (b"v 0 0 \xff\nf 1 2 3\n", [r'line 1: malformed number "\xff"', DECIMAL]),
+    *((f"{TRIANGLE}f 1 2 3\nf 1 {each} 3\n", [f'line 5: malformed number "{each}"', FORMS]) for each in NO_CORNERS),
+    (TRIANGLE + "f 1 0 3\n", ["line 4: vertex index 0 is out of range", "expected 1 to 3", "has 3 vertices"]),
+    (TRIANGLE + "f 1 2 \\\n 4\n", ["line 5: vertex index 4 is out of range", "expected 1 to 3", "has 3 vertices"]),
+    (TRIANGLE + "f 1 2 99999999999999999999\n", ["line 4: vertex index", "expected 1 to 3"]),
+    (
+        f"{TRIANGLE}f -1 -2 -4\nv 0 0 1\n",
+        ["line 4: vertex index -4 is out of range", "expected -3 to -1", "3 vertices are above"],
+    ),
+    (TRIANGLE + "vt\nf 1 2 3\n", ["line 4: 0 texture coordinates", "expected at least 1"]),
+    (TRIANGLE + "vt 0 o\nf 1 2 3\n", ['line 4: malformed number "o"', DECIMAL]),
+    (
+        TRIANGLE + "vt 0 1\nf 1 2/2 3\n",
+        ["line 5: texture coordinate index 2 is out of range", "expected 1 to 1", "has 1 texture coordinates"],
+    ),
+    (
+        TRIANGLE + "vt 0 1\nf 1/1 2/-2 3//1\nvt 0 1\n",
+        ["line 5: texture coordinate index -2 is out of range", "expected -1 to -1", "are above this line"],
+    ),
+    (TRIANGLE + "vt 0 1\nf 1/0 2/1 3/1\n", ["line 5: texture coordinate index 0 is out of range"]),
+    (TRIANGLE + "f 1 2", ["line 4: 2 face corners", AT_LEAST_3, "the file ends here"]),
+    (TRIANGLE + "f 1 2 3/", ['line 4: malformed number "3/"', "the file ends here"]),
+    ("f 1 2 3\nv 0 0", ["line 2: 2 coordinates", "the file ends here"]),
+    ("f 1 2 3\nv 0 0 1e", ['line 2: malformed number "1e"', "the file ends here"]),
+    (TRIANGLE + "f 1 2 3 \\\n", ["line 4: the file ends in a line continuation", "expected another line"]),
+    (TRIANGLE + "f 1 2 3\\", ["line 4: the file ends in a line continuation", "expected another line"]),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), MALFORMED)
 def test_malformed_files(text, message, obj_file):
     path = obj_file(text)
     with pytest.raises(CageError, match=".*".join(re.escape(part) for part in [f'"{path}"', *message])):
-        read_obj(path)
+        ControlCage.from_file(path)
 
 
-def test_texture_coordinates_of_some_corners_are_left_out_with_a_warning(obj_file):
-    path = obj_file(TRIANGLE + "v 1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 3/1 2 4//1\n")
-    message = (
-        r'cube\.obj": 1 of 2 faces have corners without texture coordinates, the first in line 7; .* at all corners'
-    )
+COLOURED = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n"
+LEFT_OUT = [
+    (
+        TRIANGLE + "v 1 1 0\nvt 0 0\nf 1/1 2/1 3/1\nf 3/1 2 4//1\n",
+        r'cube\.obj": 1 of 2 faces have corners without texture coordinates, the first in line 7; .* at all corners',
+    ),
+    (
+        TRIANGLE + "f 1/1/1 2/2/2 3/3/3\n",
+        r'no texture coordinates \("vt" statements\); the cage is read without them',
+    ),
+    (COLOURED, "colours of vertices are ignored; expected them as an attribute"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), LEFT_OUT)
+def test_colours_and_texture_coordinates_of_some_corners_are_left_out_with_a_warning(obj_file, text, message):
     with pytest.warns(CageWarning, match=message):
-        assert ControlCage.from_file(path).texcoords is None
-
-
-def test_colours_of_vertices_are_left_out_with_a_warning(obj_file):
-    text = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 1 1 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3 4\n"
-    with pytest.warns(CageWarning, match="colours of vertices are ignored; expected them as an attribute"):
         cage = ControlCage.from_file(obj_file(text))
-    np.testing.assert_array_equal(cage.positions, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-
-
-def test_texture_coordinate_indices_without_texture_coordinates_are_a_warning(obj_file):
-    with pytest.warns(CageWarning, match=r'no texture coordinates \("vt" statements\); the cage is read without them'):
-        assert ControlCage.from_file(obj_file(TRIANGLE + "f 1/1/1 2/2/2 3/3/3\n")).texcoords is None
+    assert cage.texcoords is None
+    np.testing.assert_array_equal(cage.positions[:3], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
 @pytest.mark.core
@@ -298,11 +272,6 @@ def test_cut_is_only_suspected_at_the_end(obj_file):
     assert "ends here" not in str(caught.value)
 
 
-def test_coordinates_that_are_not_finite_name_their_line(obj_file):
-    with pytest.raises(CageError, match=r'cube\.obj", line 2: vertex 2 has the coordinates \(1\.0, nan, 0\.0\)'):
-        ControlCage.from_file(obj_file("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n"))
-
-
 def test_every_cut_of_a_file_reads_or_names_the_file(obj_file):
     cage = torus(3, 3)
     path = obj_file("")
@@ -311,12 +280,12 @@ def test_every_cut_of_a_file_reads_or_names_the_file(obj_file):
     for length in range(0, len(content), 7):
         path.write_bytes(content[:length])
         try:
-            positions, sizes, *_ = arrays(path)
+            found = read_quietly(path)
         except CageError as error:
             assert str(error).startswith(f'"{path}"')  # noqa: PT017
         else:
-            assert len(positions) == 9
-            assert 1 <= len(sizes) <= 9
+            assert len(found.positions) == 9
+            assert 1 <= len(found.face_sizes) <= 9
 
 
 def test_names_of_materials_may_have_a_number_sign(tmp_path):
@@ -329,13 +298,8 @@ def test_names_of_materials_may_have_a_number_sign(tmp_path):
         "usemtl plain # comment",
         "usemtl # none",
     ]
-    (tmp_path / "a.obj").write_text(
-        quads + "".join(f"{each}\nf {2 * i + 1} {2 * i + 3} {2 * i + 4} {2 * i + 2}\n" for i, each in enumerate(uses))
-    )
+    faces = (f"{use}\nf {2 * i + 1} {2 * i + 3} {2 * i + 4} {2 * i + 2}\n" for i, use in enumerate(uses))
+    (tmp_path / "a.obj").write_text(quads + "".join(faces))
     found = ControlCage.from_file(tmp_path / "a.obj").materials
-    assert {name: faces.tolist() for name, faces in found.items()} == {
-        "a#1": [0],
-        "Material #25": [1, 2],
-        "plain": [3],
-        "": [4],
-    }
+    expected = {"a#1": [0], "Material #25": [1, 2], "plain": [3], "": [4]}
+    assert {name: faces.tolist() for name, faces in found.items()} == expected

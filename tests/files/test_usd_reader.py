@@ -2,14 +2,13 @@
 
 import re
 import struct
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.contents import same
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.cage.rules import RULES
 from mitsuba_subdivision.files.usd_writer import write_usd
 
@@ -39,11 +38,13 @@ TRIANGLE = """def Mesh "{}" {{
 
 @pytest.fixture
 def read(tmp_path):
+    """Function that reads the sheet with statements in place of marks, and one text of it in place of another."""
+
     def read(mesh="", transform="", more="", old="", new="", **options):
-        text = SHEET
-        for mark, put in (("<mesh>", mesh), ("<transform>", transform), ("<more>", more), (old, new)):
-            assert mark in text
-            text = text.replace(mark, put, 1) if mark else text
+        assert old in SHEET
+        text = SHEET.replace(old, new, 1) if old else SHEET
+        for mark, put in (("<mesh>", mesh), ("<transform>", transform), ("<more>", more)):
+            text = text.replace(mark, put, 1)
         (tmp_path / "cage.usda").write_text(text)
         return ControlCage.from_file(tmp_path / "cage.usda", **options)
 
@@ -57,40 +58,30 @@ def sharp_edges(cage):
 def test_mesh_without_more(read):
     cage = read()
     np.testing.assert_array_equal(cage.positions, np.array(POINTS, dtype=np.float32))
-    assert cage.face_sizes.tolist() == [4, 4]
-    assert cage.face_vertices.tolist() == [0, 1, 4, 3, 1, 2, 5, 4]
+    assert (cage.face_sizes.tolist(), cage.face_vertices.tolist()) == ([4, 4], [0, 1, 4, 3, 1, 2, 5, 4])
     # USD's defaults.
-    assert (cage.boundary, cage.face_varying, cage.triangle_rule) == (
-        "edge_and_corner",
-        "corners_plus1",
-        "catmull_clark",
-    )
+    rules = cage.boundary, cage.face_varying, cage.triangle_rule
+    assert rules == ("edge_and_corner", "corners_plus1", "catmull_clark")
     assert (cage.scheme, cage.crease_method) == ("catmull_clark", "uniform")
-    assert cage.texcoords is None
-    assert cage.attributes == {}
+    assert (cage.texcoords, cage.attributes) == (None, {})
     assert cage.source.name.endswith('cage.usda", prim /World/sheet')
 
 
-@pytest.mark.parametrize(
-    ("token", "rule", "value"),
-    [
-        ("interpolateBoundary = 'none'", "boundary", "none"),
-        ("interpolateBoundary = 'edgeOnly'", "boundary", "edge_only"),
-        ("interpolateBoundary = 'edgeAndCorner'", "boundary", "edge_and_corner"),
-        ("triangleSubdivisionRule = 'smooth'", "triangle_rule", "smooth"),
-        ("triangleSubdivisionRule = 'catmullClark'", "triangle_rule", "catmull_clark"),
-        ("faceVaryingLinearInterpolation = 'none'", "face_varying", "none"),
-        ("faceVaryingLinearInterpolation = 'cornersOnly'", "face_varying", "corners_only"),
-        ("faceVaryingLinearInterpolation = 'cornersPlus1'", "face_varying", "corners_plus1"),
-        ("faceVaryingLinearInterpolation = 'cornersPlus2'", "face_varying", "corners_plus2"),
-        ("faceVaryingLinearInterpolation = 'boundaries'", "face_varying", "boundaries"),
-        ("faceVaryingLinearInterpolation = 'all'", "face_varying", "all"),
-        ("subdivisionScheme = 'loop'", "scheme", "loop"),
-        ("subdivisionScheme = 'catmullClark'", "scheme", "catmull_clark"),
-    ],
-)
-def test_rules(read, token, rule, value):
-    assert getattr(read(f"uniform token {token}" if "Scheme" in token else f"token {token}"), rule) == value
+FACE_VARYING = {"none": "none", "cornersOnly": "corners_only", "cornersPlus1": "corners_plus1"}
+FACE_VARYING |= {"cornersPlus2": "corners_plus2", "boundaries": "boundaries", "all": "all"}
+BOUNDARY = {"none": "none", "edgeOnly": "edge_only", "edgeAndCorner": "edge_and_corner"}
+RULE_TOKENS = {
+    ("token interpolateBoundary", "boundary"): BOUNDARY,
+    ("token triangleSubdivisionRule", "triangle_rule"): {"smooth": "smooth", "catmullClark": "catmull_clark"},
+    ("token faceVaryingLinearInterpolation", "face_varying"): FACE_VARYING,
+    ("uniform token subdivisionScheme", "scheme"): {"loop": "loop", "catmullClark": "catmull_clark"},
+}
+
+
+@pytest.mark.parametrize(("name", "rule"), RULE_TOKENS)
+def test_rules(read, name, rule):
+    for token, value in RULE_TOKENS[name, rule].items():
+        assert getattr(read(f"{name} = '{token}'"), rule) == value
 
 
 def test_an_argument_overrides_a_rule(read):
@@ -105,34 +96,18 @@ def test_contents_that_name_no_rules_are_written_with_the_usual_ones(tmp_path):
 
 
 def test_creases_corners_and_holes(read):
-    cage = read(
-        """int[] creaseIndices = [3, 4, 1, 0, 2, 1]
-        int[] creaseLengths = [4, 2]
-        float[] creaseSharpnesses = [2.5, 10]
-        int[] cornerIndices = [5, 0]
-        float[] cornerSharpnesses = [10, 1.5]
-        int[] holeIndices = [1]"""
-    )
+    corners = "int[] cornerIndices = [5, 0]\nfloat[] cornerSharpnesses = [10, 1.5]\nint[] holeIndices = [1]\n"
+    creases = "int[] creaseIndices = {}\nint[] creaseLengths = {}\nfloat[] creaseSharpnesses = {}"
+    cage = read(corners + creases.format([3, 4, 1, 0, 2, 1], [4, 2], [2.5, 10]))
     assert sharp_edges(cage) == {(3, 4): 2.5, (1, 4): 2.5, (0, 1): 2.5, (1, 2): 10}
-    assert cage.contents.corners.tolist() == [[0, 1.5], [5, 10]]
-    assert cage.holes.tolist() == [1]
+    assert (cage.contents.corners.tolist(), cage.holes.tolist()) == ([[0, 1.5], [5, 10]], [1])
+    per_edge = read(creases.format([3, 4, 1, 2, 5], [3, 2], [1, 2, 3]))
+    assert sharp_edges(per_edge) == {(3, 4): 1, (1, 4): 2, (2, 5): 3}
 
 
-def test_sharpness_per_edge(read):
-    lines = "int[] creaseIndices = [3, 4, 1, 2, 5]\nint[] creaseLengths = [3, 2]\nfloat[] creaseSharpnesses = [1, 2, 3]"
-    assert sharp_edges(read(lines)) == {(3, 4): 1, (1, 4): 2, (2, 5): 3}
-
-
-UV = """texCoord2f[] primvars:{} = [(0, 0), (.5, 0), (1, 0), (0, 1), (1, 1)] (interpolation = "faceVarying")
-int[] primvars:{}:indices = [0, 1, 4, 3, 1, 2, 2, 4]
+UV = """texCoord2f[] primvars:{0} = [(0, 0), (.5, 0), (1, 0), (0, 1), (1, 1)] (interpolation = "faceVarying")
+int[] primvars:{0}:indices = [0, 1, 4, 3, 1, 2, 2, 4]
 """
-
-
-def test_face_varying_texture_coordinates_keep_their_indices(read):
-    cage = read(UV.format("st", "st"))
-    assert cage.texcoords.interpolation == "face_varying"
-    np.testing.assert_array_equal(cage.texcoords.values, [[0, 0], [0.5, 0], [1, 0], [0, 1], [1, 1]])
-    assert cage.texcoords.indices.tolist() == [0, 1, 4, 3, 1, 2, 2, 4]
 
 
 @pytest.mark.parametrize(("end", "shared"), [(1.0, True), (0.25, False)], ids=["one island", "mirrored"])
@@ -147,41 +122,40 @@ def test_equal_texture_coordinates_without_indices_are_shared(read, end, shared)
 
 
 def test_corners_of_other_vertices_share_no_value(read):
-    """Though they are equal."""
     cage = read('float[] primvars:a = [1, 1, 1, 1, 1, 1, 2, 1] (interpolation = "faceVarying")')
     assert cage.attributes["a"].values.ravel().tolist() == [1, 1, 1, 1, 1, 2]
     index = cage.attributes["a"].indices.tolist()
-    assert (index[1], index[2]) == (index[4], index[7])
-    assert len(set(index)) == 6
+    assert (index[1], index[2], len(set(index))) == (index[4], index[7], 6)
 
 
-def test_names_of_texture_coordinates(read):
-    other, uv_map, st = (UV.format(name, name) for name in ("zzz", "UVMap", "st"))
+def test_names_and_indices_of_texture_coordinates(read):
+    other, uv_map, st = (UV.format(name) for name in ("zzz", "UVMap", "st"))
     assert list(read(other + uv_map + st).attributes) == ["UVMap", "zzz"]
     assert list(read(other + uv_map).attributes) == ["zzz"]
     cage = read(other)
-    assert cage.attributes == {}
-    assert cage.texcoords.values.shape == (5, 2)
+    assert (cage.attributes, cage.texcoords.interpolation) == ({}, "face_varying")
+    np.testing.assert_array_equal(cage.texcoords.values, [[0, 0], [0.5, 0], [1, 0], [0, 1], [1, 1]])
+    assert cage.texcoords.indices.tolist() == [0, 1, 4, 3, 1, 2, 2, 4]
     # Float pairs of another name are no texture coordinates.
     cage = read(other.replace("texCoord2f", "float2"))
-    assert list(cage.attributes) == ["zzz"]
-    assert cage.texcoords is None
+    assert (list(cage.attributes), cage.texcoords) == (["zzz"], None)
 
 
-def test_primvars_become_attributes(read):
-    cage = read(
-        """color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)] (interpolation = "vertex")
+def test_primvars_become_attributes_and_a_warning_names_those_of_other_kinds(read):
+    lines = """color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)] (interpolation = "vertex")
         int[] primvars:displayColor:indices = [0, 1, 0, 1, 1, 0]
         double[] primvars:weight = [0, 1, 2, 3, 4, 5] (interpolation = "varying")
         half[] primvars:mask = [0, 1, 2, 3, 4, 5, 6, 7] (interpolation = "faceVarying")
-        float[] primvars:pair = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11] (
-            interpolation = "vertex"
-            elementSize = 2
-        )
+        float[] primvars:pair = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11] ( interpolation = "vertex"
+            elementSize = 2 )
         float[] primvars:one = [3] (interpolation = "constant")
         float primvars:same = 3
-        normal3f[] primvars:normals = [(0, 0, 1)] (interpolation = "uniform")"""
-    )
+        normal3f[] primvars:normals = [(0, 0, 1)] (interpolation = "uniform")
+        int[] primvars:ids = [0, 1, 2, 3, 4, 5] (interpolation = "vertex")
+        float[] primvars:area = [1, 2] (interpolation = "uniform")"""
+    message = r'prim /World/sheet: primvars "area" \(float\[\], uniform\), "ids" \(int\[\], vertex\) left out; expected'
+    with pytest.warns(CageWarning, match=message):
+        cage = read(lines)
     found = cage.attributes
     assert {name: (a.interpolation, a.values.shape) for name, a in found.items()} == {
         "displayColor": ("vertex", (6, 3)),
@@ -195,33 +169,20 @@ def test_primvars_become_attributes(read):
     assert found["mask"].indices.tolist() == list(range(8))
 
 
-def test_a_warning_names_primvars_of_other_kinds(read):
-    lines = """int[] primvars:ids = [0, 1, 2, 3, 4, 5] (interpolation = "vertex")
-        float[] primvars:area = [1, 2] (interpolation = "uniform")"""
-    message = r'prim /World/sheet: primvars "area" \(float\[\], uniform\), "ids" \(int\[\], vertex\) left out; expected'
-    with pytest.warns(CageWarning, match=message):
-        read(lines)
+MIRROR = 'double3 xformOp:scale = (-1, 1, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]'
+LEFT_HANDED = "uniform token orientation = 'leftHanded'\n"
 
 
-# Orientation and transforms
-
-
-def test_left_handed_faces_are_turned_round_with_their_data(read):
-    cage = read("uniform token orientation = 'leftHanded'\n" + UV.format("st", "st"))
+def test_left_handed_and_mirrored_faces_are_turned_round_with_their_data(read):
+    cage = read(LEFT_HANDED + UV.format("st"))
     assert cage.face_vertices.tolist() == [0, 3, 4, 1, 1, 4, 5, 2]
     assert cage.texcoords.indices.tolist() == [0, 3, 4, 1, 1, 4, 2, 2]
     unindexed = 'float[] primvars:a = [0, 1, 2, 3, 4, 5, 6, 7] (interpolation = "faceVarying")'
-    cage = read("uniform token orientation = 'leftHanded'\n" + unindexed)
-    assert cage.attributes["a"].indices.tolist() == [0, 3, 2, 1, 4, 7, 6, 5]
-
-
-def test_mirrored_faces_are_turned_round(read):
-    mirror = 'double3 xformOp:scale = (-1, 1, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]'
-    cage = read(transform=mirror)
-    assert cage.face_vertices.tolist() == [0, 3, 4, 1, 1, 4, 5, 2]
-    np.testing.assert_array_equal(cage.positions, np.array(POINTS) * [-1, 1, 1])
-    both = read("uniform token orientation = 'leftHanded'", mirror)
-    assert both.face_vertices.tolist() == [0, 1, 4, 3, 1, 2, 5, 4]
+    assert read(LEFT_HANDED + unindexed).attributes["a"].indices.tolist() == [0, 3, 2, 1, 4, 7, 6, 5]
+    mirrored = read(transform=MIRROR)
+    assert mirrored.face_vertices.tolist() == [0, 3, 4, 1, 1, 4, 5, 2]
+    np.testing.assert_array_equal(mirrored.positions, np.array(POINTS) * [-1, 1, 1])
+    assert read(LEFT_HANDED, MIRROR).face_vertices.tolist() == [0, 1, 4, 3, 1, 2, 5, 4]
 
 
 def test_points_are_in_world_space(read):
@@ -235,22 +196,20 @@ def test_points_are_in_world_space(read):
     np.testing.assert_array_equal(read(reset, turn).positions, 2 * np.array(POINTS))
 
 
-MOVING = (
-    "point3f[] points.timeSamples = {{ 1: {0}, 3: [(0, 0, 2), (1, 0, 2), (2, 0, 2), (0, 1, 2), (1, 1, 2), (2, 0, 2)] }}"
-)
-MOVING = MOVING.format("[(0, 0, 1), (1, 0, 1), (2, 0, 1), (0, 1, 1), (1, 1, 1), (2, 0, 1)]")
 POINTS_LINE = next(line for line in SHEET.splitlines() if "points" in line)
+HEIGHTS = [[(0, 0, z), (1, 0, z), (2, 0, z), (0, 1, z), (1, 1, z), (2, 0, z)] for z in (1, 2)]
+MOVING = f"point3f[] points.timeSamples = {{ 1: {HEIGHTS[0]}, 3: {HEIGHTS[1]} }}"
+ORDER = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
 
 
-@pytest.mark.parametrize(("time", "height"), [(None, 1), (1, 1), (2.5, 1.75), (3, 2), (100, 2), (0, 1)])
-def test_points_at_a_time(read, time, height):
-    cage = read(old=POINTS_LINE, new=MOVING, time=time)
-    np.testing.assert_array_equal(cage.positions[:, 2], height)
-
-
-def test_values_without_time_are_the_default(read):
-    cage = read(old=POINTS_LINE, new=POINTS_LINE + "\n" + MOVING)
-    np.testing.assert_array_equal(cage.positions[:, 2], 0)
+@pytest.mark.parametrize(
+    ("time", "height", "shift"),
+    [(None, 1, 4), (0, 1, 4), (1, 1, 4), (2, 1.5, 4), (2.5, 1.75, 5), (3, 2, 6), (4, 2, 8), (100, 2, 8)],
+)
+def test_points_and_transforms_at_a_time(read, time, height, shift):
+    move = f"double3 xformOp:translate.timeSamples = {{ 2: (4, 0, 0), 4: (8, 0, 0) }}\n{ORDER}"
+    cage = read(old=POINTS_LINE, new=MOVING, transform=move, time=time)
+    np.testing.assert_array_equal(cage.positions, np.add(HEIGHTS[0], [shift, 0, height - 1]))
 
 
 # Attributes of a mesh with a value and another one.
@@ -292,57 +251,41 @@ def test_every_attribute_of_a_mesh_is_its_default_or_else_its_first_sample(tmp_p
     for kind in ("default", "samples", "both"):
         lines = ""
         for name, value, other in ATTRIBUTES:
-            if kind == "default" or sampled not in (name, "all"):
-                lines += declared(name, value)
-            elif kind == "samples":
-                lines += declared(name, samples=[value, other])
-            else:
-                lines += declared(name, value, [other, other])
+            is_sampled = kind != "default" and sampled in (name, "all")
+            samples = [value, other] if kind == "samples" else [other, other]
+            lines += declared(name, None if is_sampled and kind == "samples" else value, samples if is_sampled else ())
         (tmp_path / "cage.usda").write_text(f'#usda 1.0\ndef Mesh "sheet" {{\n{lines}\n}}\n')
         contents.append(ControlCage.from_file(tmp_path / "cage.usda").contents)
     assert len(contents[0].creases) == len(contents[0].corners) == len(contents[0].holes) == 1
     assert all(same(contents[0], each) for each in contents[1:])
 
 
-@pytest.mark.parametrize(("time", "shift"), [(None, 4), (2, 4), (3, 6), (4, 8)])
-def test_transforms_at_a_time(read, time, shift):
-    move = "double3 xformOp:translate.timeSamples = { 2: (4, 0, 0), 4: (8, 0, 0) }\n"
-    cage = read(transform=move + 'uniform token[] xformOpOrder = ["xformOp:translate"]', time=time)
-    np.testing.assert_array_equal(cage.positions, np.add(POINTS, [shift, 0, 0]))
-
-
 def test_every_operation_of_a_transform_has_its_own_first_time(read):
-    cage = read(
-        transform="double3 xformOp:translate.timeSamples = { 1: (4, 0, 0), 3: (8, 0, 0) }\n"
-        "double3 xformOp:translate:late.timeSamples = { 2: (0, 1, 0), 3: (0, 9, 0) }\n"
-        "double3 xformOp:translate:fixed = (0, 0, 2)\n"
-        "double3 xformOp:translate:fixed.timeSamples = { 1: (0, 0, 7) }\n"
-        'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:translate:late", "xformOp:translate:fixed"]'
-    )
+    move = """double3 xformOp:translate.timeSamples = { 1: (4, 0, 0), 3: (8, 0, 0) }
+        double3 xformOp:translate:late.timeSamples = { 2: (0, 1, 0), 3: (0, 9, 0) }
+        double3 xformOp:translate:fixed = (0, 0, 2)
+        double3 xformOp:translate:fixed.timeSamples = { 1: (0, 0, 7) }
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:translate:late", "xformOp:translate:fixed"]"""
+    cage = read(transform=move)
     np.testing.assert_array_equal(cage.positions, np.add(POINTS, [4, 1, 2]))
 
 
-FLAT_POINTS = POINTS_LINE.partition("= ")[2]
+SAMPLED_POINTS = [
+    "point3f[] points.timeSamples = {{ 1: [], 2: {0}, 3: {1} }}",
+    "point3f[] points.timeSamples = {{ 0.5: None, 1: [], 2: {0}, 3: {1} }}",
+    "point3f[] points = []\npoint3f[] points.timeSamples = {{ 2: {0}, 3: {1} }}",
+    "point3f[] points.timeSamples = {{ 1: {1}, 2: {0} }}\nint[] faceVertexCounts.timeSamples = {{ 1: [], 2: {2} }}",
+]
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        "point3f[] points.timeSamples = {{ 1: [], 2: {0}, 3: {1} }}",
-        "point3f[] points.timeSamples = {{ 0.5: None, 1: [], 2: {0}, 3: {1} }}",
-        "point3f[] points = []\npoint3f[] points.timeSamples = {{ 2: {0}, 3: {1} }}",
-        "point3f[] points.timeSamples = {{ 1: {1}, 2: {0} }}\nint[] faceVertexCounts.timeSamples = {{ 1: [], 2: {2} }}",
-    ],
-)
+@pytest.mark.parametrize("points", SAMPLED_POINTS)
 def test_meshes_are_read_at_the_first_time_with_points_and_faces(read, points):
-    zero = ", ".join(["(0, 0, 0)"] * 6)
     primvar = 'float[] primvars:w (interpolation = "vertex")\nfloat[] primvars:w.timeSamples = '
     primvar += "{ 1: [], 2: [0, 1, 2, 3, 4, 5], 3: [9] }"
     move = "double3 xformOp:translate.timeSamples = { 0: (9, 9, 9), 2: (4, 0, 0), 9: (1, 1, 1) }\n"
-    points = points.format(FLAT_POINTS, f"[{zero}]", "[4, 4]")
+    points = points.format(POINTS_LINE.partition("= ")[2], [(0, 0, 0)] * 6, "[4, 4]")
     old = POINTS_LINE if "Counts" not in points else f"{POINTS_LINE}\n        int[] faceVertexCounts = [4, 4]"
-    transform = move + 'uniform token[] xformOpOrder = ["xformOp:translate"]'
-    cage = read(old=old, new=points, mesh=primvar, transform=transform)
+    cage = read(old=old, new=points, mesh=primvar, transform=move + ORDER)
     np.testing.assert_array_equal(cage.positions, np.add(np.array(POINTS, dtype=np.float32), [4, 0, 0]))
     np.testing.assert_array_equal(cage.attributes["w"].values[:, 0], np.arange(6))
 
@@ -353,61 +296,44 @@ def test_meshes_without_points_at_any_time_are_errors(read):
             read(old=POINTS_LINE, new=points)
 
 
-# Schemes
-
-
-@pytest.mark.parametrize("scheme", ["none", "bilinear"])
-def test_meshes_that_are_not_to_be_smoothed_are_errors(read, scheme):
-    line = f"uniform token subdivisionScheme = '{scheme}'"
-    with pytest.raises(CageError, match=f'subdivisionScheme is "{scheme}"; expected catmullClark or loop, or a scheme'):
-        read(line)
-    with pytest.warns(CageWarning, match=f'subdivisionScheme is "{scheme}"; the scheme "catmull_clark" is used in its'):
-        assert read(line, scheme="catmull_clark").scheme == "catmull_clark"
-
-
 def test_another_scheme_than_the_mesh_asks_for_is_a_warning(read):
     with pytest.warns(CageWarning, match='subdivisionScheme is "catmullClark"; the scheme "doo_sabin" is used'):
         assert read(scheme="doo_sabin").scheme == "doo_sabin"
     assert read(scheme="catmull_clark").scheme == "catmull_clark"
 
 
-# Several meshes
-
-
 @pytest.mark.parametrize("scheme", ["none", "bilinear"])
-def test_meshes_that_are_not_to_be_smoothed_are_passed_over_where_there_are_others(read, scheme):
-    ground = TRIANGLE.format("ground").replace("point3f", f"uniform token subdivisionScheme = '{scheme}'\npoint3f", 1)
+def test_meshes_that_are_not_to_be_smoothed_are_errors_unless_there_are_others(read, scheme):
+    line = f"uniform token subdivisionScheme = '{scheme}'"
+    with pytest.raises(CageError, match=f'subdivisionScheme is "{scheme}"; expected catmullClark or loop, or a scheme'):
+        read(line)
+    with pytest.warns(CageWarning, match=f'subdivisionScheme is "{scheme}"; the scheme "catmull_clark" is used in its'):
+        assert read(line, scheme="catmull_clark").scheme == "catmull_clark"
+    ground = TRIANGLE.format("ground").replace("point3f", f"{line}\npoint3f", 1)
     for options in ({}, {"prim": "/World"}):
         with pytest.warns(CageWarning, match="meshes /World/ground left out, as their subdivisionScheme is none"):
             assert read(more=ground, **options).source.name.endswith("prim /World/sheet")
     with pytest.raises(CageError, match=f'prim /World/ground: .*its subdivisionScheme is "{scheme}"; expected'):
         read(more=ground, prim="/World/ground")
-    with pytest.raises(CageError, match="there are 2 meshes; expected prim to name one of /World/sheet, /World/ground"):
-        read(more=ground, scheme="loop")
-    with pytest.raises(CageError, match="there are 2 meshes; expected prim to name one of /World/sheet, /World/ground"):
-        read(f"uniform token subdivisionScheme = '{scheme}'", more=ground)
+    message = "there are 2 meshes; expected prim to name one of /World/sheet, /World/ground"
+    for mesh, options in (("", {"scheme": "loop"}), (line, {})):
+        with pytest.raises(CageError, match=message):
+            read(mesh, more=ground, **options)
 
 
 def test_one_of_several_meshes_is_chosen_by_its_path(read):
-    more = TRIANGLE.format("left") + 'def Xform "car" {' + TRIANGLE.format("body") + "}"
-    with pytest.raises(
-        CageError, match="there are 3 meshes; expected prim to name one of /World/sheet, /World/left, /Wo"
-    ):
-        read(more=more)
+    more = TRIANGLE.format("left") + 'def Xform "car" {' + TRIANGLE.format("body") + '}\ndef Camera "eye" {}'
     assert read(more=more, prim="/World/sheet").face_count == 2
     assert read(more=more, prim="/World/car").source.name.endswith("prim /World/car/body")
-    with pytest.raises(CageError, match="there are 3 meshes below /World; expected prim to name one of /World/sheet, "):
-        read(more=more, prim="/World")
-    with pytest.raises(
-        CageError, match="prim /World/truck is not in the file; expected one of /World/sheet, /World/left"
+    for prim, message in (
+        (None, "there are 3 meshes; expected prim to name one of /World/sheet, /World/left, /Wo"),
+        ("/World", "there are 3 meshes below /World; expected prim to name one of /World/sheet, "),
+        ("/World/truck", "prim /World/truck is not in the file; expected one of /World/sheet, /World/left"),
+        ("a b", 'prim "a b" is no path; expected one such as /World/sheet'),
+        ("/World/eye", 'prim /World/eye is a prim of the type "Camera" without meshes; expected one of'),
     ):
-        read(more=more, prim="/World/truck")
-    with pytest.raises(CageError, match='prim "a b" is no path; expected one such as /World/sheet'):
-        read(more=more, prim="a b")
-    with pytest.raises(
-        CageError, match='prim /World/eye is a prim of the type "Camera" without meshes; expected one of'
-    ):
-        read(more='def Camera "eye" {}', prim="/World/eye")
+        with pytest.raises(CageError, match=message):
+            read(more=more, prim=prim)
 
 
 def test_meshes_of_instances(read):
@@ -421,109 +347,66 @@ def test_meshes_of_instances(read):
     np.testing.assert_array_equal(cage.positions, [[5, 0, 0], [6, 0, 0], [5, 1, 0]])
 
 
-# Errors
-
 CREASES = "int[] creaseIndices = [0, 1, 2]\nint[] creaseLengths = [{}]\nfloat[] creaseSharpnesses = [{}]"
+COUNTS, INDEXED_ST = "int[] faceVertexCounts = [4, 4]", UV.format("st")
+SHORT_ST = INDEXED_ST.replace("2, 2, 4]", "2, 2]")
+WEIGHTS = 'float[] primvars:w = [1, 2] (interpolation = "vertex")\n'
+SCALE = 'double3 xformOp:scale = {}\nuniform token[] xformOpOrder = ["xformOp:scale"]'
+# Statements in the mesh, and what the message says.
+ERRORS_OF_MESHES = [
+    ("token interpolateBoundary = 'edge'", 'interpolateBoundary is "edge"; expected one of edgeAndCorner, edge'),
+    ("uniform token orientation = 'up'", 'orientation is "up"; expected one of rightHanded, leftHanded'),
+    ("uniform token subdivisionScheme = 'odd'", 'subdivisionScheme is "odd"; expected one of catmullClark, loop'),
+    (CREASES.format("2", "1"), "creaseLengths add up to 2, but creaseIndices has 3 entries; expected as many"),
+    (CREASES.format("2, 1", "1, 1"), "creaseLengths has the value 1 at 1; expected 2 or more vertices"),
+    (
+        CREASES.format("3", "1, 1, 1"),
+        "creaseSharpnesses has 3 entries; expected 1, one per crease, or 2, one per edge",
+    ),
+    ("int[] creaseIndices = [0, 1]", "creaseLengths add up to 0, but creaseIndices has 2 entries"),
+    ("int[] cornerIndices = [0]", "cornerSharpnesses has 0 entries, but cornerIndices has 1; expected as many"),
+    ("int[] holeIndices = [2]", "hole 2 is no face; expected one of 2"),
+    (SHORT_ST, 'attribute "texcoords" has indices of shape (7,)'),
+    (INDEXED_ST.replace("2, 2, 4]", "2, 2, 5]"), 'index 5 into attribute "texcoords"; expected 0 to 4'),
+    (LEFT_HANDED + SHORT_ST, 'primvar "st" has 7 values or indices; expected 8, one per face corner'),
+    (WEIGHTS, 'attribute "w" has 2 values; expected 6, one per vertex'),
+    (
+        f"{WEIGHTS}int[] primvars:w:indices = [0, 1, 2, 0, -1, 0]",
+        'primvar "w" has the index 2 at position 2; expected 0 to 1 (2 such indices)',
+    ),
+    ("custom string[] creaseIndices = ['a']", "creaseIndices is of the type StringArray; expected"),
+    ("custom int[] interpolateBoundary = [1]", 'interpolateBoundary is "[1]"; expected one of'),
+    (INDEXED_ST.replace("int[]", "custom float[]"), "primvars:st:indices is of the type Float"),
+]
+# What is replaced in the sheet, what by, and what the message says.
+ERRORS = [
+    (POINTS_LINE, "", "there are no points; expected a mesh with points and faces"),
+    (COUNTS, "", "there are no faceVertexCounts; expected a mesh"),
+    ("[4, 4]", "[]", "there are no faceVertexCounts; expected a mesh"),
+    ("[0, 1, 4, 3, 1, 2, 5, 4]", "[]", "there are no faceVertexIndices; expected a mesh"),
+    ("[4, 4]", "[4, 3]", "faceVertexCounts add up to 7, but faceVertexIndices has 8 entries; expected as"),
+    ("[4, 4]", "[9, -1]", "faceVertexCounts add up to 8, but"),
+    ("2, 5, 4]", "2, 6, 4]", "face 1 has the vertex index 6; expected 0 to 5"),
+    ("point3f[] points", "string points", "Tuple nesting"),
+    (POINTS_LINE, 'custom string[] points = ["a"]', "points is of the type StringArray; expected"),
+    (POINTS_LINE, "custom float[] points = [1, 2, 3]", "an array of vectors of 3 numbers"),
+    ("int[] faceVertexCounts", "custom float[] faceVertexCounts", "expected an array of integers"),
+    (COUNTS, "custom int faceVertexCounts = 4", "Counts is of the type int"),
+    ("<transform>", SCALE.format("(0, 1, 1)"), "the transform to world space is [[0.0, "),
+    ("<transform>", SCALE.format("(1e308, 1, 9e99)"), "vertex 2 has the coordinates (inf, 0.0, "),
+    *(("<mesh>", *row) for row in ERRORS_OF_MESHES),
+]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"old": POINTS_LINE}, "there are no points; expected a mesh with points and faces"),
-        ({"old": "int[] faceVertexCounts = [4, 4]"}, "there are no faceVertexCounts; expected a mesh"),
-        ({"old": "[4, 4]", "new": "[]"}, "there are no faceVertexCounts; expected a mesh"),
-        ({"old": "[0, 1, 4, 3, 1, 2, 5, 4]", "new": "[]"}, "there are no faceVertexIndices; expected a mesh"),
-        (
-            {"old": "[4, 4]", "new": "[4, 3]"},
-            "faceVertexCounts add up to 7, but faceVertexIndices has 8 entries; expected as",
-        ),
-        ({"old": "[4, 4]", "new": "[9, -1]"}, "faceVertexCounts add up to 8, but"),
-        ({"old": "2, 5, 4]", "new": "2, 6, 4]"}, "face 1 has the vertex index 6; expected 0 to 5"),
-        (
-            {"mesh": "token interpolateBoundary = 'edge'"},
-            'interpolateBoundary is "edge"; expected one of edgeAndCorner, edge',
-        ),
-        ({"mesh": "uniform token orientation = 'up'"}, 'orientation is "up"; expected one of rightHanded, leftHanded'),
-        (
-            {"mesh": "uniform token subdivisionScheme = 'odd'"},
-            'subdivisionScheme is "odd"; expected one of catmullClark, loop',
-        ),
-        (
-            {"mesh": CREASES.format("2", "1")},
-            "creaseLengths add up to 2, but creaseIndices has 3 entries; expected as many",
-        ),
-        ({"mesh": CREASES.format("2, 1", "1, 1")}, "creaseLengths has the value 1 at 1; expected 2 or more vertices"),
-        (
-            {"mesh": CREASES.format("3", "1, 1, 1")},
-            "creaseSharpnesses has 3 entries; expected 1, one per crease, or 2, one per edge",
-        ),
-        ({"mesh": "int[] creaseIndices = [0, 1]"}, "creaseLengths add up to 0, but creaseIndices has 2 entries"),
-        (
-            {"mesh": "int[] cornerIndices = [0]"},
-            "cornerSharpnesses has 0 entries, but cornerIndices has 1; expected as many",
-        ),
-        ({"mesh": "int[] holeIndices = [2]"}, "hole 2 is no face; expected one of 2"),
-        (
-            {"mesh": UV.format("st", "st").replace("2, 2, 4]", "2, 2]")},
-            'attribute "texcoords" has indices of shape (7,)',
-        ),
-        (
-            {"mesh": UV.format("st", "st").replace("2, 2, 4]", "2, 2, 5]")},
-            'index 5 into attribute "texcoords"; expected 0 to 4',
-        ),
-        (
-            {"mesh": "uniform token orientation = 'leftHanded'\n" + UV.format("st", "st").replace("2, 2, 4]", "2, 2]")},
-            'primvar "st" has 7 values or indices; expected 8, one per face corner',
-        ),
-        (
-            {"mesh": 'float[] primvars:w = [1, 2] (interpolation = "vertex")'},
-            'attribute "w" has 2 values; expected 6, one per vertex',
-        ),
-        (
-            {
-                "mesh": 'float[] primvars:w = [1, 2] (interpolation = "vertex")\n'
-                "int[] primvars:w:indices = [0, 1, 2, 0, -1, 0]"
-            },
-            'primvar "w" has the index 2 at position 2; expected 0 to 1 (2 such indices)',
-        ),
-        (
-            {"transform": 'double3 xformOp:scale = (0, 1, 1)\nuniform token[] xformOpOrder = ["xformOp:scale"]'},
-            "the transform to world space is [[0.0, ",
-        ),
-        ({"time": float("nan")}, "time nan; expected a finite number, a time code"),
-    ],
-)
-def test_errors_say_what_and_where(read, options, message):
+@pytest.mark.parametrize(("old", "new", "message"), ERRORS)
+def test_errors_say_what_and_where(read, old, new, message):
     with pytest.raises(CageError, match=r'cage\.usda".*' + re.escape(message)):
-        read(**options)
+        read(old=old, new=new)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"old": "point3f[] points", "new": "string points"}, 'cage.usda": Tuple nesting'),
-        ({"old": POINTS_LINE, "new": 'custom string[] points = ["a"]'}, "points is of the type StringArray; expected"),
-        ({"old": POINTS_LINE, "new": "custom float[] points = [1, 2, 3]"}, "an array of vectors of 3 numbers"),
-        ({"old": "int[] faceVertexCounts", "new": "custom float[] faceVertexCounts"}, "expected an array of integers"),
-        (
-            {"old": "int[] faceVertexCounts = [4, 4]", "new": "custom int faceVertexCounts = 4"},
-            "Counts is of the type int",
-        ),
-        ({"mesh": "custom string[] creaseIndices = ['a']"}, "creaseIndices is of the type StringArray; expected"),
-        ({"mesh": "custom int[] interpolateBoundary = [1]"}, 'interpolateBoundary is "\\[1\\]"; expected one of'),
-        (
-            {"mesh": UV.format("st", "st").replace("int[] primvars:st:indices", "custom float[] primvars:st:indices")},
-            "primvars:st:indices is of the type Float",
-        ),
-        (
-            {"transform": 'double3 xformOp:scale = (1e308, 1, 9e99)\nuniform token[] xformOpOrder = ["xformOp:scale"]'},
-            "vertex 2 has the coordinates .inf, 0.0, ",
-        ),
-    ],
-)
-def test_values_of_other_types_and_sizes_are_errors(read, options, message):
-    with pytest.raises(CageError, match=message):
-        read(**options)
+def test_a_time_that_is_no_number_is_an_error(read):
+    with pytest.raises(CageError, match=r'cage\.usda".*time nan; expected a finite number, a time code'):
+        read(time=float("nan"))
 
 
 @pytest.mark.parametrize("old", ["World", "sheet", "edgeOnly", "weight", "rightHanded"])
@@ -540,13 +423,14 @@ def test_names_that_are_not_utf_8_are_errors_that_name_the_file(read, tmp_path, 
 
 
 def test_messages_are_short(read):
+    long = "x" * 5000
     for options in (
-        {"old": '"World"', "new": f'"{"W" * 5000}"', "more": "!"},
-        {"mesh": f"token interpolateBoundary = '{'e' * 5000}'"},
-        {"old": "sheet", "new": "s" * 5000, "mesh": "int[] holeIndices = [9]"},
-        {"more": f"def Mesh {'x' * 5000} {{}}"},
-        {"more": f'def Mesh "{"x" * 5000}" {{}}'},
-        {"mesh": f'float[] primvars:{"x" * 5000} = [1] (interpolation = "vertex")'},
+        {"old": '"World"', "new": f'"{long}"', "more": "!"},
+        {"mesh": f"token interpolateBoundary = '{long}'"},
+        {"old": "sheet", "new": long, "mesh": "int[] holeIndices = [9]"},
+        {"more": f"def Mesh {long} {{}}"},
+        {"more": f'def Mesh "{long}" {{}}'},
+        {"mesh": f'float[] primvars:{long} = [1] (interpolation = "vertex")'},
     ):
         with pytest.raises(CageError, match=r"cage\.usda") as caught:
             read(**options)
@@ -580,53 +464,19 @@ def test_damaged_fields_are_errors_that_name_the_file(tmp_path, damage):
         ControlCage.from_file(tmp_path / "bad.usdc")
 
 
-def test_syntax_errors_name_their_line(read):
+def test_syntax_errors_name_their_line_and_a_file_of_this_folder_by_its_name(read, tmp_path, monkeypatch):
     with pytest.raises(CageError, match=r"""cage\.usda", line 5: .*; expected a USD file""") as caught:
         read(old="(2, 0, 0), (0, 1, 0)", new="(2, 0, 0; (0, 1, 0)")
     assert "pxr" not in str(caught.value)
-
-
-def test_syntax_errors_name_their_line_in_a_file_of_this_folder(tmp_path, monkeypatch):
-    cube().save(tmp_path / "cube.usda")
-    text = (tmp_path / "cube.usda").read_text()
-    (tmp_path / "cube.usda").write_text(text[: len(text) // 2])
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CageError, match=r"""^"cube\.usda", line \d+: syntax error at""") as caught:
-        ControlCage.from_file("cube.usda")
+    with pytest.raises(CageError, match=r"""^"cage\.usda", line 5: """) as caught:
+        ControlCage.from_file("cage.usda")
     assert "pxr" not in str(caught.value)
 
 
-def test_every_cut_of_a_file_names_the_file(tmp_path):
-    for suffix in (".usda", ".usdc"):
-        cube().save(tmp_path / f"cube{suffix}")
-        content = (tmp_path / f"cube{suffix}").read_bytes()
-        for length in range(0, len(content) - 2, 101):
-            path = tmp_path / f"{length}{suffix}"
-            path.write_bytes(content[:length])
-            with pytest.raises(CageError, match=rf'"{path}".*; expected a USD file'):
-                ControlCage.from_file(path)
-
-
 def test_missing_references_are_a_warning(read):
-    more = 'def "other" (references = @missing.usda@) {}'
     with pytest.warns(CageWarning, match=r"the stage is incomplete: .*missing\.usda"):
-        assert read(more=more).face_count == 2
-
-
-def test_missing_file_is_an_os_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"missing\.usda"):
-        ControlCage.from_file(tmp_path / "missing.usda")
-
-
-def test_the_missing_package_is_named(read, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pxr", None)
-    with pytest.raises(CageError, match=r'the package usd-core, .* pip install "mitsuba-subdivision\[usd\]"'):
-        read()
-    with pytest.raises(CageError, match=r'the package usd-core, .* pip install "mitsuba-subdivision\[usd\]"'):
-        cube().save(tmp_path / "cube.usda")
-
-
-# Writing
+        assert read(more='def "other" (references = @missing.usda@) {}').face_count == 2
 
 
 @pytest.mark.core
@@ -643,35 +493,25 @@ def test_round_trip_is_exact_in_single_precision(any_cage, suffix, tmp_path, np_
         "mask": Attribute(single(corners, 4), "face_varying"),
         "a:deep": Attribute(single(count, 7)),
     }
-    cage = ControlCage.from_arrays(
-        single(count, 3),
-        any_cage.face_sizes,
-        any_cage.face_vertices,
-        creases=[(*edge, 2.5)],
-        corners=[(2, 10), (0, 1.25)],
-        holes=[0] if any_cage.face_count > 1 else [],
-        boundary="edge_only",
-        triangle_rule="smooth",
-        face_varying="boundaries",
-        scheme="loop",
-        texcoords=Attribute(single(5, 2), "face_varying", np_rng.integers(5, size=corners)),
-        attributes=attributes,
-    )
+    rules = {"boundary": "edge_only", "triangle_rule": "smooth", "face_varying": "boundaries", "scheme": "loop"}
+    tags = {"creases": [(*edge, 2.5)], "corners": [(2, 10), (0, 1.25)], "holes": [0] * (any_cage.face_count > 1)}
+    texcoords = Attribute(single(5, 2), "face_varying", np_rng.integers(5, size=corners))
+    faces = any_cage.face_sizes, any_cage.face_vertices
+    data = {"texcoords": texcoords, "attributes": attributes}
+    cage = ControlCage.from_arrays(single(count, 3), *faces, **tags, **rules, **data)
     path = tmp_path / f"cage{suffix}"
     cage.save(path)
     cage.save(path)
     again = ControlCage.from_file(path)
     for name in ("positions", "face_sizes", "face_vertices", "holes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(cage, name))
-    for name in ("boundary", "triangle_rule", "face_varying", "scheme"):
+    for name in rules:
         assert getattr(again, name) == getattr(cage, name)
     np.testing.assert_array_equal(again.tags.edges, cage.tags.edges)
     np.testing.assert_array_equal(again.tags.vertices, cage.tags.vertices)
     assert set(again.attributes) == set(attributes)
-    for found, expected in [
-        (again.texcoords, cage.texcoords),
-        *((again.attributes[n], cage.attributes[n]) for n in attributes),
-    ]:
+    pairs = [(again.attributes[name], cage.attributes[name]) for name in attributes]
+    for found, expected in [(again.texcoords, cage.texcoords), *pairs]:
         assert found.interpolation == expected.interpolation
         np.testing.assert_array_equal(found.values, expected.values)
         np.testing.assert_array_equal(found.indices, expected.indices)
@@ -688,24 +528,3 @@ def test_packages_are_read(tmp_path):
         CageError, match=r'unknown cage format ".usdz"; expected one of .obj, .ply, .usd, .usda, .usdc$'
     ):
         cube().save(tmp_path / "again.usdz")
-
-
-def test_a_warning_names_what_has_no_place(tmp_path):
-    cage = extraordinary(5)
-    cage = ControlCage.from_arrays(
-        cage.positions,
-        cage.face_sizes,
-        cage.face_vertices,
-        crease_method="chaikin",
-        scheme="doo_sabin",
-        attributes={"a b": Attribute(np.zeros((cage.vertex_count, 1)))},
-    )
-    message = '.usda files have no place for crease_method "chaikin", scheme "doo_sabin", attribute "a b" of the cage'
-    with pytest.warns(CageWarning, match=message):
-        cage.save(tmp_path / "cage.usda")
-
-
-def test_missing_folder_is_an_os_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match="there is no folder"):
-        cube().save(tmp_path / "missing" / "cube.usda")
-    assert list(tmp_path.iterdir()) == []

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage
@@ -10,12 +12,14 @@ from reference.exact_samples import mesh_of
 pytestmark = pytest.mark.core
 
 
-def test_next_and_prev_are_inverse_and_stay_in_their_face(any_cage):
-    topology = any_cage.topology
-    half_edges = np.arange(topology.half_edge_count)
-    np.testing.assert_array_equal(topology.next[topology.prev], half_edges)
-    np.testing.assert_array_equal(topology.prev[topology.next], half_edges)
-    np.testing.assert_array_equal(topology.face[topology.next], topology.face)
+def test_next_and_prev_walk_the_vertices_of_each_face_in_order(any_cage):
+    t = any_cage.topology
+    for begin, end in pairwise(t.face_offsets.tolist()):
+        face = np.arange(begin, end)
+        np.testing.assert_array_equal(t.next[face], np.roll(face, -1))
+        np.testing.assert_array_equal(t.prev[face], np.roll(face, 1))
+    np.testing.assert_array_equal(np.diff(t.face_offsets), t.face_sizes)
+    np.testing.assert_array_equal(t.face, np.repeat(np.arange(t.face_count), t.face_sizes))
 
 
 @pytest.mark.parametrize("as_arrays", [True, False], ids=["many", "one by one"])
@@ -23,12 +27,7 @@ def test_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     """On borders there is nothing beyond."""
     t = any_cage.topology
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
-    beyond = t.twin < 0
-    expected = {
-        "turn": t.twin[t.prev],
-        "turn_back": np.where(beyond, -1, t.next[t.twin]),
-    }
-    for name, table in expected.items():
+    for name, table in (("turn", t.twin[t.prev]), ("turn_back", np.where(t.twin < 0, -1, t.next[t.twin]))):
         walk = getattr(t, name)
         found = walk(half_edges) if as_arrays else [int(walk(h)) for h in half_edges.tolist()]
         np.testing.assert_array_equal(found, table, err_msg=name)
@@ -43,9 +42,8 @@ def test_walks_go_on_from_where_they_arrived():
 def test_vertices_of_any_integer_type_are_the_same_cage():
     expected = cube()
     for kind in (np.int8, np.uint16, np.int32, np.uint32, np.int64, np.uint64):
-        cage = ControlCage.from_arrays(
-            expected.positions, expected.face_sizes.astype(kind), expected.face_vertices.astype(kind)
-        )
+        faces = expected.face_sizes.astype(kind), expected.face_vertices.astype(kind)
+        cage = ControlCage.from_arrays(expected.positions, *faces)
         np.testing.assert_array_equal(cage.face_vertices, expected.face_vertices)
         np.testing.assert_array_equal(cage.topology.twin, expected.topology.twin)
     wrong = expected.face_vertices.astype(np.uint64)
@@ -54,33 +52,17 @@ def test_vertices_of_any_integer_type_are_the_same_cage():
         ControlCage.from_arrays(expected.positions, expected.face_sizes, wrong)
 
 
-def test_next_walks_the_vertices_of_each_face_in_order(any_cage):
-    topology = any_cage.topology
-    for face in range(topology.face_count):
-        begin, end = topology.face_offsets[face : face + 2]
-        half_edge, walked = begin, []
-        for _ in range(topology.face_sizes[face]):
-            walked.append(half_edge)
-            half_edge = topology.next[half_edge]
-        assert half_edge == begin
-        assert walked == list(range(begin, end))
-
-
-def test_twin_is_the_same_edge_backwards(any_cage):
-    topology = any_cage.topology
-    inner = np.flatnonzero(topology.twin >= 0)
-    twin = topology.twin[inner]
+def test_twin_is_the_same_edge_backwards_and_edges_are_numbered_without_gaps(any_cage):
+    t = any_cage.topology
+    inner = np.flatnonzero(t.twin >= 0)
+    twin = t.twin[inner]
     assert (twin != inner).all()
-    np.testing.assert_array_equal(topology.twin[twin], inner)
-    np.testing.assert_array_equal(topology.edge[twin], topology.edge[inner])
-    np.testing.assert_array_equal(topology.face_vertices[twin], topology.face_vertices[topology.next[inner]])
-
-
-def test_edges_are_numbered_without_gaps(any_cage):
-    topology = any_cage.topology
-    edges, lowest = np.unique(topology.edge, return_index=True)
-    np.testing.assert_array_equal(edges, np.arange(topology.edge_count))
-    np.testing.assert_array_equal(topology.edge_half_edge, lowest)
+    np.testing.assert_array_equal(t.twin[twin], inner)
+    np.testing.assert_array_equal(t.edge[twin], t.edge[inner])
+    np.testing.assert_array_equal(t.face_vertices[twin], t.face_vertices[t.next[inner]])
+    edges, lowest = np.unique(t.edge, return_index=True)
+    np.testing.assert_array_equal(edges, np.arange(t.edge_count))
+    np.testing.assert_array_equal(t.edge_half_edge, lowest)
 
 
 @pytest.mark.parametrize(("unit", "kind"), [(1, np.int64), (1 << 58, np.int64), (1 << 26, np.int32)])
@@ -107,13 +89,9 @@ def test_refinement_differs_where_one_mesh_is_sharp():
 
 
 def test_euler_characteristic():
-    def euler(cage):
-        return cage.vertex_count - cage.topology.edge_count + cage.face_count
-
-    assert euler(cube()) == 2
-    assert euler(torus(5, 4)) == 0
-    assert euler(extraordinary(6)) == 2
-    assert euler(extraordinary(6, closed=False)) == 1
+    cages = (cube(), 2), (torus(5, 4), 0), (extraordinary(6), 2), (extraordinary(6, closed=False), 1)
+    for cage, expected in cages:
+        assert cage.vertex_count - cage.topology.edge_count + cage.face_count == expected
 
 
 def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(any_cage):
@@ -128,23 +106,17 @@ def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(an
 
 
 def test_turn_is_counter_clockwise():
-    topology = cube().topology
+    t = cube().topology
+    ends = t.face_vertices[t.next]
     # From outside, at the corner (1, 1, 1), the outgoing edges turn -x, -y, -z.
-    half_edge = next(
-        h for h in np.flatnonzero(topology.face_vertices == 7) if topology.face_vertices[topology.next[h]] == 6
-    )
-    ends = []
-    for _ in range(3):
-        ends.append(int(topology.face_vertices[topology.next[half_edge]]))
-        half_edge = topology.turn(half_edge)
-    assert ends == [6, 5, 3]
+    (first,) = np.flatnonzero((t.face_vertices == 7) & (ends == 6))
+    assert ends[[first, t.turn(first), t.turn(t.turn(first))]].tolist() == [6, 5, 3]
 
 
 def test_open_faces_have_boundary():
-    topology = mesh_of(5, [[0, 1, 2], [2, 1, 3]])
-    np.testing.assert_array_equal(topology.twin, [-1, 3, -1, 1, -1, -1])
-    np.testing.assert_array_equal(topology.is_border_vertex, [True] * 4 + [False])
-    np.testing.assert_array_equal(topology.vertex_half_edge, [0, 1, 2, 5, -1])
-    np.testing.assert_array_equal(topology.vertex_face_count, [1, 2, 2, 1, 0])
-    assert topology.turn(0) == -1
-    assert topology.turn(2) == 3
+    t = mesh_of(5, [[0, 1, 2], [2, 1, 3]])
+    np.testing.assert_array_equal(t.twin, [-1, 3, -1, 1, -1, -1])
+    np.testing.assert_array_equal(t.is_border_vertex, [True] * 4 + [False])
+    np.testing.assert_array_equal(t.vertex_half_edge, [0, 1, 2, 5, -1])
+    np.testing.assert_array_equal(t.vertex_face_count, [1, 2, 2, 1, 0])
+    assert (t.turn(0), t.turn(2)) == (-1, 3)

@@ -13,13 +13,11 @@ from mitsuba_subdivision.mesh import manifold
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from peers import fidelity_cages
 from peers.fidelity_cages import book, fan, joined, strip
-from reference.exact_samples import mesh_of
+from reference.exact_samples import faces_of, mesh_of
 from reference.non_manifold import NonManifoldParts
 from reference.refined_cages import tagged
 
-pytestmark = pytest.mark.core
-
-QUIET = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
+pytestmark = [pytest.mark.core, pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")]
 
 
 def cage_of(peer, **options):
@@ -36,40 +34,31 @@ def rules(cage, vertex):
 
 
 def test_manifold_cages_warn_of_nothing():
-    for cage in (cube(), tetrahedron(), torus(5, 4), cage_of(fan(5)), cage_of(strip(2))):
-        assert cage.non_manifold is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for cage in (cube(), tetrahedron(), torus(5, 4), cage_of(fan(5)), cage_of(strip(2))):
+            assert cage.non_manifold is None
 
 
-@QUIET
-def test_an_edge_of_three_faces_is_sharp_and_its_ends_are_corners():
-    cage = cage_of(book(3))
-    assert rules(cage, 0) == {VertexRule.CORNER}
+def test_pages_run_along_their_spine_and_its_ends_and_where_a_crease_meets_it_are_corners():
+    cage, creased = cage_of(book(3)), cage_of(book(3), creases=[(1, 5, 10)])
+    assert rules(cage, 0) == rules(creased, 1) == {VertexRule.CORNER}
+    assert rules(cage, 1) == rules(creased, 2) == {VertexRule.AUTOMATIC}
     assert len(copies(cage, 0)) == 3
     assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1, 2, 3])
-
-
-@QUIET
-def test_pages_run_along_their_spine():
-    cage = cage_of(book(3))
-    assert rules(cage, 1) == {VertexRule.AUTOMATIC}
     assert np.array_equal(np.flatnonzero(cage.non_manifold.is_crease), [1, 2])
 
 
-@QUIET
-def test_a_crease_that_meets_a_spine_makes_a_corner():
-    cage = cage_of(book(3), creases=[(1, 5, 10)])
-    assert rules(cage, 1) == {VertexRule.CORNER}
-    assert rules(cage, 2) == {VertexRule.AUTOMATIC}
-
-
-@QUIET
 @pytest.mark.parametrize(
-    "spokes", [[], [1], [2], [1, 3], [3, 5], [11, 13, 1], [12, 3]], ids=lambda spokes: f"creases to {spokes}"
+    "spokes",
+    [[], [1], [2], [11], [13], [1, 3], [3, 5], [11, 13, 1], [12, 3]],
+    ids=lambda spokes: f"creases to {spokes}",
 )
 def test_fans_that_share_a_vertex_are_apart(spokes):
     cage = cage_of(joined(fan(5), fan(6), {0: 0}), creases=[(0, spoke, 10) for spoke in spokes])
     cut = cage.cut_mesh.topology
     assert rules(cage, 0) == {VertexRule.CORNER}
+    assert (cut.vertex_face_count > 0).all()
     corners = np.flatnonzero(cage.face_vertices == 0)
     of_fan = [set(cut.face_vertices[of_one].tolist()) for of_one in np.split(corners, [5])]
     assert of_fan[0].isdisjoint(of_fan[1])
@@ -78,7 +67,6 @@ def test_fans_that_share_a_vertex_are_apart(spokes):
         assert len(copies_of_fan) == max(1, sum(spoke in first for spoke in spokes))
 
 
-@QUIET
 def test_all_sides_of_an_edge_have_the_same_points():
     for peer in (book(3), book(4), joined(fidelity_cages.cube(), fidelity_cages.cube(), {0: 7, 1: 6})):
         surface = msub.LimitSurface(cage_of(peer))
@@ -89,31 +77,22 @@ def test_all_sides_of_an_edge_have_the_same_points():
         assert not np.isin(table.copies[1], table.copies[0]).any()
 
 
-def shared_edges(cage, rate):
-    """How many triangles of a tessellation have each edge, edges being told apart by their ends' positions."""
-    t = msub.LimitSurface(cage).tessellate(rate)
-    _, place = np.unique(t.positions, axis=0, return_inverse=True)
-    corners = place.ravel()[t.triangles]
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    return np.unique(edges, axis=0, return_counts=True)[1]
-
-
-@QUIET
 @pytest.mark.parametrize("rate", [1, 2, 5])
 def test_tessellations_have_no_cracks_along_edges_of_many_faces(rate):
     pages = 3
-    counts = np.bincount(shared_edges(cage_of(book(pages)), rate))
+    t = msub.LimitSurface(cage_of(book(pages))).tessellate(rate)
+    # Edges are told apart by the positions of their ends.
+    _, place = np.unique(t.positions, axis=0, return_inverse=True)
+    corners = place.ravel()[t.triangles]
+    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    counts = np.bincount(np.unique(edges, axis=0, return_counts=True)[1])
     assert counts[3] == 3 * rate
     # Of each page: two sides of two edges and the far one of three.
     assert counts[1] == pages * (2 * 2 + 3) * rate
 
 
 def turned_over(cage, faces):
-    sizes, offsets = cage.face_sizes, cage.topology.face_offsets
-    return [
-        cage.face_vertices[offsets[f] : offsets[f] + sizes[f]][:: -1 if f in faces else 1].tolist()
-        for f in range(cage.face_count)
-    ]
+    return [face[:: -1 if f in faces else 1].tolist() for f, face in enumerate(faces_of(cage))]
 
 
 def volume(cage):
@@ -131,7 +110,6 @@ def test_faces_against_their_neighbours_are_turned(faces):
     assert volume(cage) == pytest.approx(volume(cube()), rel=1e-12)
 
 
-@QUIET
 def test_as_few_faces_are_turned_as_possible_and_each_piece_by_itself():
     one, count = torus(5, 4), torus(5, 4).face_count
     other = np.vstack([one.positions, one.positions + 5])
@@ -143,18 +121,14 @@ def test_as_few_faces_are_turned_as_possible_and_each_piece_by_itself():
     assert np.array_equal(np.flatnonzero(changed), [3, 7, count + 2])
 
 
-@QUIET
 def test_data_at_the_corners_of_turned_faces_stays_at_their_vertices():
     plain = cube()
-    rng = np.random.default_rng(2)
-    values, at_vertices = rng.random((8, 2)), plain.face_vertices
-    faces = turned_over(plain, {1, 5})
-    given = np.concatenate(faces)
-    cage = ControlCage(plain.positions, faces, texcoords=msub.Attribute(values, "face_varying", given))
-    assert np.array_equal(cage.texcoords.indices, cage.face_vertices)
-    whole = ControlCage.from_arrays(
-        plain.positions, plain.face_sizes, at_vertices, texcoords=msub.Attribute(values, "face_varying", at_vertices)
+    values, faces = np.random.default_rng(2).random((8, 2)), turned_over(plain, {1, 5})
+    given, at_vertices = (
+        msub.Attribute(values, "face_varying", corners) for corners in (np.concatenate(faces), plain.face_vertices)
     )
+    cage, whole = ControlCage(plain.positions, faces, texcoords=given), tagged(plain, texcoords=at_vertices)
+    assert np.array_equal(cage.texcoords.indices, cage.face_vertices)
     for face in range(6):
         first = cage.face_vertices[4 * face]
         corner = plain.face_vertices[4 * face :][:4].tolist().index(first)
@@ -164,7 +138,6 @@ def test_data_at_the_corners_of_turned_faces_stays_at_their_vertices():
         np.testing.assert_allclose(ours, theirs, atol=1e-14)
 
 
-@QUIET
 @pytest.mark.parametrize(
     "faces",
     [
@@ -179,7 +152,6 @@ def test_faces_that_share_no_edge_are_not_turned(faces):
     assert np.array_equal(cage.face_vertices, np.concatenate(faces))
 
 
-@QUIET
 @pytest.mark.parametrize("collapsed", [{1: 0}, {1: 0, 2: 0}])
 def test_a_face_beside_a_pole_is_turned(collapsed):
     sheet = [[collapsed.get(vertex, vertex) for vertex in face] for face in fidelity_cages.grid(4, 4).faces]
@@ -188,16 +160,16 @@ def test_a_face_beside_a_pole_is_turned(collapsed):
     assert np.array_equal(cage.face_vertices, np.concatenate(sheet))
 
 
-@QUIET
-def test_faces_beside_a_moebius_strip_are_turned_as_any_others():
-    strip_and_sheet = joined(strip(1), fidelity_cages.grid(6, 6), {0: 2, 1: 4})
-    reversed_face = strip_and_sheet.faces[7 + 20]
-    faces = [face if face is not reversed_face else face[::-1] for face in strip_and_sheet.faces]
-    whole, cage = cage_of(strip_and_sheet), ControlCage(strip_and_sheet.positions, faces)
-    assert cage.non_manifold.is_edge.sum() == whole.non_manifold.is_edge.sum() == 2
+def test_faces_that_cannot_agree_have_sharp_edges_between_them_and_others_beside_them_are_turned():
+    cage = cage_of(strip(1))
+    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1])
+    assert np.array_equal(cage.face_vertices, np.concatenate(strip(1).faces))
+    beside = joined(strip(1), fidelity_cages.grid(6, 6), {0: 2, 1: 4})
+    turned = ControlCage(beside.positions, [face[:: -1 if f == 27 else 1] for f, face in enumerate(beside.faces)])
+    for each in (cage, cage_of(beside), turned):
+        assert each.non_manifold.is_edge.sum() == 2
 
 
-@QUIET
 def test_fans_beside_a_spine_hold_it():
     closed = joined(book(3), fan(5), {0: 1})
     assert rules(cage_of(closed), 1) == {VertexRule.CORNER}
@@ -206,37 +178,15 @@ def test_fans_beside_a_spine_hold_it():
     assert rules(ControlCage(np.random.default_rng(1).random((32, 3)), coming_back), 1) == {VertexRule.CORNER}
 
 
-@QUIET
-@pytest.mark.parametrize("spoke", [1, 2, 11, 13])
-def test_every_copy_of_a_vertex_has_a_face(spoke):
-    cage = cage_of(joined(fan(5), fan(6), {0: 0}), creases=[(0, spoke, 10)])
-    assert (cage.cut_mesh.topology.vertex_face_count > 0).all()
-
-
-@QUIET
 def test_thousands_of_fans_are_not_held_against_each_other():
     """Semi-sharp edges of one fan do not matter to the copies of the vertex that the others have: these are corners."""
-    k = 3000
-    ring = 1 + np.arange(6 * k).reshape(k, 6)
-    faces = np.stack(
-        [np.stack([0 * ring[:, 0], ring[:, i], ring[:, i + 1], ring[:, (i + 2) % 6]], axis=1) for i in (0, 2, 4)],
-        axis=1,
-    )
-    cage = ControlCage(
-        np.random.default_rng(1).random((6 * k + 1, 3)), faces.reshape(-1, 4), creases=[(0, r, 1.5) for r in ring[:, 0]]
-    )
+    ring = np.arange(1, 18_001).reshape(-1, 6)
+    faces = np.concatenate([np.c_[0 * ring[:, 0], ring[:, [i, i + 1, (i + 2) % 6]]] for i in (0, 2, 4)])
+    positions, creases = np.random.default_rng(1).random((18_001, 3)), [(0, first, 1.5) for first in ring[:, 0]]
+    cage = ControlCage(positions, faces, creases=creases)
     assert len(cage.cut_mesh.topology.semi_sharpness.across_vertex) == 0
 
 
-@QUIET
-def test_faces_that_cannot_agree_have_sharp_edges_between_them():
-    cage = cage_of(strip(1))
-    assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1])
-    assert cage.non_manifold.is_edge.sum() == 2
-    assert np.array_equal(cage.face_vertices, np.concatenate(strip(1).faces))
-
-
-@QUIET
 def test_boundary_none_keeps_faces_at_edges_of_many_faces():
     # Of the pages' faces only those in the middle beside the spine touch no open edge; they do touch its ends.
     peer = joined(fidelity_cages.cube(), fidelity_cages.cube(), {0: 7, 1: 6})
@@ -258,26 +208,14 @@ def test_the_first_ones_are_named():
 
 def test_three_of_a_kind_are_named_and_an_edge_of_one_face_is_none_of_many():
     spines = [[2 * k, 2 * k + 1, 8 + 3 * k + page] for k in range(4) for page in range(3)]
-    for count, names in (
-        (3, "edge (0, 1), edge (2, 3), edge (4, 5)"),
-        (4, "edge (0, 1), edge (2, 3), edge (4, 5), ..."),
-    ):
+    for count, more in ((3, ""), (4, ", ...")):
         with pytest.warns(CageWarning) as record:
             ControlCage(np.random.default_rng(1).random((22, 3)), [[20, 21, 21], *spines[: 3 * count]])
-        message = str(record[0].message)
+        message, names = str(record[0].message), f"edge (0, 1), edge (2, 3), edge (4, 5){more}"
         assert f"{count} edges of more than two faces, or of two in one direction ({names}); 1 face with" in message
         assert "more than once (face 0)" in message
-
-
-def test_both_ends_of_an_edge_of_many_faces_are_no_fans():
-    with pytest.warns(CageWarning) as record:
-        ControlCage(np.random.default_rng(1).random((5, 3)), [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
-    assert "fans" not in str(record[0].message)
-
-
-def test_strict_is_a_truth_value():
-    with pytest.raises(CageError, match="strict is 'no'; expected True or False"):
-        ControlCage(cube().positions, [[0, 1, 2]], strict="no")
+        # Both ends of such an edge are no fans.
+        assert "fans" not in message
 
 
 def test_strict_cages_are_manifolds(tmp_path):
@@ -293,9 +231,10 @@ def test_strict_cages_are_manifolds(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         again.with_positions(again.positions + 1)
+    with pytest.raises(CageError, match="strict is 'no'; expected True or False"):
+        ControlCage(cube().positions, [[0, 1, 2]], strict="no")
 
 
-@QUIET
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 def test_every_scheme_takes_fans_that_share_a_vertex(scheme):
     peer = joined(fan(4, triangles=scheme == "loop"), fan(5, triangles=scheme == "loop"), {0: 0})
@@ -307,7 +246,6 @@ def test_every_scheme_takes_fans_that_share_a_vertex(scheme):
         assert surface.patches.patch_count == 1 + 5
 
 
-@QUIET
 @pytest.mark.parametrize("interpolation", ["vertex", "varying", "face_varying"])
 def test_data_that_is_linear_in_space_stays_so(interpolation):
     # Affine invariance, of points and values alike; on the surface for values that follow it.
@@ -317,13 +255,12 @@ def test_data_that_is_linear_in_space_stays_so(interpolation):
     data = msub.Attribute(rows, interpolation, corners if interpolation == "face_varying" else None)
     surface = msub.LimitSurface(cage_of(peer, attributes={"place": data}, face_varying="none"))
     tessellation = surface.tessellate(4)
+    found = tessellation.attributes["place"]
+    assert np.isfinite(found).all()
     if interpolation != "varying":
-        np.testing.assert_allclose(tessellation.attributes["place"], tessellation.positions[:, :2], atol=1e-14)
-    else:
-        assert np.isfinite(tessellation.attributes["place"]).all()
+        np.testing.assert_allclose(found, tessellation.positions[:, :2], atol=1e-14)
 
 
-@QUIET
 @pytest.mark.parametrize("mode", ["none", "corners_only", "corners_plus1", "corners_plus2", "boundaries"])
 @pytest.mark.parametrize("triangles", [False, True])
 def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, mode, np_rng):
@@ -380,32 +317,23 @@ def random_faces(rng):
     return topologies.numbered(changes[rng.integers(len(changes))])
 
 
-def with_unused_vertex(faces):
-    return mesh_of(2 + max(map(max, faces)), faces)
-
-
 # In which every vertex and edge is what it is many times over.
 RANDOM_MESHES = 300
+FEW_FACES = manifold.FEW_FACES
 
 
-# Few faces at a vertex are counted by turning about it, more by pointer doubling.
-@pytest.mark.parametrize("few_faces", [manifold.FEW_FACES, 2])
-def test_a_manifold_is_known_at_once(few_faces, np_rng, monkeypatch):
-    monkeypatch.setattr(manifold, "FEW_FACES", few_faces)
-    found = set()
+def test_what_is_no_manifold_is_so_by_definition(np_rng, monkeypatch):
+    creases = closed_fans = manifolds = 0
     for _ in range(RANDOM_MESHES):
         faces = random_faces(np_rng)
-        expected = not NonManifoldParts(faces).vertices and all(len({*face}) == len(face) for face in faces)
-        assert manifold.is_manifold(with_unused_vertex(faces)) == expected, faces
-        found.add(expected)
-    assert found == {True, False}
-
-
-def test_what_is_no_manifold_is_so_by_definition(np_rng):
-    creases = closed_fans = 0
-    for _ in range(RANDOM_MESHES):
-        faces = random_faces(np_rng)
-        mesh, expected = with_unused_vertex(faces), NonManifoldParts(faces)
+        # With a vertex that no face uses.
+        mesh, expected = mesh_of(2 + max(map(max, faces)), faces), NonManifoldParts(faces)
+        is_manifold = not expected.vertices and all(len({*face}) == len(face) for face in faces)
+        # Few faces at a vertex are counted by turning about it, more by pointer doubling.
+        for few_faces in (2, FEW_FACES):
+            monkeypatch.setattr(manifold, "FEW_FACES", few_faces)
+            assert manifold.is_manifold(mesh) == is_manifold, faces
+        manifolds += is_manifold
         separate, found = manifold.separated(mesh)
         assert (found is not None) == bool(expected.vertices), faces
         twins = np.full(mesh.half_edge_count, -1)
@@ -422,4 +350,4 @@ def test_what_is_no_manifold_is_so_by_definition(np_rng):
         assert len(np.unique(found.edge)) == mesh.edge_count
         creases += len(expected.creases)
         closed_fans += len(expected.closed_fans)
-    assert min(creases, closed_fans) > 10
+    assert min(creases, closed_fans, manifolds) > 10

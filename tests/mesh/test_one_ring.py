@@ -11,7 +11,6 @@ from reference.refined_cages import sheet, tagged
 
 pytestmark = pytest.mark.core
 
-KINDS = ("face", "vertex")
 # Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
 PILLOWS = {f"pillow {n}": mesh_of(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}
 TOPOLOGIES = {name: make().topology for name, make in CLOSED_CAGES.items()} | PILLOWS
@@ -24,17 +23,18 @@ LARGE = {
 }
 
 
-# Elements looked at in each mesh.
-ENOUGH = 80
-
-
-def half_edges_of(topology):
+def half_edges_of(topology, most=80):
+    """Some of them, all over the mesh."""
     count = topology.half_edge_count
-    return np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).astype(int)).tolist()
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
 
 def by_name(topologies):
     return pytest.mark.parametrize("topology", topologies.values(), ids=topologies)
+
+
+WITH_SHEETS = TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology}
+EVERY_KIND = pytest.mark.parametrize("kind", ["face", "vertex"])
 
 
 def quads_at(*valences):
@@ -46,11 +46,6 @@ def element_vertices(topology, half_edge, kind):
     turn = half_edge - topology.face_offsets[topology.face[half_edge]]
     turned = face[turn:] + face[:turn]
     return turned if kind == "face" else turned[:1]
-
-
-def local_faces(ring):
-    """Local vertices of each local face, from where the walk arrives there."""
-    return polygons(ring.topology)
 
 
 def test_quad_has_twice_its_valences_less_16_control_points():
@@ -65,20 +60,13 @@ def test_vertex_has_the_control_points_of_its_fan(fan):
 
 
 @by_name(TOPOLOGIES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_local_mesh_has_the_signature_it_was_made_from(topology, kind):
-    for half_edge in half_edges_of(topology):
-        signature = signature_at(topology, half_edge, kind)
-        assert signature_at(one_ring(signature).topology, 0, kind) == signature
-
-
-@by_name(TOPOLOGIES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_signature_lists_the_faces_around_each_corner(topology, kind):
+@EVERY_KIND
+def test_signature_lists_the_faces_around_each_corner_and_the_local_mesh_has_it(topology, kind):
     faces = polygons(topology)
     for half_edge in half_edges_of(topology):
         signature = signature_at(topology, half_edge, kind)
         assert signature.kind == kind
+        assert signature_at(one_ring(signature).topology, 0, kind) == signature
         corners = element_vertices(topology, half_edge, kind)
         assert len(signature.fans) == len(corners)
         assert signature.valences == tuple(sum(v in f for f in faces) for v in corners)
@@ -88,12 +76,11 @@ def test_signature_lists_the_faces_around_each_corner(topology, kind):
 
 
 @by_name(TOPOLOGIES)
-@pytest.mark.parametrize("kind", KINDS)
+@EVERY_KIND
 def test_gathered_ring_is_a_map_of_meshes(topology, kind):
-    """Local faces land on faces of the mesh, and local edges on edges between the same faces."""
-    half_edge_of = {}
-    for half_edge in range(topology.half_edge_count):
-        half_edge_of[topology.face[half_edge], topology.face_vertices[half_edge]] = half_edge
+    """The element comes first; local faces land on faces, and local edges on edges between the same faces."""
+    starts = zip(topology.face.tolist(), topology.face_vertices.tolist(), strict=True)
+    half_edge_of = {start: half_edge for half_edge, start in enumerate(starts)}
     faces = {}
     for index, face in enumerate(polygons(topology)):
         faces |= {face[i:] + face[:i]: index for i in range(len(face))}
@@ -101,16 +88,19 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
         ring = one_ring(signature_at(topology, half_edge, kind))
         controls = ring.gather(topology, np.array([half_edge]))[0]
         local = ring.topology
-        landed = [faces[tuple(int(v) for v in controls[list(face)])] for face in local_faces(ring)]
-        where = local.face, local.face_vertices
-        image = np.array([half_edge_of[landed[f], controls[v]] for f, v in zip(*where, strict=True)])
+        element = element_vertices(topology, half_edge, kind)
+        assert tuple(controls[: len(element)]) == element
+        assert tuple(local.face_vertices[: len(element)]) == tuple(range(len(element)))
+        landed = [faces[tuple(int(v) for v in controls[list(face)])] for face in polygons(ring.topology)]
+        places = zip(local.face, local.face_vertices, strict=True)
+        image = np.array([half_edge_of[landed[f], controls[v]] for f, v in places])
         assert image[0] == half_edge
         inner = np.flatnonzero(local.twin >= 0)
         np.testing.assert_array_equal(topology.twin[image[inner]], image[local.twin[inner]])
 
 
 @by_name(LARGE)
-@pytest.mark.parametrize("kind", KINDS)
+@EVERY_KIND
 def test_gathered_ring_is_every_face_that_shares_a_vertex_once(topology, kind):
     faces = polygons(topology)
     for half_edge in half_edges_of(topology):
@@ -118,30 +108,26 @@ def test_gathered_ring_is_every_face_that_shares_a_vertex_once(topology, kind):
         expected = sorted(sorted(f) for f in faces if not element.isdisjoint(f))
         ring = one_ring(signature_at(topology, half_edge, kind))
         controls = ring.gather(topology, np.array([half_edge]))[0]
-        assert sorted(sorted(controls[list(face)]) for face in local_faces(ring)) == expected
+        assert sorted(sorted(controls[list(face)]) for face in polygons(ring.topology)) == expected
         assert sorted(controls) == sorted({v for f in expected for v in f})
 
 
-@by_name(TOPOLOGIES)
-def test_element_comes_first_in_its_ring(topology):
-    for half_edge in half_edges_of(topology):
-        element = element_vertices(topology, half_edge, "face")
-        ring = one_ring(signature_at(topology, half_edge, "face"))
-        controls = ring.gather(topology, np.array([half_edge]))[0]
-        assert tuple(controls[: len(element)]) == element
-        assert tuple(ring.topology.face_vertices[: len(element)]) == tuple(range(len(element)))
-
-
-@by_name(TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology})
-@pytest.mark.parametrize("kind", KINDS)
-def test_vertices_around_fans_are_those_gathered(topology, kind):
+@by_name(WITH_SHEETS)
+@EVERY_KIND
+def test_many_elements_gather_as_each_alone(topology, kind):
+    classes = {}
     for half_edge in range(topology.half_edge_count):
-        ring = one_ring(signature_at(topology, half_edge, kind))
-        found = ring.vertices_around(topology, fan_half_edges(topology, half_edge, kind))
-        np.testing.assert_array_equal(found, ring.gather(topology, np.array([half_edge] * (FEW_ELEMENTS + 1)))[0])
+        classes.setdefault(signature_at(topology, half_edge, kind), []).append(half_edge)
+    for signature, members in classes.items():
+        ring = one_ring(signature)
+        together = ring.gather(topology, np.array(members * (FEW_ELEMENTS + 1)))
+        assert together.shape == (len(members) * (FEW_ELEMENTS + 1), ring.vertex_count)
+        alone = [ring.vertices_around(topology, fan_half_edges(topology, member, kind)) for member in members]
+        np.testing.assert_array_equal(together, alone * (FEW_ELEMENTS + 1))
+        np.testing.assert_array_equal(ring.gather(topology, np.array(members[:1])), alone[:1])
 
 
-@by_name(TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology})
+@by_name(WITH_SHEETS)
 def test_half_edges_around_each_corner_are_turns_apart(topology):
     for half_edge in range(topology.half_edge_count):
         fans = fan_half_edges(topology, half_edge, "face")
@@ -162,21 +148,6 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
 
 
 @by_name(TOPOLOGIES)
-@pytest.mark.parametrize("kind", KINDS)
-def test_many_elements_gather_as_each_alone(topology, kind):
-    classes = {}
-    for half_edge in half_edges_of(topology):
-        classes.setdefault(signature_at(topology, half_edge, kind), []).append(half_edge)
-    for signature, members in classes.items():
-        ring = one_ring(signature)
-        many = members * (FEW_ELEMENTS + 1)
-        together = ring.gather(topology, np.array(many))
-        assert together.shape == (len(many), ring.vertex_count)
-        for row, member in zip(together, many, strict=True):
-            np.testing.assert_array_equal(row, ring.gather(topology, np.array([member]))[0])
-
-
-@by_name(TOPOLOGIES)
 def test_signature_of_the_next_corner_is_rotated(topology):
     for half_edge in half_edges_of(topology):
         by_face = signature_at(topology, half_edge, "face")
@@ -190,7 +161,6 @@ def test_signature_of_the_next_corner_is_rotated(topology):
 @pytest.mark.parametrize(
     ("cage", "places", "vertices"),
     [(tetrahedron(), 4, 4), (cube(), 8, 8), (torus(3, 3), 16, 9), (torus(3, 5), 16, 12), (torus(4, 4), 16, 16)],
-    ids=["tetrahedron", "cube", "torus 3 x 3", "torus 3 x 5", "torus 4 x 4"],
 )
 def test_small_cages_fill_places_more_than_once(cage, places, vertices):
     ring = one_ring(signature_at(cage.topology, 0, "face"))

@@ -1,7 +1,5 @@
 """Locations all over a surface."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.patches import LinearChannel, SubdividedChannel, channel
 from patches.closed_cages import mixed_torus
 from patches.locations import grid_locations
-from reference.refined_cages import refine_first
+from reference.refined_cages import refine_first, tagged
 
 # Sums of some tens of terms of order one, in double precision.
 ROUNDING = 1e-13
@@ -25,9 +25,7 @@ def with_attributes(cage, rng, **options):
         "smooth": Attribute(rng.random((count, 1)), "face_varying", cage.face_vertices),
         "islands": Attribute(rng.random((corners, 1)), "face_varying"),
     }
-    return ControlCage.from_arrays(
-        cage.positions, cage.face_sizes, cage.face_vertices, attributes=attributes, **options
-    )
+    return tagged(cage, attributes=attributes, **options)
 
 
 CAGES = {
@@ -52,28 +50,17 @@ def test_values_are_weights_times_the_cages(name, refines, np_rng, monkeypatch):
         channel = surface.channel(attribute)
         weights = channel.weights(start, uv)
         assert weights.shape == (len(start), len(channel.values))
+        assert channel.weights(start[:0], uv[:0]).shape == (0, len(channel.values))
         np.testing.assert_allclose(weights @ channel.values, channel.evaluate(start, uv), rtol=0, atol=ROUNDING)
         np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=0, atol=ROUNDING)
 
 
 def test_values_of_doo_sabin_are_weights_times_the_cages(np_rng):
     cage = named_cages.torus(5, 4)
-    values = {"heat": np_rng.random((cage.vertex_count, 1))}
-    surface = LimitSurface(
-        ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), attributes=values), "doo_sabin"
-    )
+    surface = LimitSurface(tagged(cage, attributes={"heat": np_rng.random((cage.vertex_count, 1))}), "doo_sabin")
     channel, locations = surface.channel("heat"), grid_locations(surface, 3)
-    np.testing.assert_allclose(
-        channel.weights(*locations) @ channel.values, channel.evaluate(*locations), rtol=0, atol=ROUNDING
-    )
-
-
-def test_no_samples_have_no_weights():
-    surface = LimitSurface(with_attributes(named_cages.cube(), np.random.default_rng(0)))
-    for name in surface.attribute_names:
-        channel = surface.channel(name)
-        weights = channel.weights(np.empty(0, dtype=np.int64), np.empty((0, 2)))
-        assert weights.shape == (0, len(channel.values))
+    weights = channel.weights(*locations)
+    np.testing.assert_allclose(weights @ channel.values, channel.evaluate(*locations), rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("mode", ["corners_only", "corners_plus1", "corners_plus2", "boundaries"])
@@ -96,7 +83,8 @@ def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monk
 
 def test_values_of_faces_cut_from_each_other_are_subdivided_where_that_is_not_linear(np_rng):
     """Without corners there, and around the middle of polygons."""
-    smooth = LimitSurface(with_attributes(named_cages.cube(), np_rng, face_varying="none"))
-    polygons = LimitSurface(with_attributes(mixed_torus(), np_rng))
-    assert isinstance(smooth.channel("islands"), SubdividedChannel)
-    assert isinstance(polygons.channel("islands"), SubdividedChannel)
+    for cage in (
+        with_attributes(named_cages.cube(), np_rng, face_varying="none"),
+        with_attributes(mixed_torus(), np_rng),
+    ):
+        assert isinstance(LimitSurface(cage).channel("islands"), SubdividedChannel)

@@ -3,17 +3,15 @@
 Another path to them is a search by evaluation alone: many samples, and finer and finer grids around the nearest one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.patches import closest_points, polynomial_pieces
 from mitsuba_subdivision.patches.nearest_in_piece import nearest_in_pieces
 from mitsuba_subdivision.patches.turned_boxes import TurnedBoxes
-from patches.closed_cages import bumpy, cage_of
+from patches.closed_cages import bumpy, cage_of, creased
 from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 from scipy.spatial import cKDTree
@@ -38,15 +36,11 @@ def points_around(samples, np_rng):
     low, high = samples.p.min(axis=0), samples.p.max(axis=0)
     size = float((high - low).max())
     first, second, third = np_rng.integers(0, len(samples.p), (3, COUNT))
-    return size, np.concatenate(
-        [
-            np_rng.uniform(low - 0.3 * size, high + 0.3 * size, (COUNT, 3)),
-            samples.p[first] + np_rng.normal(size=(COUNT, 3)) * 0.02 * size,
-            samples.p[second],
-            samples.p[third] + np_rng.normal(size=(COUNT, 1)) * 0.1 * size * samples.n[third],
-            np_rng.normal(size=(2, 3)) * 30 * size,
-        ]
-    )
+    around = np_rng.uniform(low - 0.3 * size, high + 0.3 * size, (COUNT, 3))
+    near = samples.p[first] + np_rng.normal(size=(COUNT, 3)) * 0.02 * size
+    above = samples.p[third] + np_rng.normal(size=(COUNT, 1)) * 0.1 * size * samples.n[third]
+    far = np_rng.normal(size=(2, 3)) * 30 * size
+    return size, np.concatenate([around, near, samples.p[second], above, far])
 
 
 def distances_by_evaluation(surface, points, samples, start, uv, spacing):
@@ -140,23 +134,15 @@ def test_points_above_places_next_to_extraordinary_ones(name, np_rng):
     uv = deep * (np_rng.dirichlet(np.ones(domain.corner_count), len(deep)) @ domain.corners)
     element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))
     samples = surface.evaluate(element, uv)
-    away = 1e-3 * samples.n
-    found = surface.closest_point(samples.p + away)
-    assert (found.distance <= 1e-3 + ROUNDED).all()
+    assert (surface.closest_point(samples.p + 1e-3 * samples.n).distance <= 1e-3 + ROUNDED).all()
 
 
 def test_creases_are_found(np_rng):
     """A cube of creases is flat: the nearest points are those of a box."""
-    edges = {
-        tuple(sorted(edge))
-        for face in cube().face_vertices.reshape(-1, 4)
-        for edge in zip(face, np.roll(face, -1), strict=True)
-    }
-    box = LimitSurface(tagged(cube(), creases=[(int(a), int(b), 10.0) for a, b in edges]))
     points = np_rng.uniform(1, 3, (50, 3)) * np_rng.choice([-1, 1], (50, 3))
     points[:20, 0] = np_rng.uniform(-1, 1, 20)
     points[:10, 1] = np_rng.uniform(-1, 1, 10)
-    found = box.closest_point(points)
+    found = LimitSurface(creased(cube())).closest_point(points)
     np.testing.assert_allclose(found.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
 
 
@@ -172,37 +158,30 @@ def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
     np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("kept", [0, 100])
-def test_levels_that_are_made_when_needed_change_nothing(kept, np_rng, monkeypatch):
-    surface = surface_named("rook")
-    points = np_rng.uniform(-1.5, 3, (300, 3))
-    expected = surface.closest_point(points)
-    monkeypatch.setattr(closest_points, "MOST_KEPT", kept)
-    found = LimitSurface(surface.cage).closest_point(points)
-    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("name", ["mixed torus", "semi-sharp ring"])
-def test_elements_that_are_divided_when_needed_change_nothing(name, np_rng, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "count", "module", "limits"),
+    [
+        ("rook", 300, closest_points, {"MOST_KEPT": 0}),
+        ("rook", 300, closest_points, {"MOST_KEPT": 100}),
+        ("mixed torus", 20, polynomial_pieces, {"MOST_PIECES": 1, "DIVISIONS": 1}),
+        ("semi-sharp ring", 20, polynomial_pieces, {"MOST_PIECES": 1, "DIVISIONS": 1}),
+    ],
+)
+def test_levels_and_divisions_that_are_made_when_needed_change_nothing(
+    name, count, module, limits, np_rng, monkeypatch
+):
     surface = surface_named(name)
-    points = np_rng.uniform(-1.5, 3, (20, 3))
+    points = np_rng.uniform(-1.5, 3, (count, 3))
     expected = surface.closest_point(points)
-    monkeypatch.setattr(polynomial_pieces, "MOST_PIECES", 1)
-    monkeypatch.setattr(polynomial_pieces, "DIVISIONS", 1)
+    for limit, value in limits.items():
+        monkeypatch.setattr(module, limit, value)
     later = LimitSurface(surface.cage)
     np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
     assert later.area() == pytest.approx(surface.area(), rel=AREA)
 
 
-def test_descents_are_the_same_in_every_unit_of_length(np_rng):
-    """From anywhere, also where the distance is not convex."""
-    cage, count = surface_named("mixed torus").cage, 500
-    points, begin, found = np_rng.normal(size=(count, 3)) * 3, np_rng.uniform(0.1, 0.9, (count, 2)), []
-    # Powers of two, by which all products are scaled exactly.
-    for unit in (1, 2.0**-20):
-        pieces = LimitSurface(cage.with_positions(unit * cage.positions))._all_pieces.regular
-        found.append(nearest_in_pieces(pieces, np.arange(count) % len(pieces), unit * points, begin, unit)[0])
-    np.testing.assert_array_equal(*found)
+def points_of_pieces(pieces, which, uv):
+    return np.einsum("sb,sbx->sx", pieces.basis.values(uv), pieces.coefficients[which]) + pieces.origins[which]
 
 
 def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_rng):
@@ -215,12 +194,9 @@ def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_
     is_convex = boxes.are_convex(away, which[near])
     assert 0 < np.count_nonzero(is_convex) < count
     one, other = np_rng.random((2, count, 2))
-    squared = []
-    for uv in (one, other, (one + other) / 2):
-        p = np.einsum("sb,sbx->sx", pieces.basis.values(uv), pieces.coefficients[which]) + pieces.origins[which]
-        squared.append(((p - points) ** 2).sum(axis=1)[near])
-    mean = (squared[0] + squared[1]) / 2
-    assert (squared[2] <= (1 + ROUNDED) * mean)[is_convex].all()
+    places = [points_of_pieces(pieces, which, uv) for uv in (one, other, (one + other) / 2)]
+    first, second, middle = (((p - points) ** 2).sum(axis=1)[near] for p in places)
+    assert (middle <= (1 + ROUNDED) * (first + second) / 2)[is_convex].all()
 
 
 def test_bounds_around_extraordinary_points_move_with_them():
@@ -230,35 +206,32 @@ def test_bounds_around_extraordinary_points_move_with_them():
         np.testing.assert_allclose(one.reach(2), other.reach(2), rtol=1e-9)
 
 
-def test_descents_end_at_local_minima(np_rng):
-    """From anywhere in a piece, also where the distance is not convex: nothing within a small step is nearer."""
-    pieces = surface_named("mixed torus")._all_pieces.regular
-    points, which = np_rng.normal(size=(500, 3)) * 3, np.arange(500) % len(pieces)
-    uv, squared, _ = nearest_in_pieces(pieces, which, points, np_rng.uniform(0, 1, (500, 2)), 1.0)
-    for step in 1e-4 * STEPS:
-        values = pieces.basis.values(np.clip(uv + step, 0, 1))
-        p = np.einsum("sb,sbx->sx", values, pieces.coefficients[which]) + pieces.origins[which]
-        assert (((p - points) ** 2).sum(axis=1) >= (1 - ROUNDED) * squared).all()
-
-
-def test_descents_of_many_points_are_those_of_few(np_rng):
-    """Some take shorter steps where others have taken theirs."""
-    pieces, count = surface_named("mixed torus")._all_pieces.regular, 600
+def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_points(np_rng):
+    """From anywhere in a piece, also where the distance is not convex."""
+    cage, count = surface_named("mixed torus").cage, 600
+    pieces = LimitSurface(cage)._all_pieces.regular
     points, which, begin = np_rng.normal(size=(count, 3)) * 3, np.arange(count) % len(pieces), np_rng.random((count, 2))
-    together, _, slope = nearest_in_pieces(pieces, which, points, begin, 1.0)
+    uv, squared, slope = nearest_in_pieces(pieces, which, points, begin, 1.0)
+    # Nothing within a small step is nearer.
+    for step in 1e-4 * STEPS:
+        p = points_of_pieces(pieces, which, np.clip(uv + step, 0, 1))
+        assert (((p - points) ** 2).sum(axis=1) >= (1 - ROUNDED) * squared).all()
+    # By powers of two all products are scaled exactly.
+    unit = 2.0**-20
+    scaled = LimitSurface(cage.with_positions(unit * cage.positions))._all_pieces.regular
+    np.testing.assert_array_equal(nearest_in_pieces(scaled, which, unit * points, begin, unit)[0], uv)
+    # Some take shorter steps where others have taken theirs.
     parts = [nearest_in_pieces(pieces, which[at], points[at], begin[at], 1.0) for at in np.split(np.arange(count), 100)]
-    np.testing.assert_allclose(together, np.concatenate([uv for uv, _, _ in parts]), rtol=0, atol=DESCENT)
+    np.testing.assert_allclose(uv, np.concatenate([each for each, _, _ in parts]), rtol=0, atol=DESCENT)
     np.testing.assert_allclose(slope, np.concatenate([each for _, _, each in parts]), rtol=0, atol=DESCENT)
 
 
 def test_nearest_points_move_with_the_surface(np_rng):
     surface = surface_named("hexagon")
     points, shift = np_rng.normal(size=(50, 3)) * 2, np.array([3.0, -1.0, 0.5])
-    found = surface.closest_point(points)
-    moved = LimitSurface(surface.cage.with_positions(2 * surface.cage.positions + shift)).closest_point(
-        2 * points + shift
-    )
-    np.testing.assert_allclose(moved.distance, 2 * found.distance, rtol=0, atol=1e-13)
+    moved = LimitSurface(surface.cage.with_positions(2 * surface.cage.positions + shift))
+    found, expected = moved.closest_point(2 * points + shift).distance, 2 * surface.closest_point(points).distance
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
 def test_holes_have_no_nearest_points():
@@ -277,7 +250,6 @@ def test_no_points_have_no_nearest_ones():
 
 
 def test_a_collapsed_surface_is_a_point():
-    cage = ControlCage(np.ones_like(cube().positions), cube().face_vertices.reshape(-1, 4))
-    found = LimitSurface(cage).closest_point([[1.0, 1.0, 4.0]])
+    found = LimitSurface(cube().with_positions(np.ones((8, 3)))).closest_point([[1.0, 1.0, 4.0]])
     np.testing.assert_allclose(found.p, [[1, 1, 1]], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(found.n, [[0, 0, 0]])

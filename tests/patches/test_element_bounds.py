@@ -1,7 +1,5 @@
 """Boxes of elements: they contain the surface in both precisions, and are little larger than they have to be."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
@@ -11,8 +9,8 @@ from patches.closed_cages import bumpy, cage_of
 from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 
-EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 SAMPLES = 5000
+MANY_SAMPLES = ("mixed torus", "loop mixed torus", "doo_sabin mixed torus")
 # Diagonals of boxes, in those of the tight ones.
 LONGER = 1.05
 # Samples on a grid leave out some of the tight box: a part of the bend between two of them.
@@ -36,14 +34,9 @@ def assert_contained(surface, np_rng, count=SAMPLES):
         assert (found <= upper[element]).all()
 
 
-@EVERY_SURFACE
+@pytest.mark.parametrize("name", SURFACES)
 def test_boxes_contain_the_surface_in_both_precisions(name, np_rng):
-    assert_contained(surface_named(name), np_rng)
-
-
-@pytest.mark.parametrize("name", ["mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
-def test_boxes_contain_very_many_samples(name, np_rng):
-    assert_contained(surface_named(name), np_rng, 100_000)
+    assert_contained(surface_named(name), np_rng, 100_000 if name in MANY_SAMPLES else SAMPLES)
 
 
 @pytest.mark.parametrize("name", ["cube", "loop valence 3", "doo_sabin mixed torus"])
@@ -66,17 +59,16 @@ def test_a_minimum_inside_an_element_is_met_to_a_256th_of_its_square():
     assert -1 / 256 - 1e-5 <= bounds.lower[middle, 2] <= 0
 
 
-@EVERY_SURFACE
-def test_boxes_are_tight(name):
-    assert_tight(surface_named(name))
+def bent(scheme):
+    return LimitSurface(bumpy(cage_of(scheme, "mixed torus"), size=1), scheme)
 
 
-@pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
-def test_boxes_of_surfaces_that_bend_much_are_tight(scheme):
-    assert_tight(LimitSurface(bumpy(cage_of(scheme, "mixed torus"), size=1), scheme))
-
-
-def assert_tight(surface):
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [(surface_named, name) for name in SURFACES] + [(bent, name) for name in ("catmull_clark", "loop", "doo_sabin")],
+)
+def test_boxes_are_tight(make, name):
+    surface = make(name)
     bounds = surface.bounds()
     start, uv = grid_locations(surface, GRID)
     points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
@@ -91,8 +83,7 @@ def assert_tight(surface):
 def test_boxes_of_flat_elements_are_the_elements():
     surface = LimitSurface(sheet(4, 3))
     inner = surface.bounds([5])
-    np.testing.assert_allclose(inner.lower, [[1, 1, 0]], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(inner.upper, [[2, 2, 0]], rtol=0, atol=1e-5)
+    np.testing.assert_allclose([inner.lower, inner.upper], [[[1, 1, 0]], [[2, 2, 0]]], rtol=0, atol=1e-5)
 
 
 def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
@@ -102,19 +93,17 @@ def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
     assert refined.patches.refined is not None
     assert_contained(refined, np_rng)
     monkeypatch.undo()
-    bounds, others = refined.bounds(), LimitSurface(cage).bounds()
-    size = np.linalg.norm(others.upper - others.lower, axis=1).max()
+    found, expected = ([each.lower, each.upper] for each in (refined.bounds(), LimitSurface(cage).bounds()))
+    size = np.linalg.norm(expected[1] - expected[0], axis=1).max()
     # Parts around extraordinary points are bounded otherwise.
-    np.testing.assert_allclose(bounds.lower, others.lower, rtol=0, atol=0.03 * size)
-    np.testing.assert_allclose(bounds.upper, others.upper, rtol=0, atol=0.03 * size)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.03 * size)
 
 
 def test_elements_are_chosen_by_number():
     surface = LimitSurface(bumpy(cage_of("catmull_clark", "mixed torus")))
-    every, some = surface.bounds(), surface.bounds([4, 1, 4])
-    assert some.element.tolist() == [4, 1, 4]
-    np.testing.assert_array_equal(some.lower, every.lower[[4, 1, 4]])
-    np.testing.assert_array_equal(some.upper, every.upper[[4, 1, 4]])
+    every, some, chosen = surface.bounds(), surface.bounds([4, 1, 4]), [4, 1, 4]
+    assert some.element.tolist() == chosen
+    np.testing.assert_array_equal([some.lower, some.upper], [every.lower[chosen], every.upper[chosen]])
 
 
 def test_holes_have_no_box():
@@ -131,10 +120,8 @@ def test_elements_that_do_not_exist_are_an_error(element, problem):
 
 
 def test_a_collapsed_surface_has_boxes():
-    cage = ControlCage(np.zeros_like(cube().positions), cube().face_vertices.reshape(-1, 4))
-    bounds = LimitSurface(cage).bounds()
-    assert (bounds.lower == 0).all()
-    assert (bounds.upper == 0).all()
+    bounds = LimitSurface(cube().with_positions(np.zeros((8, 3)))).bounds()
+    np.testing.assert_array_equal([bounds.lower, bounds.upper], 0)
 
 
 def test_boxes_do_not_depend_on_the_numbering_of_faces():

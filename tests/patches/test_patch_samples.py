@@ -1,9 +1,8 @@
 """Laws of samples anywhere on surfaces of every kind."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
+from evaluation.common import evaluate_from
 from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
@@ -32,23 +31,17 @@ def close(found, expected, size, atol=ROUNDED):
 
 
 @EVERY_SURFACE
-def test_samples_are_limit_stencils_applied(name, np_rng):
+def test_samples_are_limit_stencils_applied_and_first_levels_as_eigencoordinates_have_them(name, np_rng):
     surface = surface_named(name)
     where = locations(surface, np_rng)
     found, weights, points = surface.evaluate(*where), surface.matrix(*where), surface.cage.positions
     close(found.p, weights.p @ points, np.abs(points).max())
     for own, matrix in ((found.dp_du, weights.dp_du), (found.dp_dv, weights.dp_dv)):
         close(own, matrix @ points, (np.abs(matrix) @ np.abs(points)).max(), 10 * ROUNDED)
-
-
-@EVERY_SURFACE
-def test_first_levels_are_as_eigencoordinates_have_them(name, np_rng):
-    surface = surface_named(name)
-    where = locations(surface, np_rng)
     # With second derivatives, no level is a piece.
-    found, expected = surface.evaluate(*where), surface.evaluate(*where, derivatives=2)
+    expected = surface.evaluate(*where, derivatives=2)
     np.testing.assert_array_equal(found.level, expected.level)
-    close(found.p, expected.p, np.abs(surface.cage.positions).max())
+    close(found.p, expected.p, np.abs(points).max())
     close(found.n, expected.n, 1, NORMAL)
     np.testing.assert_array_equal((found.n == 0).all(axis=1), (expected.n == 0).all(axis=1))
 
@@ -58,36 +51,29 @@ def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
     surface = surface_named(name)
     where = locations(surface, np_rng, 90)
     expected, size = surface.evaluate(*where), np.abs(surface.cage.positions).max()
-    for chosen in (slice(None, None, -1), slice(0, 1), slice(5, 6), slice(40, 43)):
+
+    def check(chosen):
         found = surface.evaluate(*(each[chosen] for each in where))
         close(found.p, expected.p[chosen], size)
         close(found.n, expected.n[chosen], 1, NORMAL)
         np.testing.assert_array_equal(found.level, expected.level[chosen])
+
+    for chosen in (slice(None, None, -1), slice(0, 1), slice(5, 6), slice(40, 43)):
+        check(chosen)
     # In short runs.
     monkeypatch.setattr(channel, "WEIGHTS", 70)
-    found = surface.evaluate(*where)
-    close(found.p, expected.p, size)
-    close(found.n, expected.n, 1, NORMAL)
+    check(slice(None))
 
 
 @pytest.mark.parametrize("valence", [3, 5, 7])
 @pytest.mark.parametrize(("make", "scheme"), [(extraordinary, "catmull_clark"), (extraordinary_triangles, "loop")])
 def test_normals_tend_to_that_of_the_extraordinary_vertex(make, scheme, valence):
     surface = LimitSurface(bumpy(make(valence)), scheme)
-    t = surface.patches.elements
-    start = np.flatnonzero(t.face_vertices == 0)
-    face = t.face[start]
-    corner = start - t.face_offsets[face]
-    at = surface.evaluate(face, np.zeros((len(face), 2)), corner)
+    start = np.flatnonzero(surface.patches.elements.face_vertices == 0)
+    at = evaluate_from(surface, start, [[0.0, 0.0]])
     close(at.n, np.broadcast_to(at.n[0], at.n.shape), 1, NORMAL)
     for size in (1e-12, 1e-100):
-        near = surface.evaluate(face, np.full((len(face), 2), size), corner)
+        near = evaluate_from(surface, start, [[size, size]])
         # The slower the more faces there are.
         close(near.n, at.n, 1, NORMAL if size == 1e-100 else 1e-3)
         np.testing.assert_allclose(np.linalg.norm(near.n, axis=1), 1, rtol=1e-12)
-
-
-def test_nothing_is_nowhere():
-    found = surface_named("cube").evaluate(np.empty(0, dtype=int), np.empty((0, 2)))
-    assert found.p.shape == found.n.shape == (0, 3)
-    assert found.level.shape == (0,)

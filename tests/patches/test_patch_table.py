@@ -1,8 +1,7 @@
-from collections import Counter
-
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import ControlCage
+from evaluation.test_semi_sharp import CAGES as SEMI_SHARP
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import NEAR_FACES, signature_at
@@ -13,45 +12,53 @@ from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
 
+EVERY_CAGE = {f"{scheme} {name}": (scheme, cage_of(scheme, name)) for scheme, name in SURFACES} | SEMI_SHARP
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 
 
 def patch_table(scheme, cage):
-    return PatchTable(cage.topology, scheme_named(scheme))
+    return LimitSurface(cage, scheme).patches
 
 
 def signature_of(table, corner):
     return signature_at(table.topology, int(table.half_edge_of_corner[corner]), table.scheme.element)
 
 
-def least_turn(signature, corner_count):
+def turns(signature, corner_count):
     """The same for a whole element, whichever corner it is named by."""
     corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
-    turns = corners if corners == corner_count else 1
-    return min((signature.rotated(k) for k in range(turns)), key=lambda s: s.fans)
+    return frozenset(signature.rotated(k) for k in range(corners if corners == corner_count else 1))
+
+
+def assert_classes_differ(table):
+    every = [turns(each.signature, table.scheme.domain.corner_count) for each in table.classes]
+    assert len(frozenset().union(*every)) == sum(map(len, every))
 
 
 @EVERY_SURFACE
 def test_every_whole_element_is_one_patch_and_every_corner_of_others(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
-    elements = table.elements
+    face = table.elements.face
     corners = np.concatenate([patch_class.corners for patch_class in table.classes])
     assert len(corners) == table.patch_count
-    whole = table.is_whole[elements.face[corners]]
-    np.testing.assert_array_equal(np.sort(elements.face[corners[whole]]), np.flatnonzero(table.is_whole))
-    expected = np.flatnonzero(~table.is_whole[elements.face])
-    np.testing.assert_array_equal(np.sort(corners[~whole]), expected)
-    for patch_class in table.classes:
-        assert len(set(table.is_whole[elements.face[patch_class.corners]])) == 1
+    whole = table.is_whole[face[corners]]
+    np.testing.assert_array_equal(np.sort(face[corners[whole]]), np.flatnonzero(table.is_whole))
+    np.testing.assert_array_equal(np.sort(corners[~whole]), np.flatnonzero(~table.is_whole[face]))
 
 
-@EVERY_SURFACE
-def test_patches_of_a_class_have_its_signature_and_others_have_not(scheme, name):
-    table = patch_table(scheme, cage_of(scheme, name))
+@pytest.mark.parametrize(("scheme", "cage"), EVERY_CAGE.values(), ids=EVERY_CAGE)
+def test_patches_of_a_class_have_its_signature_and_one_ring_and_others_have_not(scheme, cage):
+    table = patch_table(scheme, cage)
     for patch_class in table.classes:
+        assert len(set(table.is_whole[table.elements.face[patch_class.corners]])) == 1
         assert {signature_of(table, corner) for corner in patch_class.corners} == {patch_class.signature}
-    classes = [least_turn(patch_class.signature, table.scheme.domain.corner_count) for patch_class in table.classes]
-    assert len(set(classes)) == len(classes)
+        ring = one_ring(patch_class.signature)
+        assert patch_class.controls.shape == (len(patch_class.corners), ring.vertex_count)
+        half_edges = table.half_edge_of_corner[patch_class.corners]
+        for controls, half_edge in zip(patch_class.controls, half_edges, strict=True):
+            np.testing.assert_array_equal(controls, ring.gather(table.topology, np.array([half_edge]))[0])
+            assert controls[0] == table.topology.face_vertices[half_edge]
+    assert_classes_differ(table)
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
@@ -71,23 +78,9 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
         start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
         for controls, ends in zip(patch_class.controls, zip(start, end, strict=True), strict=True):
             assert {*ends} <= {*controls}
-    signatures = [least_turn(patch_class.signature, table.scheme.domain.corner_count) for patch_class in table.classes]
-    assert len(set(signatures)) == len(signatures)
+    assert_classes_differ(table)
     # Far from the ends of both fans there are three kinds of faces, and so three of each of their corners.
     assert table.class_count < table.patch_count / 2
-
-
-@EVERY_SURFACE
-def test_controls_are_the_one_rings(scheme, name):
-    table = patch_table(scheme, cage_of(scheme, name))
-    for patch_class in table.classes:
-        ring = one_ring(patch_class.signature)
-        assert patch_class.controls.shape == (len(patch_class.corners), ring.vertex_count)
-        for controls, half_edge in zip(
-            patch_class.controls, table.half_edge_of_corner[patch_class.corners], strict=True
-        ):
-            np.testing.assert_array_equal(controls, ring.gather(table.topology, np.array([half_edge]))[0])
-            assert controls[0] == table.topology.face_vertices[half_edge]
 
 
 @EVERY_SURFACE
@@ -113,17 +106,16 @@ def test_numbering_and_first_corners_do_not_matter_to_the_classes(scheme, name):
     positions = np.empty_like(cage.positions)
     positions[number] = cage.positions
     tables = [patch_table(scheme, c) for c in (cage, ControlCage(positions, faces))]
-    one, other = (
-        Counter({least_turn(g.signature, t.scheme.domain.corner_count): len(g.corners) for g in t.classes})
-        for t in tables
-    )
+    corner_count = tables[0].scheme.domain.corner_count
+    one, other = ({turns(g.signature, corner_count): len(g.corners) for g in t.classes} for t in tables)
     assert one == other
 
 
 @pytest.mark.parametrize("name", CLOSED_CAGES)
 def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
     cage = CLOSED_CAGES[name]()
-    table = patch_table("doo_sabin", cage)
+    # Also of cages that the scheme takes no surface from.
+    table = PatchTable(cage.topology, scheme_named("doo_sabin"))
     faces, elements = polygons(cage.topology), table.elements
     assert elements.face_count == cage.vertex_count
     assert (elements.twin >= 0).all()
@@ -137,19 +129,13 @@ def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
     np.testing.assert_array_equal(elements.face_vertices[elements.twin], elements.face_vertices[elements.next])
 
 
-@pytest.mark.parametrize(
-    ("scheme", "cage"),
-    [("catmull_clark", torus(40, 50)), ("doo_sabin", torus(40, 50)), ("loop", triangulated(torus(40, 50)))],
-    ids=["catmull_clark", "doo_sabin", "loop"],
-)
-def test_regular_mesh_has_one_class(scheme, cage):
+@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin", "loop"])
+def test_regular_mesh_has_one_class(scheme):
+    cage = triangulated(torus(40, 50)) if scheme == "loop" else torus(40, 50)
     table = patch_table(scheme, cage)
     (patch_class,) = table.classes
-    assert (
-        table.patch_count
-        == len(patch_class.corners)
-        == (cage.vertex_count if scheme == "doo_sabin" else cage.face_count)
-    )
+    count = cage.vertex_count if scheme == "doo_sabin" else cage.face_count
+    assert table.patch_count == len(patch_class.corners) == count
 
 
 def test_cube_is_one_class_and_a_prism_has_one_for_each_kind_of_corner():

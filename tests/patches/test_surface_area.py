@@ -1,13 +1,11 @@
 """Areas: closed forms, fine triangles, and what scaling and refinement do to them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from patches.closed_cages import bumpy, cage_of
+from patches.closed_cages import bumpy, cage_of, creased
 from reference.refined_cages import refined, sheet, tagged
 
 # Of an area.
@@ -35,13 +33,7 @@ def test_area_of_a_flat_sheet(triangles):
 
 @pytest.mark.core
 def test_area_of_a_box_of_creases():
-    edges = {
-        tuple(sorted(map(int, edge)))
-        for face in cube().face_vertices.reshape(-1, 4)
-        for edge in zip(face, np.roll(face, -1), strict=True)
-    }
-    box = LimitSurface(tagged(cube(), creases=[(*edge, 10.0) for edge in edges]))
-    np.testing.assert_allclose(box.area(), 24, rtol=EXACT)
+    np.testing.assert_allclose(LimitSurface(creased(cube())).area(), 24, rtol=EXACT)
 
 
 @pytest.mark.core
@@ -51,11 +43,9 @@ def test_area_of_a_cylinder_of_b_splines():
     angle = 2 * np.pi * np.arange(n) / n
     ring = np.stack([np.cos(angle), 0.6 * np.sin(angle)], axis=1)
     positions = np.concatenate([np.column_stack([ring, np.full(n, z)]) for z in range(height + 1)])
-    faces = [
-        (n * z + i, n * z + (i + 1) % n, n * (z + 1) + (i + 1) % n, n * (z + 1) + i)
-        for z in range(height)
-        for i in range(n)
-    ]
+    first = np.arange(n * height)
+    second = np.where(first % n == n - 1, first + 1 - n, first + 1)
+    faces = np.stack([first, second, second + n, first + n], axis=1)
     nodes, weights = np.polynomial.legendre.leggauss(40)
     t = ((nodes + 1) / 2)[:, None, None]
     before, first, second, after = (np.roll(ring, shift, axis=0) for shift in (1, 0, -1, -2))
@@ -82,18 +72,17 @@ def test_refinement_of_the_cage_leaves_the_area(name):
 
 
 @pytest.mark.core
-def test_scaling_and_turning():
+def test_areas_turn_with_the_cage_and_grow_with_the_square_of_its_size(np_rng):
     cage = bumpy(cage_of("catmull_clark", "prism"))
-    turn, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
+    turn, _ = np.linalg.qr(np_rng.normal(size=(3, 3)))
     moved = cage.with_positions(3 * cage.positions @ turn + [1, 2, 3])
     np.testing.assert_allclose(LimitSurface(moved).area(), 9 * LimitSurface(cage).area(), rtol=EXACT)
-
-
-def test_the_unit_of_length_changes_nothing():
-    """Powers of two scale all products exactly."""
-    cage = bumpy(cage_of("catmull_clark", "prism"))
+    # Powers of two scale all products exactly.
     small, large = (LimitSurface(cage.with_positions(unit * cage.positions)).area() for unit in (2.0**-30, 2.0**30))
     assert large == 2.0**120 * small
+    for scale in (1e-90, 1e-30, 1e30, 1e80):
+        found = LimitSurface(cage.with_positions(scale * cage.positions)).area()
+        assert found / scale / scale == pytest.approx(LimitSurface(cage).area(), rel=1e-12)
 
 
 def test_holes_have_no_area():
@@ -102,5 +91,4 @@ def test_holes_have_no_area():
 
 
 def test_a_collapsed_surface_has_no_area():
-    cage = ControlCage(np.zeros_like(cube().positions), cube().face_vertices.reshape(-1, 4))
-    assert LimitSurface(cage).area() == 0
+    assert LimitSurface(cube().with_positions(np.zeros((8, 3)))).area() == 0

@@ -7,80 +7,58 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.cage.errors import CageWarning
-from mitsuba_subdivision.cage.named_cages import cube, torus
-from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision import Attribute, CageWarning, LimitSurface, upload
+from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.attribute_parameters import mesh_attributes
 from reference.refined_cages import tagged
-
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-
-SINGLE = 2e-6
-# Each face of the cube is an island.
-ISLANDS = Attribute(np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), "face_varying", np.arange(24))
+from shapes.cages import ISLANDS, cube, described, load, textured
+from shapes.scenes import SINGLE, WIDTHS, buffer, film, hit, perspective, vertices
+from shapes.updates import differentiated, update
+from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, mirrors, scalar, shadings
 
 
 def textured_cube(rng, **options):
-    return tagged(
-        cube(),
-        texcoords=ISLANDS,
-        attributes={
-            "colour": Attribute(rng.random((8, 3))),
-            "weight": Attribute(rng.random((8, 1)), "varying"),
-            "label": Attribute(rng.random((24, 1)), "face_varying", np.arange(24)[::-1]),
-        },
-        **options,
-    )
+    attributes = {
+        "colour": Attribute(rng.random((8, 3))),
+        "weight": Attribute(rng.random((8, 1)), "varying"),
+        "label": Attribute(rng.random((24, 1)), "face_varying", np.arange(24)[::-1]),
+    }
+    return cube(texcoords=ISLANDS, attributes=attributes, **options)
 
 
 def make(cage, **parameters):
-    return mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, **parameters})
+    return load(cage, **{"tessellation_rate": 4, **parameters})
 
 
-def buffer(shape, name, width):
-    return np.array(mi.traverse(shape)[name]).reshape(-1, width)
-
-
-@pytest.mark.parametrize("mirror", [1, -1])
-@pytest.mark.usefixtures("variants_all_rgb")
+@mirrors
+@every_variant
 def test_buffers_are_the_tessellation(np_rng, mirror):
     cage = textured_cube(np_rng)
     shape = make(cage, to_world=mi.ScalarTransform4f().scale([mirror, 1, 1]))
     expected = LimitSurface(cage).tessellate(4)
-    np.testing.assert_allclose(buffer(shape, "vertex_positions", 3), expected.positions * [mirror, 1, 1], atol=SINGLE)
-    np.testing.assert_allclose(buffer(shape, "vertex_normals", 3), expected.normals * [mirror, 1, 1], atol=50 * SINGLE)
-    np.testing.assert_allclose(buffer(shape, "vertex_texcoords", 2), expected.texcoords, atol=SINGLE)
     assert shape.vertex_count() == len(expected.positions)
-    for name, values in expected.attributes.items():
-        np.testing.assert_allclose(buffer(shape, f"vertex_{name}", values.shape[1]), values, atol=SINGLE)
+    positions, normals = vertices(shape)
+    np.testing.assert_allclose(positions, expected.positions * [mirror, 1, 1], atol=SINGLE)
+    np.testing.assert_allclose(normals, expected.normals * [mirror, 1, 1], atol=50 * SINGLE)
+    for name, values in {"texcoords": expected.texcoords, **expected.attributes}.items():
+        assert values.shape[1] == WIDTHS.get(f"vertex_{name}", 3)
+        np.testing.assert_allclose(buffer(shape, f"vertex_{name}"), values, atol=SINGLE)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_properties_give_the_same_cage(np_rng):
-    texcoords = {
-        "face_varying": ISLANDS,
-        "vertex": Attribute(np_rng.random((8, 2))),
-        "varying": Attribute(np_rng.random((8, 2)), "varying"),
-    }
-    for each in texcoords.values():
-        cage = ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), texcoords=each, face_varying="none")
+    for each in (ISLANDS, *(Attribute(np_rng.random((8, 2)), kind) for kind in ("vertex", "varying"))):
+        cage = cube(texcoords=each, face_varying="none")
         expected = LimitSurface(cage).tessellate(4)
-        np.testing.assert_allclose(buffer(make(cage), "vertex_texcoords", 2), expected.texcoords, atol=SINGLE)
+        np.testing.assert_allclose(buffer(make(cage), "vertex_texcoords"), expected.texcoords, atol=SINGLE)
 
 
-def hit(shape, x=0.1, y=0.2):
-    return mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(mi.Ray3f([x, y, 5], [0, 0, -1]))
-
-
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_hits_follow_the_texture_coordinates(np_rng):
-    shape = make(textured_cube(np_rng), tessellation_rate=32)
-    si, step = hit(shape), 0.05
+    shape, step = make(textured_cube(np_rng), tessellation_rate=32), 0.05
     # The islands run along x and y on the top.
-    beside = hit(shape, 0.1 + step)
+    si, beside = hit(shape), hit(shape, 0.1 + step)
     moved = np.array(beside.p - si.p).ravel()
     along = np.array(beside.uv - si.uv).ravel()
     predicted = np.array(si.dp_du).ravel() * along[0] + np.array(si.dp_dv).ravel() * along[1]
@@ -89,7 +67,7 @@ def test_hits_follow_the_texture_coordinates(np_rng):
     assert 0.3 <= np.linalg.norm(along) / step <= 1
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 def test_rendering_takes_the_same_kernels_wherever_arrays_lie(np_rng):
     """Texture coordinates are read in packets where they are aligned, and one by one where they are not."""
     cage = textured_cube(np_rng)
@@ -109,46 +87,23 @@ def test_rendering_takes_the_same_kernels_wherever_arrays_lie(np_rng):
     assert len(found) == 1
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
-def test_attributes_can_be_evaluated(np_rng):
-    cage = textured_cube(np_rng)
-    shape = make(cage, tessellation_rate=16)
-    si = hit(shape)
-    expected = LimitSurface(cage).tessellate(16)
-    nearest = np.linalg.norm(expected.positions - np.array(si.p).reshape(3), axis=1).argmin()
-    colour = np.array(shape.eval_attribute_3("vertex_colour", si)).ravel()
-    weight = np.array(shape.eval_attribute_1("vertex_weight", si)).ravel()
-    np.testing.assert_allclose(colour, expected.attributes["colour"][nearest], atol=0.1)
-    np.testing.assert_allclose(weight, expected.attributes["weight"][nearest], atol=0.1)
-
-
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_values_stay_when_control_points_move(np_rng):
     shape = make(textured_cube(np_rng))
-    names = {"vertex_texcoords": 2, "vertex_colour": 3, "faces": 3}
-    before = {name: buffer(shape, name, width) for name, width in names.items()}
-    parameters = mi.traverse(shape)
-    positions, normals = buffer(shape, "vertex_positions", 3), buffer(shape, "vertex_normals", 3)
-    parameters["control_points"] = parameters["control_points"] * 2
-    parameters.update()
-    for name, width in names.items():
-        np.testing.assert_array_equal(buffer(shape, name, width), before[name])
-    np.testing.assert_array_equal(buffer(shape, "vertex_positions", 3), 2 * positions)
-    np.testing.assert_array_equal(buffer(shape, "vertex_normals", 3), normals)
+    names = ("vertex_texcoords", "vertex_colour", "faces", "vertex_normals", "vertex_positions")
+    before = [buffer(shape, name) for name in names]
+    update(shape, control_points=mi.traverse(shape)["control_points"] * 2)
+    before[-1] = 2 * before[-1]
+    for name, values in zip(names, before, strict=True):
+        np.testing.assert_array_equal(buffer(shape, name), values)
 
 
-@pytest.mark.usefixtures("variants_all_ad_rgb")
+@every_ad_variant
 def test_gradients_reach_the_control_points_across_seams(np_rng):
-    cage = textured_cube(np_rng)
-    plain = ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4))
     gradients = []
-    for each in (cage, plain):
-        shape = make(each)
-        parameters = mi.traverse(shape)
-        points = upload(type(parameters["control_points"]), cage.positions)
-        dr.enable_grad(points)
-        parameters["control_points"] = points
-        parameters.update()
+    for cage in (textured_cube(np_rng), cube()):
+        parameters = mi.traverse(make(cage))
+        points = differentiated(parameters, "control_points")
         # Triangles' corners are the same places with and without copies of vertices.
         faces = dr.ravel(dr.unravel(mi.Point3u, parameters["faces"]))
         corners = dr.gather(mi.Point3f, parameters["vertex_positions"], faces)
@@ -159,32 +114,27 @@ def test_gradients_reach_the_control_points_across_seams(np_rng):
     assert np.abs(gradients[0]).min() > 0
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_other_evaluators_and_flat_faces_have_texture_coordinates(np_rng):
     cage = textured_cube(np_rng)
     expected = LimitSurface(cage).tessellate(4).texcoords
     for parameters in ({"evaluator": "stam", "sample_offset": 1e-3}, {"face_normals": True}):
         shape = make(cage, **parameters)
         assert shape.vertex_count() == len(expected)
-        np.testing.assert_allclose(buffer(shape, "vertex_texcoords", 2), expected, atol=SINGLE)
+        np.testing.assert_allclose(buffer(shape, "vertex_texcoords"), expected, atol=SINGLE)
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
-def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
-    given = cube()
-    for name, width, message in (
-        ("pair", 2, r'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'),
+@pytest.mark.parametrize(
+    ("name", "width", "message"),
+    [
+        ("pair", 2, 'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'),
         ("normals", 3, 'attribute "normals" is left out; every Mitsuba mesh has "normals" already'),
-    ):
-        cage = ControlCage(
-            given.positions,
-            given.face_vertices.reshape(-1, 4),
-            attributes={"colour": Attribute(given.positions), name: Attribute(np.ones((8, width)))},
-        )
-        from mitsuba_subdivision.shapes.attribute_parameters import mesh_attributes
-
-        with pytest.warns(CageWarning, match=message):
-            assert mesh_attributes(cage) == {"colour": 3}
+    ],
+)
+def test_attributes_that_mitsuba_cannot_evaluate_are_told_of(name, width, message):
+    cage = cube(attributes={"colour": cube().positions, name: np.ones((8, width))})
+    with pytest.warns(CageWarning, match=message):
+        assert mesh_attributes(cage) == {"colour": 3}
 
 
 @pytest.mark.parametrize(
@@ -203,47 +153,38 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of():
         ({"vertex_c": np.zeros(8)}, 'parameter "vertex_c" has shape (8,); expected (n, k)'),
         ({"vertex_c": "red"}, "parameter \"vertex_c\" is 'red'; expected a tensor"),
         ({"texcord": np.zeros((8, 2))}, 'unknown parameter "texcord", did you mean "texcoords"?'),
-        ({"filename": "cage.obj", "positions": None, "face_sizes": None, "face_vertices": None}, "texcoords"),
+        (
+            {"filename": "cage.obj", "texcoords": np.zeros((8, 2))},
+            'parameters "filename" and "texcoords" contradict each other',
+        ),
     ],
 )
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_errors_say_what_was_expected(parameters, message):
-    description = {"type": "subdivision", **cube().as_properties(mi)}
-    if "filename" in parameters:
-        parameters = {**parameters, "texcoords": np.zeros((8, 2))}
-        message = 'parameters "filename" and "texcoords" contradict each other'
-    for name, value in parameters.items():
-        description[name] = upload(mi.TensorXf, value) if isinstance(value, np.ndarray) else value
-    description = {name: value for name, value in description.items() if value is not None}
+    cage = {"type": "subdivision"} if "filename" in parameters else described(cube())
+    given = {name: upload(mi.TensorXf, v) if isinstance(v, np.ndarray) else v for name, v in parameters.items()}
     with pytest.raises(RuntimeError, match=re.escape(message)):
-        mi.load_dict(description)
+        mi.load_dict({**cage, **given})
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_seams_are_an_error_for_doo_sabin(np_rng):
     with pytest.raises(RuntimeError, match="the scheme doo_sabin has no rules for seams"):
         make(textured_cube(np_rng), scheme="doo_sabin")
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_a_texture_is_seen():
     # Texture coordinates that are the vertices' own positions are the surface's points.
     cage = torus(12, 8)
-    cage = ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), texcoords=Attribute(cage.positions[:, :2]))
+    cage = tagged(cage, texcoords=cage.positions[:, :2])
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]).scale(2)
+    checkerboard = {"type": "checkerboard", "color0": 0.0, "color1": 1.0}
     scene = {
         "type": "scene",
         "integrator": {"type": "aov", "aovs": "albedo:albedo,uv:uv,p:position"},
-        "sensor": {
-            "type": "orthographic",
-            "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]).scale(2),
-            "film": {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}},
-        },
-        "shape": {
-            "type": "subdivision",
-            **cage.as_properties(mi),
-            "tessellation_rate": 4,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": 0.0, "color1": 1.0}},
-        },
+        "sensor": {"type": "orthographic", "to_world": to_world, "film": film(32)},
+        "shape": described(cage, tessellation_rate=4, bsdf={"type": "diffuse", "reflectance": checkerboard}),
     }
     picture = np.array(mi.render(mi.load_dict(scene), spp=1))
     albedo, uv, position = picture[..., -8], picture[..., -5:-3], picture[..., -3:]
@@ -277,27 +218,33 @@ OF_MITSUBA = {
     "n": ["n_0", "n_1", "n_2"],
     "heat": ["heat_1"],
 }
+# Places in float32, relative to a cage of size one.
+DRAWN = 5e-6
 # Spectra of colours by Mitsuba's table, evaluated in single precision at two places.
 SPECTRUM = 1e-5
 
 
-def square(path):
+@pytest.fixture
+def square(tmp_path):
+    """The path of the file of a square."""
     rows = []
     for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
         linear = [0.5 + 0.25 * x, 0.5 - 0.1 * y, 0.3 + 0.1 * (x + y)]
         rows.append([x, y, 0, 0.2, 0.5, 0.1, 0.3, 0.3, 0.3, *linear, *linear, linear[2]])
-    names = [name for columns in OF_MITSUBA.values() for name in columns]
-    properties = "\n".join(f"property float {name}" for name in names)
+    properties = "\n".join(f"property float {name}" for columns in OF_MITSUBA.values() for name in columns)
+    path = tmp_path / "square.ply"
     path.write_text(SQUARE.format(properties=properties, rows="\n".join(" ".join(map(str, row)) for row in rows)))
-    return path
+    return str(path)
 
 
-@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+def square_shape(square, shading):
+    return mi.load_dict({"type": "subdivision", "filename": square, "shading": shading, "boundary": "edge_and_corner"})
+
+
+@shadings
 @pytest.mark.usefixtures("variants_all")
-def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(tmp_path, shading):
-    path = str(square(tmp_path / "square.ply"))
-    ours = mi.load_dict({"type": "subdivision", "filename": path, "shading": shading, "boundary": "edge_and_corner"})
-    own = mi.load_dict({"type": "ply", "filename": path})
+def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
+    ours, own = square_shape(square, shading), mi.load_dict({"type": "ply", "filename": square})
     wavelengths = [450, 500, 550, 600] if mi.is_spectral else []
     found = []
     for shape in (ours, own):
@@ -319,21 +266,19 @@ def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(tmp_path, shading)
     if not mi.is_spectral:
         # The values of the file.
         np.testing.assert_allclose(found[0]["color"], [0.2, 0.5, 0.1], atol=SPECTRUM)
-    parameters = mi.traverse(ours)
-    np.testing.assert_allclose(np.array(parameters["cage_color"]), np.tile([0.2, 0.5, 0.1], 4), atol=SPECTRUM)
+    given = np.array(mi.traverse(ours)["cage_color"])
+    np.testing.assert_allclose(given, np.tile([0.2, 0.5, 0.1], 4), atol=SPECTRUM)
 
 
-@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+@shadings
 @pytest.mark.usefixtures("variant_llvm_ad_spectral")
-def test_spectra_have_derivatives_by_colours(tmp_path, shading):
+def test_spectra_have_derivatives_by_colours(square, shading):
     """Of one constant colour, against differences."""
-    path = str(square(tmp_path / "square.ply"))
-    shape = mi.load_dict({"type": "subdivision", "filename": path, "shading": shading, "boundary": "edge_and_corner"})
-    scene, parameters = mi.load_dict({"type": "scene", "shape": shape}), mi.traverse(shape)
+    shape = square_shape(square, shading)
+    scene = mi.load_dict({"type": "scene", "shape": shape})
 
     def spectrum(color):
-        parameters["cage_color"] = dr.ravel(mi.Color3f(color) + dr.zeros(mi.Color3f, 4))
-        parameters.update()
+        update(shape, cage_color=dr.ravel(mi.Color3f(color) + dr.zeros(mi.Color3f, 4)))
         si = scene.ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, [450, 500, 550, 600]))
         return shape.eval_attribute("vertex_color", si)
 
@@ -349,30 +294,27 @@ def test_spectra_have_derivatives_by_colours(tmp_path, shading):
         np.testing.assert_allclose(gradient[i], change, rtol=2e-2)
 
 
-@pytest.mark.parametrize("name", ["vertex_displayColor", "face_color"])
+@pytest.mark.parametrize(("name", "count"), [("vertex_displayColor", 3), ("face_color", 1)])
 @pytest.mark.usefixtures("variants_all")
-def test_meshes_of_polygons_have_spectra_as_well(name):
-    colors = np.array([[0.2, 0.5, 0.1], [0.2, 0.5, 0.1], [0.2, 0.5, 0.1]])[: 1 if name.startswith("face") else 3]
-    positions = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
-    mesh = mitsuba_mesh("triangle", np.array([[0, 1, 2]]), {"vertex_positions": positions, name: colors})
-    si = dr.zeros(mi.SurfaceInteraction3f)
+def test_meshes_of_polygons_have_spectra_as_well(name, count):
+    positions, expected = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]]), [0.2, 0.5, 0.1]
+    values = {"vertex_positions": positions, name: np.tile(expected, (count, 1))}
+    mesh, si = mitsuba_mesh("triangle", np.array([[0, 1, 2]]), values), dr.zeros(mi.SurfaceInteraction3f)
     si.p = mi.Point3f(0, 0, 0)
-    expected = [0.2, 0.5, 0.1]
     if mi.is_spectral:
         si.wavelengths = [450, 500, 550, 600]
         expected = mi.load_dict({"type": "srgb", "color": expected}).eval(si)
     elif mi.is_monochromatic:
         expected = mi.luminance(mi.Color3f(expected))
-    np.testing.assert_allclose(
-        np.array(mesh.eval_attribute(name, si)).ravel(), np.array(expected).ravel(), atol=SPECTRUM
-    )
+    found = np.array(mesh.eval_attribute(name, si)).ravel()
+    np.testing.assert_allclose(found, np.array(expected).ravel(), atol=SPECTRUM)
 
 
 @exact
 @pytest.mark.usefixtures("variant_llvm_ad_spectral", "no_other_scene")
-def test_frozen_functions_look_up_spectra(tmp_path):
-    path = str(square(tmp_path / "square.ply"))
-    scene = mi.load_dict({"type": "scene", "shape": {"type": "subdivision", "filename": path, "shading": "exact"}})
+def test_frozen_functions_look_up_spectra(square):
+    shape = {"type": "subdivision", "filename": square, "shading": "exact"}
+    scene = mi.load_dict({"type": "scene", "shape": shape})
     parameters = mi.traverse(scene)
 
     def spectrum(scene, x):
@@ -381,9 +323,31 @@ def test_frozen_functions_look_up_spectra(tmp_path):
 
     frozen = dr.freeze(spectrum)
     for grey in (0.25, 0.75, 0.5):
-        parameters["shape.cage_color"] = dr.full(mi.Float, grey, 12)
-        parameters.update()
+        update(parameters, {"shape.cage_color": dr.full(mi.Float, grey, 12)})
         found = frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))
         np.testing.assert_allclose(np.array(found), grey, atol=SPECTRUM)
     # The last values were looked up without Python.
     assert frozen.n_recordings < 3
+
+
+@exact
+@every_array_variant
+@pytest.mark.parametrize("displacement", [{}, {"displacement": "vertex_heat"}], ids=["flat", "displaced"])
+@pytest.mark.parametrize("kind", ["bitmap", "checkerboard"])
+def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
+    """Mitsuba draws points of them by the texture coordinates of the mesh, which had none."""
+    cage = textured(attributes={"heat": np.linspace(0, 0.2, 8)[:, None]} if displacement else {})
+    below = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)
+    seen = {"floor": {"type": "rectangle", "to_world": below}, "sensor": perspective(12, (2.2, -3.2, 2.0), fov=30)}
+    texels, points, means = np.random.default_rng(0).random((8, 8, 3)).astype(np.float32), [], []
+    for shading in ("exact", "vertex"):
+        radiance = {"data": upload(mi.TensorXf, texels), "raw": True} if kind == "bitmap" else {}
+        emitter = {"type": "area", "radiance": {"type": kind, **radiance}}
+        shape = make(cage, shading=shading, emitter=emitter, **displacement)
+        scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "shape": shape, **seen})
+        si = scene.ray_intersect(mi.Ray3f([1.9, 0.3, 4], [0, 0, -1]))
+        drawn = (scene.sample_emitter_direction(si, mi.Point2f(*xy), False)[0] for xy in ([0.2, 0.7], [0.9, 0.4]))
+        points.append([np.array(each.p).ravel() for each in drawn])
+        means.append(np.array(mi.render(scene, spp=256)).mean())
+    np.testing.assert_allclose(points[0], points[1], rtol=0, atol=DRAWN)
+    assert means[0] == pytest.approx(means[1], rel=0.01)

@@ -9,23 +9,15 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.cage.errors import CageWarning
-from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
-from reference.refined_cages import refine_first
+from reference.refined_cages import refine_first, tagged
+from shapes.cages import MIXED_FACES, cube, load
+from shapes.scenes import SINGLE, buffer, perspective
+from shapes.updates import MODES, derivative, differentiated, update
+from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, shadings
 
-every_variant = pytest.mark.usefixtures("variants_all_rgb")
-every_array_variant = pytest.mark.usefixtures("variants_array_rgb")
-every_ad_variant = pytest.mark.usefixtures("variants_all_ad_rgb")
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-shadings = pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
-
-# Sums of some tens of terms of order one, in single precision.
-SINGLE = 2e-6
 # Where a ray meets the surface in single precision, times the slope of attributes there.
 HIT = 1e-4
 # Sums over some thousand vertices or samples in single precision, relative to the result.
@@ -35,53 +27,43 @@ STEP, DIFFERENCE = 0.02, 1e-4
 RESOLUTION = 16
 NAMES = {"texcoords": 2, "colour": 3, "weight": 1, "label": 1}
 ADAPTIVE = {"tessellation": "adaptive", "chord_error": 0.02}
-
-# The top is two triangles, two sides are joined to an L-shaped hexagon.
-MIXED_FACES = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5, 4, 0]]
+FINER = {"tessellation": "adaptive", "chord_error": 0.02 / 3}
 
 
-def with_attributes(positions, faces, seed, **tags):
+def with_attributes(cage, seed, **tags):
     """Random values of every interpolation, with seams; each face is an island of texture coordinates."""
-    rng, corners = np.random.default_rng(seed), np.concatenate(faces)
-    angles = np.concatenate([2 * np.pi * np.arange(len(face)) / len(face) for face in faces])
+    rng, corners, count = np.random.default_rng(seed), cage.face_vertices, cage.vertex_count
+    angles = np.concatenate([2 * np.pi * np.arange(size) / size for size in cage.face_sizes])
     islands = 0.5 + 0.1 * np.stack([np.cos(angles), np.sin(angles)], axis=1) + 0.04 * rng.random((len(corners), 2))
     # Two values for each vertex, of which the first face takes the other.
-    rows = np.where(np.arange(len(corners)) < len(faces[0]), corners, corners + len(positions))
-    return ControlCage(
-        positions,
-        faces,
-        texcoords=Attribute(islands, "face_varying", np.arange(len(corners))),
-        attributes={
-            "colour": Attribute(rng.random((len(positions), 3))),
-            "weight": Attribute(rng.random((len(positions), 1)), "varying"),
-            "label": Attribute(rng.random((2 * len(positions), 1)), "face_varying", rows),
-        },
-        **tags,
-    )
+    rows = corners + count * (np.arange(len(corners)) >= cage.face_sizes[0])
+    attributes = {
+        "colour": Attribute(rng.random((count, 3))),
+        "weight": Attribute(rng.random((count, 1)), "varying"),
+        "label": Attribute(rng.random((2 * count, 1)), "face_varying", rows),
+    }
+    return tagged(cage, texcoords=Attribute(islands, "face_varying"), attributes=attributes, **tags)
 
 
-def cube(seed=0):
-    given = named_cages.cube()
-    creases = [(0, 1, 10), (1, 3, 10), (3, 2, 2.5)]
-    return with_attributes(given.positions, given.face_vertices.reshape(-1, 4), seed, creases=creases)
+def creased(seed=0):
+    return with_attributes(cube(), seed, creases=[(0, 1, 10), (1, 3, 10), (3, 2, 2.5)])
 
 
 def mixed(seed=0):
-    return with_attributes(named_cages.cube().positions, MIXED_FACES, seed)
+    return with_attributes(ControlCage(cube().positions, MIXED_FACES), seed)
 
 
 def triangles(seed=0):
-    given = named_cages.cube()
-    halves = [half for a, b, c, d in given.face_vertices.reshape(-1, 4).tolist() for half in ([a, b, c], [a, c, d])]
-    return with_attributes(given.positions, halves, seed)
+    quads = cube().face_vertices.reshape(-1, 4)
+    return with_attributes(ControlCage(cube().positions, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)), seed)
 
 
 CAGES = {
-    "cube": (cube, {}),
+    "cube": (creased, {}),
     "mixed": (mixed, {}),
     "refined": (mixed, {}),
     "loop": (triangles, {"scheme": "loop"}),
-    "adaptive": (cube, ADAPTIVE),
+    "adaptive": (creased, ADAPTIVE),
     "adaptive mixed": (mixed, ADAPTIVE),
 }
 
@@ -95,8 +77,7 @@ def cage(request, monkeypatch):
 
 
 def make(cage, **parameters):
-    rate = {} if "tessellation" in parameters else {"tessellation_rate": 4}
-    return mi.load_dict({"type": "subdivision", **cage.as_properties(mi), **rate, **parameters})
+    return load(cage, **({} if "tessellation" in parameters else {"tessellation_rate": 4}), **parameters)
 
 
 def values_of(cage):
@@ -104,20 +85,12 @@ def values_of(cage):
 
 
 def assign(parameters, cage):
-    for name, values in values_of(cage).items():
-        key = f"cage_{name}"
-        parameters[key] = upload(type(parameters[key]), values)
-    parameters.update()
-
-
-def buffers(shape):
-    parameters = mi.traverse(shape)
-    return {name: np.array(parameters[f"vertex_{name}"]).reshape(-1, size) for name, size in NAMES.items()}
+    update(parameters, {f"cage_{n}": upload(type(parameters[f"cage_{n}"]), v) for n, v in values_of(cage).items()})
 
 
 def assert_alike(shape, expected):
-    for name, values in buffers(expected).items():
-        np.testing.assert_allclose(buffers(shape)[name], values, rtol=0, atol=SINGLE, err_msg=name)
+    for name in (f"vertex_{name}" for name in NAMES):
+        np.testing.assert_allclose(buffer(shape, name), buffer(expected, name), rtol=0, atol=SINGLE, err_msg=name)
 
 
 # What follows
@@ -125,7 +98,7 @@ def assert_alike(shape, expected):
 
 @every_variant
 def test_equal_values_share_their_memory_until_those_of_one_shape_change():
-    first, second = (mi.traverse(make(cube())) for _ in range(2))
+    first, second = (mi.traverse(make(creased())) for _ in range(2))
     for name in NAMES:
         one, other = first[f"cage_{name}"], second[f"cage_{name}"]
         assert not dr.is_jit_v(one) or one.index == other.index
@@ -137,16 +110,14 @@ def test_equal_values_share_their_memory_until_those_of_one_shape_change():
 
 
 @shadings
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 @pytest.mark.parametrize("interpolation", ["vertex", "varying"])
 @pytest.mark.parametrize("by", ["heat", "texcoords"])
 def test_a_frozen_function_sees_new_values(shading, interpolation, by):
     """Dr.Jit went on reading the memory of NumPy that the first values came from."""
-    cube, rng = named_cages.cube(), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     texcoords, heat = (Attribute(rng.random((8, size)), kind) for size, kind in ((2, "vertex"), (1, interpolation)))
-    faces = cube.face_vertices.reshape(-1, 4)
-    cage = ControlCage(cube.positions, faces, texcoords=texcoords, attributes={"heat": heat})
-    shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "shading": shading})
+    shape = load(cube(texcoords=texcoords, attributes={"heat": heat}), shading=shading)
     scene = mi.load_dict({"type": "scene", "shape": shape})
     parameters, x = mi.traverse(shape), upload(mi.Float, np.linspace(-0.4, 0.4, 9, dtype=np.float32))
 
@@ -160,8 +131,7 @@ def test_a_frozen_function_sees_new_values(shading, interpolation, by):
         np.testing.assert_array_equal(found, np.array(seen(scene, x)))
         assert before is None or not np.array_equal(found, before)
         before = found
-        parameters[f"cage_{by}"] = parameters[f"cage_{by}"] * 0.7
-        parameters.update()
+        update(parameters, {f"cage_{by}": parameters[f"cage_{by}"] * 0.7})
 
 
 # Under exact shading, vertices that no seam asks for hold no values; hits are those of test_hits_follow.
@@ -175,9 +145,8 @@ def test_an_update_equals_a_new_shape(cage, shading):
     made, parameters = cage
     shape = make(made(), shading=shading, **parameters)
     assign(mi.traverse(shape), made(1))
-    expected = make(made(1), shading=shading, **parameters)
-    assert (len(buffers(shape)["texcoords"]) > 0) == (shading == "vertex")
-    assert_alike(shape, expected)
+    assert (len(buffer(shape, "vertex_texcoords")) > 0) == (shading == "vertex")
+    assert_alike(shape, make(made(1), shading=shading, **parameters))
 
 
 @every_variant
@@ -227,29 +196,24 @@ def test_hits_follow(cage):
 @every_variant
 @shadings
 def test_values_stay_when_triangles_are_chosen_anew(shading):
-    shape = make(cube(), shading=shading, **ADAPTIVE)
-    parameters = mi.traverse(shape)
-    count = shape.vertex_count()
-    assign(parameters, cube(1))
-    parameters["chord_error"] = ADAPTIVE["chord_error"] / 3
-    parameters.update()
+    shape = make(creased(), shading=shading, **ADAPTIVE)
+    parameters, count = mi.traverse(shape), shape.vertex_count()
+    assign(parameters, creased(1))
+    update(parameters, chord_error=FINER["chord_error"])
     assert shape.vertex_count() > count
-    assert_alike(shape, make(cube(1), shading=shading, **{**ADAPTIVE, "chord_error": ADAPTIVE["chord_error"] / 3}))
-    assign(parameters, cube(2))
+    assert_alike(shape, make(creased(1), shading=shading, **FINER))
+    assign(parameters, creased(2))
     shape.retessellate()
-    assert_alike(shape, make(cube(2), shading=shading, **{**ADAPTIVE, "chord_error": ADAPTIVE["chord_error"] / 3}))
+    assert_alike(shape, make(creased(2), shading=shading, **FINER))
 
 
 @every_variant
 def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated():
-    shape = make(cube())
+    shape = make(creased())
     parameters = mi.traverse(shape)
     own = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
-    parameters["vertex_colour"] = own
-    parameters["cage_weight"] = parameters["cage_weight"] * 2
-    parameters.update()
-    parameters["control_points"] = parameters["control_points"] * 2
-    parameters.update()
+    update(parameters, vertex_colour=own, cage_weight=parameters["cage_weight"] * 2)
+    update(parameters, control_points=parameters["control_points"] * 2)
     np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(own))
     parameters["cage_colour"] = parameters["cage_colour"] * 1
     parameters.set_dirty("cage_colour")
@@ -262,20 +226,15 @@ def test_no_weights_are_made_where_no_value_changes(monkeypatch):
     made = []
     for kind in (SubdividedChannel, LinearChannel):
         monkeypatch.setattr(kind, "weights", lambda *_, kind=kind: made.append(kind))
-    shape = make(cube())
-    parameters = mi.traverse(shape)
-    parameters["control_points"] = parameters["control_points"] * 2
-    parameters.update()
+    parameters = mi.traverse(make(creased()))
+    update(parameters, control_points=parameters["control_points"] * 2)
     assert made == []
 
 
 @every_variant
 def test_attributes_that_a_mesh_has_no_place_for_are_no_parameters():
-    given = named_cages.cube()
-    attributes = {"pair": np.ones((8, 2)), "colour": np.ones((8, 3))}
-    cage = ControlCage(given.positions, given.face_vertices.reshape(-1, 4), attributes=attributes)
     with pytest.warns(CageWarning, match='attribute "pair" has 2 numbers per value and is left out'):
-        shape = make(cage)
+        shape = make(cube(attributes={"pair": np.ones((8, 2)), "colour": np.ones((8, 3))}))
     found = {key for key in mi.traverse(shape).keys() if key.startswith("cage_")}  # noqa: SIM118 - it iterates over pairs
     assert found == {"cage_colour"}
 
@@ -283,22 +242,20 @@ def test_attributes_that_a_mesh_has_no_place_for_are_no_parameters():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (np.ones(23), 'parameter "cage_colour": 23 numbers; expected 24, 3 for each of 8 values at the cage'),
+        (np.ones(23), "23 numbers; expected 24, 3 for each of 8 values at the cage"),
         (
             np.where(np.arange(24) > 21, np.inf, 1),
-            'parameter "cage_colour": number 22 is not finite; expected finite numbers (2 such in all)',
+            "number 22 is not finite; expected finite numbers (2 such in all)",
         ),
     ],
 )
 @every_variant
 def test_errors_say_what_was_expected(values, message):
-    shape = make(cube())
-    parameters = mi.traverse(shape)
+    parameters = mi.traverse(make(creased()))
     if not dr.is_jit_v(mi.Float) and len(values) != len(parameters["cage_colour"]):
         pytest.skip("Mitsuba compares the values before it assigns them")
-    parameters["cage_colour"] = upload(type(parameters["cage_colour"]), values)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        parameters.update()
+    with pytest.raises(ValueError, match=re.escape(f'parameter "cage_colour": {message}')):
+        update(parameters, cage_colour=upload(type(parameters["cage_colour"]), values))
 
 
 # Gradients
@@ -307,23 +264,13 @@ def test_errors_say_what_was_expected(values, message):
 def weights_of(cage, name, scheme):
     """Of an attribute's values in those at the tessellation's vertices: what unit vectors become."""
     given = cage.texcoords if name == "texcoords" else cage.attributes[name]
-    unit = Attribute(np.eye(len(given.values)), given.interpolation, given.indices)
-    surface = LimitSurface(
-        ControlCage.from_arrays(
-            cage.positions,
-            cage.face_sizes,
-            cage.face_vertices,
-            creases=cage.tags.creases(cage.topology),
-            texcoords=cage.texcoords,
-            attributes={**cage.attributes, "unit": unit},
-        ),
-        scheme,
-    )
-    return surface.tessellate(4).attributes["unit"]
+    attributes = {**cage.attributes, "unit": Attribute(np.eye(len(given.values)), given.interpolation, given.indices)}
+    creases = cage.tags.creases(cage.topology)
+    cage = tagged(cage, creases=creases, texcoords=cage.texcoords, attributes=attributes)
+    return LimitSurface(cage, scheme).tessellate(4).attributes["unit"]
 
 
-@pytest.mark.usefixtures("no_other_scene")
-@every_ad_variant
+@pytest.mark.usefixtures("no_other_scene", "variants_all_ad_rgb")
 @pytest.mark.parametrize("cage", ["cube", "mixed", "refined", "loop"], indirect=True)
 def test_gradients_of_sums_over_vertices_are_column_sums_of_weights(cage, np_rng):
     made, options = cage
@@ -356,51 +303,12 @@ def ramp():
 def picture_of(cage, name, **parameters):
     """A scene whose shape shows an attribute, or a bitmap by its texture coordinates."""
     reflectance = ramp() if name == "texcoords" else {"type": "mesh_attribute", "name": f"vertex_{name}"}
-    films = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
-    views = [[2.5, -3, 2], [-2, 3, 2.5]]
-    sensors = {
-        f"view_{view}": {
-            "type": "perspective",
-            "fov": 30,
-            "to_world": mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 0, 1]),
-            "film": films,
-        }
-        for view, origin in enumerate(views)
-    }
     shape = make(cage, bsdf={"type": "diffuse", "reflectance": reflectance}, **parameters)
+    eyes = {"view_0": [2.5, -3, 2], "view_1": [-2, 3, 2.5]}
+    sensors = {view: perspective(RESOLUTION, eye, fov=30) for view, eye in eyes.items()}
     # Directions that a BSDF samples turn with the texture coordinates, and may meet the shape or not.
-    integrator = {"type": "direct", "bsdf_samples": 0}
-    return mi.load_dict(
-        {"type": "scene", "integrator": integrator, **sensors, "sky": {"type": "constant"}, "shape": shape}
-    )
-
-
-def derivatives(assign, loss):
-    """Of a loss: backward, forward, and by central differences.
-
-    Parameters
-    ----------
-    assign : callable
-        Assigns parameters some steps away.
-    loss : callable
-        Takes two seeds, of values and of their derivatives.
-    """
-    found = []
-    for is_forward in (False, True):
-        step = mi.Float(0)
-        dr.enable_grad(step)
-        assign(step)
-        value = loss(1, 2)
-        if is_forward:
-            dr.forward(step)
-        else:
-            dr.backward(value)
-        found.append(float(np.array(dr.grad(value if is_forward else step)).ravel()[0]))
-    ends = []
-    for side in (1, -1):
-        assign(mi.Float(side * STEP))
-        ends.append(float(np.array(loss(2, 3)).ravel()[0]))
-    return *found, (ends[0] - ends[1]) / (2 * STEP)
+    integrator, sky = {"type": "direct", "bsdf_samples": 0}, {"type": "constant"}
+    return mi.load_dict({"type": "scene", "integrator": integrator, **sensors, "sky": sky, "shape": shape})
 
 
 # Where weights make what hits look up: of linear interpolation over polygons, and of cages that are refined once.
@@ -427,14 +335,16 @@ def test_gradients_of_renders_are_central_differences(cage, name, shading, np_rn
     along = upload(mi.Float, np_rng.normal(size=dr.width(start)))
     factors = upload(mi.TensorXf, np_rng.random((RESOLUTION, RESOLUTION, 3)))
 
-    def assign(step):
-        parameters[key] = start + step * along
-        parameters.update()
+    def derivative_by(mode):
+        # The samples of derivatives are those of the pictures that differ.
+        seed = 2 if mode == "difference" else 1
 
-    def loss(seed, seed_grad):
-        return dr.sum(mi.render(scene, parameters, spp=4, seed=seed, seed_grad=seed_grad) * factors, axis=None)
+        def loss():
+            return dr.sum(mi.render(scene, parameters, spp=4, seed=seed, seed_grad=seed + 1) * factors, axis=None)
 
-    backward, forward, difference = derivatives(assign, loss)
+        return derivative(mode, lambda step: update(parameters, {key: start + step * along}), loss, STEP)
+
+    backward, forward, difference = map(derivative_by, MODES)
     scale = max(1, abs(difference))
     assert abs(difference) > 100 * DIFFERENCE
     assert backward == pytest.approx(difference, abs=DIFFERENCE * scale)
@@ -452,32 +362,22 @@ def test_each_view_has_its_gradients_after_one_update(name, shading):
     # Of mixed faces, weights make what hits look up.
     scene = picture_of(mixed(), name, shading=shading)
     parameters, key = mi.traverse(scene), f"shape.cage_{name}"
-    start = mi.Float(parameters[key])
-
-    def gradient(how):
-        values = mi.Float(dr.detach(start))
-        dr.enable_grad(values)
-        parameters[key] = values
-        parameters.update()
-        if how == "sum":
-            dr.backward(msub.loss_of_views(scene, parameters, loss_of, spp=4))
-        for view in range(2 if how == "once" else 0):
-            dr.backward(loss_of(mi.render(scene, parameters, sensor=view, spp=4, seed=view)))
-        return np.array(dr.grad(values))
-
-    expected = gradient("sum")
+    values = differentiated(parameters, key)
+    dr.backward(msub.loss_of_views(scene, parameters, loss_of, spp=4))
+    expected = np.array(dr.grad(values))
     assert np.abs(expected).max() > 0
-    np.testing.assert_allclose(gradient("once"), expected, rtol=0, atol=SUM * np.abs(expected).max())
+    values = differentiated(parameters, key)
+    for view in range(2):
+        dr.backward(loss_of(mi.render(scene, parameters, sensor=view, spp=4, seed=view)))
+    np.testing.assert_allclose(np.array(dr.grad(values)), expected, rtol=0, atol=SUM * np.abs(expected).max())
 
 
 @every_ad_variant
 def test_gradients_that_end_at_the_values_are_told_of():
-    scene = picture_of(cube(), "colour")
-    parameters, key = mi.traverse(scene), "shape.cage_colour"
-    factor = dr.opaque(mi.Float, 1)
+    scene = picture_of(creased(), "colour")
+    parameters, key, factor = mi.traverse(scene), "shape.cage_colour", dr.opaque(mi.Float, 1)
     dr.enable_grad(factor)
-    parameters[key] = parameters[key] * factor
-    parameters.update()
+    update(parameters, {key: parameters[key] * factor})
 
     def differentiate():
         dr.backward(loss_of(mi.render(scene, parameters, spp=4)))
@@ -491,9 +391,8 @@ def test_gradients_that_end_at_the_values_are_told_of():
 
 @every_ad_variant
 def test_control_points_and_colours_have_gradients_together():
-    scene = picture_of(cube(), "colour")
-    parameters = mi.traverse(scene)
-    keys = ["shape.control_points", "shape.cage_colour"]
+    scene = picture_of(creased(), "colour")
+    parameters, keys = mi.traverse(scene), ["shape.control_points", "shape.cage_colour"]
     found = []
     for chosen in ([keys[0]], [keys[1]], keys):
         for key in keys:
@@ -514,7 +413,7 @@ def test_control_points_and_colours_have_gradients_together():
 @every_ad_variant
 @shadings
 def test_derivatives_do_not_keep_shapes_alive(shading):
-    shape = make(cube(), shading=shading)
+    shape = make(creased(), shading=shading)
     parameters = mi.traverse(shape)
     dr.enable_grad(parameters["cage_colour"])
     parameters.set_dirty("cage_colour")
@@ -531,39 +430,31 @@ def test_derivatives_do_not_keep_shapes_alive(shading):
 MOVED, MOVED_DIFFERENCE = 1e-3, 2e-3
 
 
-def grown_colours(scheme):
-    cage = named_cages.extraordinary_triangles(5) if scheme == "loop" else named_cages.cube()
-    weights = np.linspace(0, 1, len(cage.positions))[:, None]
-    return ControlCage(
-        cage.positions,
-        np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1]),
-        attributes={"weight": Attribute(weights), "colour": Attribute(np.hstack([weights, 1 - weights, weights**2]))},
-    )
-
-
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 @pytest.mark.parametrize("by", ["control_points", "to_world"])
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 @shadings
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, mode, np_rng):
     """Under exact shading they left out that it moves: a surface moving along its colours had a gradient of zero."""
-    cage = grown_colours(scheme)
-    shape = make(cage, scheme=scheme, tessellation_rate=4, shading=shading)
+    cage = named_cages.extraordinary_triangles(5) if scheme == "loop" else cube()
+    weights = np.linspace(0, 1, cage.vertex_count)[:, None]
+    cage = tagged(cage, attributes={"weight": weights, "colour": np.hstack([weights, 1 - weights, weights**2])})
+    shape = make(cage, scheme=scheme, shading=shading)
     scene = mi.load_dict({"type": "scene", "shape": shape})
     parameters, by = mi.traverse(scene), f"{shape.id()}.{by}"
     inside = LimitSurface(cage, scheme).sample(64, 1)
     targets = cage.positions.mean(axis=0) + 0.9 * (inside.p - cage.positions.mean(axis=0))
     o, d = inside.p + inside.n, targets - inside.p - inside.n
-    ray = mi.Ray3f(msub.upload(mi.Point3f, o.T), msub.upload(mi.Vector3f, d.T))
+    ray = mi.Ray3f(upload(mi.Point3f, o.T), upload(mi.Vector3f, d.T))
     moves, given = np_rng.normal(size=len(cage.positions) * 3), type(parameters[by])(parameters[by])
 
     def values(step):
         if by.endswith("control_points"):
-            parameters[by] = given + step * msub.upload(mi.Float, moves)
+            moved = given + step * upload(mi.Float, moves)
         else:
-            parameters[by] = mi.AffineTransform4f().translate([0.3 * step, step, -0.5 * step]) @ given
-        parameters.update()
+            moved = mi.AffineTransform4f().translate([0.3 * step, step, -0.5 * step]) @ given
+        update(parameters, {by: moved})
         si = scene.ray_intersect(ray)
         found, is_valid = si.shape.eval_attribute_1("vertex_weight", si), si.is_valid()
         dr.eval(found, is_valid, si.prim_index)
@@ -577,16 +468,14 @@ def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, mode, np_rn
     # Values of vertex shading have kinks between triangles.
     same = np.all([np.array(each[2]) == np.array(triangle) for each in (ahead, behind)], axis=0) & np.array(is_valid)
     assert same.mean() > 0.5
+    differences = differences[same]
+    tolerance = MOVED_DIFFERENCE * np.abs(differences).max()
     if mode == "forward":
         dr.set_grad(step, 1)
-        derivative = np.array(dr.forward_to(found))
+        derivative = np.array(dr.forward_to(found))[same]
     else:
-        weights, kept = np.where(same, np_rng.choice([-1, 1], 64), 0), same
-        dr.backward(dr.sum(found * msub.upload(mi.Float, weights)))
-        derivative = np.array(dr.grad(step))
-    tolerance = MOVED_DIFFERENCE * np.abs(differences[same]).max()
-    if mode == "backward":
-        # Of the same rays as the differences.
-        derivative, same = derivative / same.sum(), [0]
-        differences = (differences * weights)[kept].sum(keepdims=True) / kept.sum()
-    np.testing.assert_allclose(derivative[same], differences[same], rtol=0, atol=tolerance)
+        # The mean over the same rays as the differences.
+        signs = np.where(same, np_rng.choice([-1, 1], 64), 0)
+        dr.backward(dr.sum(found * upload(mi.Float, signs)))
+        derivative, differences = np.array(dr.grad(step)) / same.sum(), (differences * signs[same]).mean()
+    np.testing.assert_allclose(derivative, differences, rtol=0, atol=tolerance)

@@ -4,15 +4,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, ControlCage
-from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from shapes.cages import cube, described
+from shapes.scenes import perspective
+from shapes.updates import update
+from shapes.variants import exact, shadings
 
 # A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
-exact = pytest.mark.skipif(hook_problem() is not None, reason="no exact shading")
-shadings = pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
 KEYS = {"points": "control_points", "world": "to_world", "colour": "cage_colour", "scale": "displacement_scale"}
 # Dr.Jit adds gradients of pixels in no fixed order.
 ORDER_OF_SUMS = 1e-5
@@ -20,26 +19,18 @@ ORDER_OF_SUMS = 1e-5
 
 def loaded(shading, **parameters):
     """A scene, and its parameters, in which everything that may be updated matters."""
-    rng, cube = np.random.default_rng(0), named_cages.cube()
-    attributes = {"colour": Attribute(rng.random((8, 3)), "vertex"), "height": Attribute(rng.random((8, 1)), "vertex")}
-    cage = ControlCage(cube.positions, cube.face_vertices.reshape(-1, 4), attributes=attributes)
-    camera = mi.ScalarTransform4f().look_at([4, -6, 4], [0, 0, 0], [0, 0, 1])
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "sensor": {"type": "perspective", "to_world": camera, "film": {"type": "hdrfilm", "width": 8, "height": 8}},
-            "sky": {"type": "constant"},
-            "shape": {
-                "type": "subdivision",
-                **cage.as_properties(mi),
-                **({} if "tessellation" in parameters else {"tessellation_rate": 2}),
-                "shading": shading,
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}},
-                **parameters,
-            },
-        }
-    )
+    rng = np.random.default_rng(0)
+    cage = cube(attributes={"colour": rng.random((8, 3)), "height": rng.random((8, 1))})
+    rate = {} if "tessellation" in parameters else {"tessellation_rate": 2}
+    bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "direct"},
+        "sensor": perspective({"type": "hdrfilm", "width": 8, "height": 8}, [4, -6, 4]),
+        "sky": {"type": "constant"},
+        "shape": described(cage, shading=shading, bsdf=bsdf, **rate, **parameters),
+    }
+    scene = mi.load_dict(scene)
     return scene, mi.traverse(scene)
 
 
@@ -51,16 +42,11 @@ NEEDED = {"scale": DISPLACED}
 def value(by, number):
     """New values of a parameter on the device, which no kernel has compiled in."""
     if by == "points":
-        return upload(mi.Float, named_cages.cube().positions * (1 + number / 10))
-    if by == "world":
-        return mi.Transform4f().translate([dr.opaque(mi.Float, number / 10), 0, 0])
+        return upload(mi.Float, cube().positions * (1 + number / 10))
     if by == "colour":
         return upload(mi.Float, np.full((8, 3), number / 5))
-    return dr.opaque(mi.Float, number / 10)
-
-
-def leaf(by, values):
-    return values.matrix if by == "world" else values
+    tenths = dr.opaque(mi.Float, number / 10)
+    return mi.Transform4f().translate([tenths, 0, 0]) if by == "world" else tenths
 
 
 @shadings
@@ -69,8 +55,7 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by):
     """Earlier, memory of NumPy that was dropped during the recording ended the process, and checks read arrays."""
 
     def step(scene, parameters, values):
-        parameters[f"shape.{KEYS[by]}"] = values
-        parameters.update()
+        update(parameters, {f"shape.{KEYS[by]}": values})
         return mi.render(scene, spp=2)
 
     expected = [np.array(step(*loaded(shading, **NEEDED.get(by, {})), value(by, number))) for number in range(1, 4)]
@@ -85,31 +70,34 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by):
         assert frozen.n_recordings == 2
 
 
+def loss_of(scene, parameters, seed):
+    return dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None)
+
+
 @pytest.mark.parametrize(
     ("shading", "by"), [*(("vertex", by) for by in KEYS), pytest.param("exact", "points", marks=exact)]
 )
 def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by):
     def picture(scene, parameters, seed):
-        loss = dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None)
+        loss = loss_of(scene, parameters, seed)
         dr.backward(loss)
         return dr.detach(loss)
 
     def gradient(picture, scene, parameters, number):
         values = value(by, number)
-        dr.enable_grad(leaf(by, values))
-        parameters[f"shape.{KEYS[by]}"] = values
-        parameters.update()
+        leaf = values.matrix if by == "world" else values
+        dr.enable_grad(leaf)
+        update(parameters, {f"shape.{KEYS[by]}": values})
         picture(scene, parameters, dr.opaque(mi.UInt32, number))
-        return np.array(dr.grad(leaf(by, values)))
+        return np.array(dr.grad(leaf))
 
     plain, frozen = (loaded(shading, **NEEDED.get(by, {})) for _ in range(2))
     function = dr.freeze(picture)
     for number in range(1, 5):
         expected = gradient(picture, *plain, number)
-        size = abs(expected).max()
-        assert size > 0
+        assert abs(expected).max() > 0
         found = gradient(function, *frozen, number)
-        np.testing.assert_allclose(found, expected, atol=ORDER_OF_SUMS * size)
+        np.testing.assert_allclose(found, expected, atol=ORDER_OF_SUMS * abs(expected).max())
     assert function.n_recordings == 2
 
 
@@ -117,9 +105,8 @@ def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by
 def test_steps_of_colours_are_frozen_whole(shading):
     def step(scene, parameters, colours, seed):
         dr.enable_grad(colours)
-        parameters["shape.cage_colour"] = colours
-        parameters.update()
-        dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None))
+        update(parameters, {"shape.cage_colour": colours})
+        dr.backward(loss_of(scene, parameters, seed))
         return dr.grad(colours)
 
     plain, frozen, function = loaded(shading), loaded(shading), dr.freeze(step)
@@ -136,18 +123,17 @@ def test_what_a_frozen_function_cannot_do_is_told():
 
     def step(scene, parameters, key, values):
         dr.enable_grad(values)
-        parameters[key] = values
-        parameters.update()
+        update(parameters, {key: values})
         return mi.render(scene, spp=1)
 
-    scene, parameters = loaded("vertex")
-    with pytest.raises(RuntimeError, match="recording") as error:
-        dr.freeze(step)(scene, parameters, "shape.control_points", value("points", 1))
-    assert "update them before" in str(error.value.__cause__)
-    scene, parameters = loaded("vertex", tessellation="adaptive", chord_error=0.1)
-    with pytest.raises(RuntimeError, match="recording") as error:
-        dr.freeze(step)(scene, parameters, "shape.chord_error", dr.opaque(mi.Float, 0.2))
-    assert "a frozen function has read the triangles" in str(error.value.__cause__)
+    adaptive = {"tessellation": "adaptive", "chord_error": 0.1}
+    for parameters, key, values, cause in (
+        ({}, "shape.control_points", value("points", 1), "update them before"),
+        (adaptive, "shape.chord_error", dr.opaque(mi.Float, 0.2), "a frozen function has read the triangles"),
+    ):
+        with pytest.raises(RuntimeError, match="recording") as error:
+            dr.freeze(step)(*loaded("vertex", **parameters), key, values)
+        assert cause in str(error.value.__cause__)
 
 
 def test_triangles_that_a_frozen_function_has_read_are_not_replaced():
@@ -158,8 +144,6 @@ def test_triangles_that_a_frozen_function_has_read_are_not_replaced():
     dr.freeze(lambda scene: mi.render(scene, spp=1))(scene)
     with pytest.raises(RuntimeError, match="a frozen function has read the triangles of this shape; choose others"):
         shape.retessellate()
-    mirrored = mi.Transform4f().scale([-1, 1, 1])
-    for key, value in (("chord_error", 0.1), ("to_world", mirrored)):
-        parameters[f"shape.{key}"] = value
+    for key, value in (("chord_error", 0.1), ("to_world", mi.Transform4f().scale([-1, 1, 1]))):
         with pytest.raises(RuntimeError, match="or load the scene anew"):
-            parameters.update()
+            update(parameters, {f"shape.{key}": value})

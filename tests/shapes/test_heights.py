@@ -4,11 +4,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision import LimitSurface, upload
 from mitsuba_subdivision.shapes.heights import AttributeHeights, TextureHeights
+from shapes.cages import cube, load
+from shapes.scenes import waves
+from shapes.updates import update
+from shapes.variants import every_variant
 
 IMAGE = np.random.default_rng(5).random((4, 7, 1)).astype(np.float32)
 # Central differences in single precision.
@@ -23,19 +24,15 @@ TO_UV = {
     "sheared": lambda: mi.ScalarTransform3f(np.array([[1.5, 0.4, 0.1], [-0.2, 0.7, 0.3], [0, 0, 1]])),
 }
 
-pytestmark = pytest.mark.usefixtures("variants_all_rgb")
+pytestmark = every_variant
 
 
 def bitmap(image=IMAGE, **more):
     return {"type": "bitmap", "data": upload(mi.TensorXf, image), "raw": True, **more}
 
 
-def variant():
-    return getattr(mi, mi.variant())
-
-
 def heights_of(texture):
-    return TextureHeights(variant(), texture if isinstance(texture, mi.Texture) else mi.load_dict(texture))
+    return TextureHeights(getattr(mi, mi.variant()), mi.load_dict(texture) if isinstance(texture, dict) else texture)
 
 
 def arrays(*values):
@@ -43,36 +40,27 @@ def arrays(*values):
     return [upload(kind, value) for value in values]
 
 
-def waves():
-    """A texture in Python without a gradient of its own."""
+def needs_derivatives():
+    if not dr.is_diff_v(mi.Float):
+        pytest.skip("only variants of arrays have derivatives")
 
-    class Waves(mi.Texture):
-        def __init__(self, props):
-            mi.Texture.__init__(self, props)
 
-        def eval_1(self, si, active=True):  # noqa: ARG002 - as Mitsuba calls it
-            return dr.sin(3 * si.uv.x) * dr.cos(2 * si.uv.y)
-
-        def is_spatially_varying(self):
-            return True
-
-    mi.register_texture("waves", Waves)
-    return mi.load_dict({"type": "waves"})
+def attached_slopes(heights, s, t):
+    """Derivatives by s and by t, as the chain rule gives them for parameters that are s and t."""
+    zeros, ones = arrays(np.zeros(len(s)), np.ones(len(s)))
+    return heights([s, t], [ones, zeros], [zeros, ones])[1:]
 
 
 def slopes(heights, s, t):
-    """Derivatives by s and by t, as the chain rule gives them for parameters that are s and t."""
-    zeros, ones = arrays(np.zeros(len(s)), np.ones(len(s)))
-    _, by_s, by_t = heights(arrays(s, t), [ones, zeros], [zeros, ones])
-    return np.array(by_s), np.array(by_t)
+    return np.array([np.array(each) for each in attached_slopes(heights, *arrays(s, t))])
 
 
 def differences(heights, s, t):
     def between(ds, dt):
-        ends = (np.array(heights.height(arrays(s + sign * ds, t + sign * dt))) for sign in (1, -1))
-        return (next(ends) - next(ends)) / (2 * STEP)
+        ahead, behind = (np.array(heights.height(arrays(s + sign * ds, t + sign * dt))) for sign in (1, -1))
+        return (ahead - behind) / (2 * STEP)
 
-    return between(STEP, 0), between(0, STEP)
+    return np.array([between(STEP, 0), between(0, STEP)])
 
 
 def places(count=50):
@@ -84,9 +72,7 @@ def places(count=50):
 @pytest.mark.parametrize("channels", [1, 3])
 def test_slopes_of_bitmaps_are_differences(turn, channels):
     heights = heights_of(bitmap(np.repeat(IMAGE, channels, axis=2) * np.arange(1, channels + 1), to_uv=TO_UV[turn]()))
-    s, t = places()
-    found, expected = slopes(heights, s, t), differences(heights, s, t)
-    off = np.abs(np.array(found) - np.array(expected)).max(axis=0)
+    off = np.abs(slopes(heights, *places()) - differences(heights, *places())).max(axis=0)
     # But for some steps that lead across a line between texels.
     assert np.quantile(off, 0.9) < DIFFERENCE * 5
 
@@ -94,8 +80,7 @@ def test_slopes_of_bitmaps_are_differences(turn, channels):
 @pytest.mark.parametrize("turn", [0, 90])
 def test_slopes_of_a_bitmap_turn_with_texture_coordinates(turn):
     """Of a bitmap of texels of a quadratic function, whose differences over a texel are its second derivatives."""
-    if not dr.is_diff_v(mi.Float):
-        pytest.skip("only variants of arrays have derivatives")
+    needs_derivatives()
     height, width = 9, 16
     y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
     image = (0.5 * x**2 - 0.75 * x * y + 0.2 * y**2)[:, :, None].astype(np.float32)
@@ -106,28 +91,23 @@ def test_slopes_of_a_bitmap_turn_with_texture_coordinates(turn):
     inside = np.linalg.inv(a) @ np.concatenate([np.random.default_rng(3).uniform(0.2, 0.8, (2, 40)), np.ones((1, 40))])
     expected = a[:2, :2].T @ [[1, -0.75], [-0.75, 0.4]] @ a[:2, :2]
     for axis in range(2):
-        s, t = arrays(*inside[:2])
-        dr.enable_grad((s, t)[axis])
-        zeros, ones = arrays(np.zeros(40), np.ones(40))
-        _, by_s, by_t = heights([s, t], [ones, zeros], [zeros, ones])
+        given = arrays(*inside[:2])
+        dr.enable_grad(given[axis])
         found = []
-        for slope in (by_s, by_t):
-            dr.set_grad((s, t)[axis], 1)
+        for slope in attached_slopes(heights, *given):
+            dr.set_grad(given[axis], 1)
             found.append(np.array(dr.forward_to(slope, flags=dr.ADFlag.ClearInterior)))
         np.testing.assert_allclose(found, np.repeat(expected[:, axis, None], 40, axis=1), rtol=0, atol=SECOND)
 
 
 def test_slopes_of_a_bitmap_that_is_not_interpolated_are_zero():
-    s, t = places()
-    assert not np.any(slopes(heights_of(bitmap(filter_type="nearest")), s, t))
+    assert not np.any(slopes(heights_of(bitmap(filter_type="nearest")), *places()))
 
 
 def test_slopes_of_a_texture_without_a_gradient_are_derivatives():
-    heights = heights_of(waves())
     s, t = places()
-    found = np.array(slopes(heights, s, t))
     expected = [3 * np.cos(3 * s) * np.cos(2 * t), -2 * np.sin(3 * s) * np.sin(2 * t)]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(slopes(heights_of(waves()), s, t), expected, rtol=0, atol=1e-3)
 
 
 def test_the_range_of_a_bitmap_bounds_it():
@@ -140,8 +120,7 @@ def test_the_range_of_a_bitmap_bounds_it():
 
 
 def test_the_range_of_a_bitmap_in_colours_is_that_of_its_luminance():
-    image = np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)
-    heights = heights_of(bitmap(image))
+    heights = heights_of(bitmap(np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)))
     # At texels' centres the texture has their values.
     s, t = (each.ravel() for each in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))
     values, found = np.array(heights.height(arrays(s, t))), heights.range()
@@ -149,8 +128,7 @@ def test_the_range_of_a_bitmap_in_colours_is_that_of_its_luminance():
 
 
 def test_the_range_of_other_textures_is_that_of_samples():
-    found = heights_of(waves()).range()
-    assert found.high == pytest.approx(1, abs=1e-3)
+    assert heights_of(waves()).range().high == pytest.approx(1, abs=1e-3)
     flat = heights_of({"type": "uniform", "value": 0.25}).range()
     assert (flat.low, flat.high) == (0.25, 0.25)
     board = heights_of({"type": "checkerboard"}).range()
@@ -158,10 +136,7 @@ def test_the_range_of_other_textures_is_that_of_samples():
 
 
 def test_the_range_of_an_attribute_is_the_hull_of_its_values():
-    cube = named_cages.cube()
-    values = np.linspace(-1, 2, 8)[:, None]
-    faces = cube.face_vertices.reshape(-1, 4)
-    cage = ControlCage(cube.positions, faces, attributes={"height": Attribute(values, "vertex")})
+    cage = cube(attributes={"height": np.linspace(-1, 2, 8)[:, None]})
     found = AttributeHeights(LimitSurface(cage).channel("height")).range()
     assert (found.low, found.high) == (-1, 2)
 
@@ -173,24 +148,18 @@ def test_textures_that_are_no_heights_are_refused():
 
 def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap():
     """They did not, but for the products of both coordinates: slopes of bitmaps are constant along a texel."""
-    if not dr.is_diff_v(mi.Float):
-        pytest.skip("only variants of arrays have derivatives")
-    cube = named_cages.cube()
-    x, y, z = cube.positions.T
-    texcoords = Attribute(np.stack([0.3 * x + 0.11 * z + 0.5, 0.3 * y + 0.23 * z + 0.5], axis=1), "vertex")
-    cage = ControlCage(cube.positions, cube.face_vertices.reshape(-1, 4), texcoords=texcoords)
+    needs_derivatives()
+    x, y, z = cube().positions.T
+    cage = cube(texcoords=np.stack([0.3 * x + 0.11 * z + 0.5, 0.3 * y + 0.23 * z + 0.5], axis=1))
     t, s = np.meshgrid(*[(np.arange(256) + 0.5) / 256] * 2, indexing="ij")
-    image = np.sin(4 * np.pi * s) * np.cos(2 * np.pi * t)
-    shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, "displacement_scale": 0.02}
-    parameters = mi.traverse(mi.load_dict({**shape, "displacement": bitmap(image[:, :, None].astype(np.float32))}))
+    image = bitmap((np.sin(4 * np.pi * s) * np.cos(2 * np.pi * t))[:, :, None].astype(np.float32))
+    parameters = mi.traverse(load(cage, tessellation_rate=4, displacement=image, displacement_scale=0.02))
     given = mi.Float(parameters["cage_texcoords"])
     way = upload(mi.Float, np.random.default_rng(1).normal(size=dr.width(given)))
 
     def normals(step):
-        parameters["cage_texcoords"] = given + step * way
-        parameters.update()
         # Dr.Jit clears the derivatives of what others are computed from.
-        return 1 * parameters["vertex_normals"]
+        return 1 * update(parameters, cage_texcoords=given + step * way)["vertex_normals"]
 
     step = mi.Float(0)
     dr.enable_grad(step)

@@ -10,19 +10,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageWarning, ControlCage
+from mitsuba_subdivision import Attribute, CageWarning, ControlCage
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.shapes import nesting
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from reference.refined_cages import tagged
+from shapes.cages import cube, described
+from shapes.updates import update
+from shapes.variants import every_array_variant, every_variant, exact, exact_llvm, llvm
 
 pytestmark = pytest.mark.threads
-
-every_variant = pytest.mark.usefixtures("variants_all_rgb")
-llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-parallel = pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "one by one"])
 
 # Four frames of Python for each of so many shapes on two threads are more than a stack may have, were they nested.
 MANY = 600
@@ -35,17 +32,19 @@ SINGLE = 1e-6
 LONG_AGO = 3_600 * 10**9
 
 
-def coloured(cage, seed=0):
+def coloured(cage, seed=0, **attributes):
     rng = np.random.default_rng(seed)
     texcoords = Attribute(rng.random((len(cage.face_vertices), 2)), "face_varying")
-    return ControlCage.from_arrays(
-        cage.positions, cage.face_sizes, cage.face_vertices,
-        texcoords=texcoords, attributes={"colour": rng.random((cage.vertex_count, 3))},
-    )  # fmt: skip
+    return tagged(cage, texcoords=texcoords, attributes={"colour": rng.random((cage.vertex_count, 3)), **attributes})
 
 
 def of(cage, **parameters):
-    return {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 2, **parameters}
+    rate = {} if "tessellation" in parameters else {"tessellation_rate": 2}
+    return described(cage, **rate, **parameters)
+
+
+def made(cage, **parameters):
+    return mi.load_dict(of(cage, **parameters))
 
 
 def buffers(shape):
@@ -73,51 +72,36 @@ def assert_as_if_alone(shape, found, i):
 @llvm
 @pytest.mark.parametrize(("count", "parallel"), [(MANY, True), (SOME, False)], ids=["parallel", "one by one"])
 def test_many_shapes_load(count, parallel):
-    shape = of(named_cages.cube())
+    shape = of(cube())
     found = load(shape, count, parallel=parallel)
     assert len(found) == count
     for i in (0, count // 2, count - 1):
         assert_as_if_alone(shape, found, i)
 
 
-@exact
-@llvm
+@exact_llvm
 def test_what_waits_within_constructors_loads():
     """All kinds inside each other."""
     kinds = [
         {"shading": "exact"},
         {"displacement": "vertex_height", "displacement_scale": 0.1},
-        {"displacement": "texture", "shading": "exact"},
+        {"displacement": {"type": "checkerboard"}, "shading": "exact"},
         {"tessellation": "adaptive", "chord_error": 0.05},
         {"evaluator": "stam", "sample_offset": 1e-3},
     ]
-    cage = coloured(named_cages.cube())
-    height = np.linspace(0, 1, cage.vertex_count)[:, None]
-    cage = ControlCage.from_arrays(
-        cage.positions, cage.face_sizes, cage.face_vertices, texcoords=cage.texcoords,
-        attributes={**cage.attributes, "height": height},
-    )  # fmt: skip
-
-    def shape(i):
-        parameters = kinds[i % len(kinds)]
-        made = of(cage, **parameters)
-        if parameters.get("displacement") == "texture":
-            made["displacement"] = {"type": "checkerboard"}
-        if "tessellation" in parameters:
-            del made["tessellation_rate"]
-        return made
-
-    scene = {"type": "scene", **{f"s{i:03}": placed(shape(i), i) for i in range(SOME)}}
+    cage = coloured(cube(), height=np.linspace(0, 1, 8)[:, None])
+    shapes = [of(cage, **kinds[i % len(kinds)]) for i in range(SOME)]
+    scene = {"type": "scene", **{f"s{i:03}": placed(shape, i) for i, shape in enumerate(shapes)}}
     found = mi.load_dict(scene).shapes()
     assert len(found) == SOME
     for i in range(SOME - len(kinds), SOME):
-        assert_as_if_alone(shape(i), found, i)
+        assert_as_if_alone(shapes[i], found, i)
 
 
 @llvm
-@parallel
+@pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "one by one"])
 def test_many_shapes_load_from_xml(parallel, tmp_path):
-    named_cages.cube().save(tmp_path / "cube.obj")
+    cube().save(tmp_path / "cube.obj")
     shape = (
         '<shape type="subdivision"><string name="filename" value="cube.obj"/>'
         '<integer name="tessellation_rate" value="2"/><transform name="to_world"><translate x="{}"/></transform>'
@@ -130,7 +114,7 @@ def test_many_shapes_load_from_xml(parallel, tmp_path):
 
 @llvm
 def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
-    shape = of(named_cages.cube())
+    shape = of(cube())
     scene = {f"s{i:03}": placed(shape, i) for i in range(SOME)} | {"wrong": {**shape, "tessellation_rate": 0}}
     with pytest.raises(RuntimeError, match='parameter "tessellation_rate" is 0; expected 1 to'):
         mi.load_dict({"type": "scene", **scene})
@@ -179,25 +163,24 @@ def device_arrays(shape):
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
 @pytest.mark.parametrize("rate", [1, 3])
 def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_path, np_rng):
-    cage = coloured(named_cages.cube())
+    cage = coloured(cube())
     moved = cage.with_positions(cage.positions + np_rng.normal(size=cage.positions.shape) * 0.1)
-    paths = [tmp_path / f"{name}.obj" for name in ("one", "other")]
+    paths = [str(tmp_path / f"{name}.obj") for name in ("one", "other")]
     # An OBJ file has no place for colours.
     for path, each in zip(paths, (cage, moved), strict=True):
         with pytest.warns(CageWarning, match="no place for attribute"):
             each.save(path)
     options = {"shading": shading, "tessellation_rate": rate}
-    from_arrays = [mi.load_dict(of(each, **options)) for each in (cage, moved, coloured(cage, 1))]
-    files = [mi.load_dict({"type": "subdivision", "filename": str(path), **options}) for path in (*paths, paths[0])]
-    for shapes in (from_arrays, files):
-        for shape in shapes[1:]:
-            assert all(a is b for a, b in zip(tables(shapes[0]), tables(shape), strict=True))
+    from_arrays = [mi.load_dict({**of(each), **options}) for each in (cage, moved, coloured(cage, 1))]
+    files = [from_file(path, **options) for path in (*paths, paths[0])]
+    for first, *others in (from_arrays, files):
+        for shape in others:
+            assert all(a is b for a, b in zip(tables(first), tables(shape), strict=True))
             if dr.is_jit_v(mi.Float):
-                assert device_arrays(shape) == device_arrays(shapes[0])
+                assert device_arrays(shape) == device_arrays(first)
+        assert not np.array_equal(buffers(first)["vertex_positions"], buffers(others[0])["vertex_positions"])
     assert files[0]._parameters.surface.patches is from_arrays[0]._parameters.surface.patches
     assert files[0]._triangles.table is from_arrays[0]._triangles.table
-    for shapes in (from_arrays, files):
-        assert not np.array_equal(buffers(shapes[0])["vertex_positions"], buffers(shapes[1])["vertex_positions"])
 
 
 @every_variant
@@ -216,18 +199,17 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
     ids=str,
 )
 def test_shapes_of_other_tags_or_rules_share_no_patches(change):
-    cube = named_cages.cube()
-    other = ControlCage.from_arrays(cube.positions, cube.face_sizes, cube.face_vertices, **change)
-    one, two = (mi.load_dict(of(cage)) for cage in (cube, other))
+    one, two = (made(cage) for cage in (cube(), cube(**change)))
     assert one._parameters.surface.patches is not two._parameters.surface.patches
     assert one._triangles.table is not two._triangles.table
 
 
 @every_variant
 def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
-    cube = named_cages.cube()
     one, two, three = (
-        mi.load_dict(of(cube, **more)) for more in ({}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"})
+        made(cube()),
+        mi.load_dict({**of(cube()), "tessellation_rate": 3}),
+        made(cube(), scheme="doo_sabin"),
     )
     assert one._parameters.surface.patches is two._parameters.surface.patches
     assert len({id(each._triangles.table) for each in (one, two, three)}) == 3
@@ -235,7 +217,7 @@ def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
 
 
 @exact
-@pytest.mark.usefixtures("variants_array_rgb")
+@every_array_variant
 def test_nothing_is_kept_when_the_last_shape_has_gone():
     shape = of(coloured(named_cages.torus(4, 3)), shading="exact")
     one, two = mi.load_dict(shape), mi.load_dict(shape)
@@ -251,9 +233,10 @@ def test_nothing_is_kept_when_the_last_shape_has_gone():
 # Files
 
 
-def written(cage, path, age=LONG_AGO):
+def written(cage, path, age=LONG_AGO, more=""):
     """Write a cage to a file as if that had been so many nanoseconds ago."""
     cage.save(path)
+    path.write_text(path.read_text() + more)
     then = time.time_ns() - age
     os.utime(path, ns=(then, then))
     return str(path)
@@ -263,45 +246,42 @@ def from_file(path, **more):
     return mi.load_dict({"type": "subdivision", "filename": path, "tessellation_rate": 2, **more})
 
 
+def cage_of(shape):
+    return shape._parameters.surface.cage
+
+
 @every_variant
 def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
-    cube = named_cages.cube()
-    path = written(cube, tmp_path / "cube.obj")
+    path = written(cube(), tmp_path / "cube.obj")
     one = from_file(path)
     with monkeypatch.context() as patched:
         patched.setattr(ControlCage, "from_file", None)
         two = from_file(path)
-    assert one._parameters.surface.cage is two._parameters.surface.cage
+    assert cage_of(one) is cage_of(two)
     # Of the same size.
-    shifted = cube.with_positions(cube.positions[::-1])
-    three = from_file(written(shifted, path, LONG_AGO // 2))
-    np.testing.assert_array_equal(three._parameters.surface.cage.positions, shifted.positions)
+    shifted = cube().with_positions(cube().positions[::-1])
+    three = from_file(written(shifted, tmp_path / "cube.obj", LONG_AGO // 2))
+    np.testing.assert_array_equal(cage_of(three).positions, shifted.positions)
     # Other options, another cage.
-    assert from_file(path, boundary="none", strict=True)._parameters.surface.cage.boundary == "none"
+    assert cage_of(from_file(path, boundary="none", strict=True)).boundary == "none"
 
 
 @every_variant
 def test_a_file_that_has_just_changed_is_read_again(tmp_path):
     """Times of files are too coarse to tell whether it has changed once more."""
-    cube = named_cages.cube()
     shapes = []
-    for positions in (cube.positions, cube.positions[::-1]):
-        shapes.append(from_file(written(cube.with_positions(positions), tmp_path / "cube.obj", age=0)))
-        np.testing.assert_array_equal(shapes[-1]._parameters.surface.cage.positions, positions)
+    for positions in (cube().positions, cube().positions[::-1]):
+        shapes.append(from_file(written(cube().with_positions(positions), tmp_path / "cube.obj", age=0)))
+        np.testing.assert_array_equal(cage_of(shapes[-1]).positions, positions)
 
 
 @every_variant
 def test_each_shape_warns_of_its_file(tmp_path):
-    path = tmp_path / "cube.obj"
-    written(named_cages.cube(), path)
-    path.write_text(path.read_text() + "v 9 9 9\n")
-    then = time.time_ns() - LONG_AGO
-    os.utime(path, ns=(then, then))
-    shapes = []
+    path, shapes = written(cube(), tmp_path / "cube.obj", more="v 9 9 9\n"), []
     for _ in range(2):
         with pytest.warns(CageWarning, match="used by no face"):
-            shapes.append(from_file(str(path)))
-    assert shapes[0]._parameters.surface.cage is shapes[1]._parameters.surface.cage
+            shapes.append(from_file(path))
+    assert cage_of(shapes[0]) is cage_of(shapes[1])
 
 
 def test_names_of_formats_that_refer_to_no_other_files():
@@ -311,9 +291,8 @@ def test_names_of_formats_that_refer_to_no_other_files():
 
 @llvm
 def test_triangles_that_are_chosen_anew_keep_derivatives():
-    shape = mi.load_dict(of(named_cages.cube()))
-    parameters = mi.traverse(shape)
-    dr.enable_grad(parameters["control_points"])
+    shape = made(cube())
+    dr.enable_grad(mi.traverse(shape)["control_points"])
     shape.retessellate()
     dr.backward(dr.sum(mi.traverse(shape)["vertex_positions"]))
     assert np.array(dr.grad(shape.control_points)).any()
@@ -321,16 +300,12 @@ def test_triangles_that_are_chosen_anew_keep_derivatives():
 
 @llvm
 def test_shapes_of_equal_attributes_share_them_on_the_device():
-    cage = coloured(named_cages.cube())
-    one, two, other = (
-        mi.load_dict(of(each)) for each in (cage, cage.with_positions(-cage.positions), coloured(cage, 1))
-    )
+    cage = coloured(cube())
+    one, two, other = (made(each) for each in (cage, cage.with_positions(-cage.positions), coloured(cage, 1)))
     for name in ("vertex_colour", "vertex_texcoords"):
         index = [mi.traverse(shape)[name].index for shape in (one, two, other)]
         assert index[0] == index[1] != index[2]
     # What one of them is given is its own.
-    parameters = mi.traverse(one)
-    parameters["cage_colour"] *= 2
-    parameters.update()
+    update(one, cage_colour=mi.traverse(one)["cage_colour"] * 2)
     before, after = (np.array(mi.traverse(shape)["vertex_colour"]) for shape in (two, one))
     np.testing.assert_allclose(after, 2 * before, rtol=SINGLE)

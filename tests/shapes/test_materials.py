@@ -3,14 +3,16 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage
-from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
-from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision import ControlCage, upload
+from mitsuba_subdivision.cage.named_cages import tetrahedron
+from shapes.cages import cube
+from shapes.scenes import buffer
+from shapes.variants import scalar
 
 MATERIALS = {"": [0], "red": [1, 4], "dark blue": [2, 3, 5]}
 # Sums of some hundred areas in single precision.
 ROUNDING = 1e-6
-TESSELLATIONS = {"uniform": {"tessellation_rate": 3}, "adaptive": {"tessellation": "adaptive", "max_edge": 0.4}}
+TESSELLATIONS = [{"tessellation_rate": 3}, {"tessellation": "adaptive", "max_edge": 0.4}]
 
 
 @pytest.fixture
@@ -33,9 +35,7 @@ def shape(**parameters):
 
 def triangles(part):
     """Positions of the corners of all triangles, as numbers with all their bits, in one order."""
-    found = mi.traverse(part)
-    positions = np.array(found["vertex_positions"]).reshape(-1, 3)
-    corners = positions[np.array(found["faces"]).reshape(-1, 3)].reshape(-1, 9)
+    corners = buffer(part, "vertex_positions")[buffer(part, "faces")].reshape(-1, 9)
     return corners[np.lexsort(corners.T)]
 
 
@@ -46,11 +46,11 @@ def test_files_name_the_material_of_each_face(file):
     assert {name: len(faces) for name, faces in refined.items()} == {"": 4, "red": 8, "dark blue": 12}
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
-@pytest.mark.parametrize("name", TESSELLATIONS)
-def test_materials_share_their_vertices_bit_by_bit(file, name):
-    whole = shape(filename=file, **TESSELLATIONS[name])
-    parts = [shape(filename=file, material=material, **TESSELLATIONS[name]) for material in MATERIALS]
+@scalar
+@pytest.mark.parametrize("given", TESSELLATIONS, ids=["uniform", "adaptive"])
+def test_materials_share_their_vertices_bit_by_bit(file, given):
+    whole = shape(filename=file, **given)
+    parts = [shape(filename=file, material=material, **given) for material in MATERIALS]
     together = np.concatenate([triangles(part) for part in parts])
     np.testing.assert_array_equal(together[np.lexsort(together.T)], triangles(whole))
     areas = [float(part.surface_area()) for part in parts]
@@ -58,7 +58,7 @@ def test_materials_share_their_vertices_bit_by_bit(file, name):
     assert min(areas) > 0
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_unknown_materials_and_faces_are_errors(file):
     with pytest.raises(RuntimeError, match='"material" is "green"; expected one of "", "red", "dark blue"'):
         shape(filename=file, material="green")

@@ -4,16 +4,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import Attribute
-from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision import LimitSurface, upload
+from shapes.cages import cube, load
+from shapes.scenes import SINGLE
+from shapes.updates import update
+from shapes.variants import every_variant, llvm, shadings
 
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-
-# Single precision, and where a ray meets the surface in it.
-SINGLE, HIT = 2e-6, 1e-4
+# Where a ray meets the surface in single precision.
+HIT = 1e-4
 # Texture coordinates of a point that is found by them, at four segments for each edge.
 TEXTURE = 5e-4
 RATE = 4
@@ -27,28 +25,17 @@ class Place:
     Texture coordinates are x and y, the colour is half the position plus one half, the weight is x.
     """
 
-    def __init__(self, shading, has_gradients=False):
+    def __init__(self, shading):
         positions = cube().positions
-        cage = ControlCage(
-            positions,
-            cube().face_vertices.reshape(-1, 4),
-            texcoords=Attribute(positions[:, :2]),
-            attributes={"color": positions / 2 + 0.5, "weight": positions[:, :1]},
-        )
+        attributes = {"color": positions / 2 + 0.5, "weight": positions[:, :1]}
+        cage = cube(texcoords=positions[:, :2], attributes=attributes)
         self.surface, self.is_exact = LimitSurface(cage), shading == "exact"
-        parameters = {"tessellation_rate": RATE, "shading": shading, "bsdf": {"type": "diffuse"}}
-        self.shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), **parameters})
+        self.shape = load(cage, tessellation_rate=RATE, shading=shading, bsdf={"type": "diffuse"})
         self.ray = mi.Ray3f([0.1, 0.2, 5], [0.01, 0, -1])
         # Kept, as Mitsuba's own `eval_parameterization` refers to the scene of a shape.
         self.scene = mi.load_dict({"type": "scene", "shape": self.shape})
         self.preliminary = self.scene.ray_intersect_preliminary(self.ray)
         self.si = self.preliminary.compute_surface_interaction(self.ray)
-        self.interaction = dr.zeros(mi.Interaction3f)
-        self.interaction.p = mi.Point3f(CENTRE)
-        if has_gradients:
-            scene_parameters = mi.traverse(self.shape)
-            dr.enable_grad(scene_parameters["control_points"])
-            scene_parameters.update()
 
 
 def numbers(value):
@@ -59,13 +46,9 @@ def close(found, expected, atol=SINGLE):
     np.testing.assert_allclose(numbers(found), expected, atol=atol)
 
 
-def holds(value, *expected):
-    assert [bool(np.all(numbers(each))) if dr.is_array_v(each) else each for each in value] == list(expected)
-
-
-def refused(call, message):
+def refused(message, call, *arguments):
     with pytest.raises(RuntimeError, match=message):
-        call()
+        call(*arguments)
 
 
 def add_attribute(at):
@@ -76,7 +59,7 @@ def add_attribute(at):
 def remove_attribute(at):
     add_attribute(at)
     at.shape.remove_attribute("vertex_half")
-    holds([at.shape.has_attribute("vertex_half")], False)
+    assert not dr.all(at.shape.has_attribute("vertex_half"))
 
 
 def texture_attribute(at):
@@ -122,7 +105,8 @@ def attributes(at):
     close(at.shape.eval_attribute("vertex_color", at.si), p / 2 + 0.5, HIT)
     close(at.shape.eval_attribute_3("vertex_color", at.si), p / 2 + 0.5, HIT)
     close(at.shape.eval_attribute_1("vertex_weight", at.si), p[0], HIT)
-    holds([at.shape.has_attribute("vertex_color"), at.shape.has_mesh_attributes()], True, True)
+    assert dr.all(at.shape.has_attribute("vertex_color"))
+    assert at.shape.has_mesh_attributes()
 
 
 def eval_parameterization(at):
@@ -134,19 +118,17 @@ def eval_parameterization(at):
         if at.is_exact:
             close(si.sh_frame.n, nearest.n[0], 1e-3)
         assert nearest.distance[0] <= (HIT if at.is_exact else 0.1)
-    holds([at.shape.eval_parameterization(mi.Point2f(2, 2)).is_valid()], False)
-    texcoords = mi.traverse(at.shape)
+    assert not dr.any(at.shape.eval_parameterization(mi.Point2f(2, 2)).is_valid())
     if at.is_exact:
         # Those of Mitsuba's own method stay.
-        texcoords["cage_texcoords"] = texcoords["cage_texcoords"] + 10
-        texcoords.update()
+        update(at.shape, cage_texcoords=mi.traverse(at.shape)["cage_texcoords"] + 10)
         close(numbers(at.shape.eval_parameterization(mi.Point2f(10.3, 10.2)).p)[:2], [0.3, 0.2], TEXTURE)
 
 
 def normals_at_vertices(at):
     if at.is_exact:
-        refused(lambda: at.shape.vertex_normal(0), "vertex_normal: the mesh has no normals .* exact shading")
-        refused(at.shape.recompute_vertex_normals, "recompute_vertex_normals: the mesh has no normals .* exact shading")
+        refused("vertex_normal: the mesh has no normals .* exact shading", at.shape.vertex_normal, 0)
+        refused("recompute_vertex_normals: the mesh has no normals .* exact shading", at.shape.recompute_vertex_normals)
         assert len(at.shape.vertex_normals_buffer()) == 0
     else:
         expected = at.surface.tessellate(RATE).normals
@@ -154,17 +136,18 @@ def normals_at_vertices(at):
         close(at.shape.vertex_normal(3), expected[3], 50 * SINGLE)
         at.shape.recompute_vertex_normals()
         close(dr.norm(at.shape.vertex_normal(3)), 1)
-    holds([at.shape.has_vertex_normals(), at.shape.has_face_normals()], not at.is_exact, False)
+    assert at.shape.has_vertex_normals() == (not at.is_exact)
+    assert not at.shape.has_face_normals()
 
 
 def texcoords_at_vertices(at):
     if at.is_exact:
-        refused(lambda: at.shape.vertex_texcoord(0), "the mesh has no texture coordinates .* exact shading")
+        refused("the mesh has no texture coordinates .* exact shading", at.shape.vertex_texcoord, 0)
         assert len(at.shape.vertex_texcoords_buffer()) == 0
     else:
         close(at.shape.vertex_texcoord(3), numbers(at.shape.vertex_position(3))[:2])
         assert len(at.shape.vertex_texcoords_buffer()) == 2 * at.shape.vertex_count()
-    holds([at.shape.has_vertex_texcoords()], not at.is_exact)
+    assert at.shape.has_vertex_texcoords() == (not at.is_exact)
 
 
 def samples(at):
@@ -174,9 +157,11 @@ def samples(at):
     close(at.shape.pdf_position(found), 1 / area)
     # On a triangle, not further from the surface than its middle.
     assert at.surface.closest_point(numbers(found.p)[None]).distance[0] < 0.1
-    direction = at.shape.sample_direction(at.interaction, u)
+    viewer = dr.zeros(mi.Interaction3f)
+    viewer.p = mi.Point3f(CENTRE)
+    direction = at.shape.sample_direction(viewer, u)
     close(direction.p, numbers(found.p))
-    close(at.shape.pdf_direction(at.interaction, direction), numbers(direction.pdf), 1e-4)
+    close(at.shape.pdf_direction(viewer, direction), numbers(direction.pdf), 1e-4)
 
 
 def surface_area(at):
@@ -184,44 +169,44 @@ def surface_area(at):
 
 
 def silhouettes(at):
-    with_gradients = Place("exact" if at.is_exact else "vertex", has_gradients=True).shape
+    shape, perimeter = Place("exact" if at.is_exact else "vertex").shape, int(mi.DiscontinuityFlags.PerimeterType)
+    scene_parameters = mi.traverse(shape)
+    dr.enable_grad(scene_parameters["control_points"])
+    scene_parameters.update()
     given = np.random.default_rng(0).random((3, 1000))
-    sample = with_gradients.sample_silhouette(upload(mi.Point3f, given.T), EDGES)
+    sample = shape.sample_silhouette(upload(mi.Point3f, given.T), EDGES)
     # Edges are silhouettes from few directions each.
     is_valid = np.array(sample.is_valid())
     assert is_valid.sum() > 50
-    again = np.array(with_gradients.invert_silhouette_sample(sample))
+    again = np.array(shape.invert_silhouette_sample(sample))
     np.testing.assert_allclose(again[:, is_valid], given[:, is_valid], atol=1e-3)
-    indices, weights = with_gradients.precompute_silhouette(mi.ScalarPoint3f(CENTRE))
+    indices, weights = shape.precompute_silhouette(mi.ScalarPoint3f(CENTRE))
     assert len(indices) == len(weights) > 0
-    first = with_gradients.sample_precomputed_silhouette(mi.Point3f(CENTRE), int(np.array(indices)[0]), 0.5)
-    assert with_gradients.bbox().contains(numbers(first.p).tolist())
-    kind = int(mi.DiscontinuityFlags.PerimeterType)
-    projected = with_gradients.primitive_silhouette_projection(mi.Point3f(CENTRE), at.si, kind, 0.5)
-    assert with_gradients.bbox().contains(numbers(projected.p).tolist())
-    assert with_gradients.silhouette_discontinuity_types() == int(mi.DiscontinuityFlags.PerimeterType)
-    assert with_gradients.silhouette_sampling_weight() == 1
-    assert with_gradients.parameters_grad_enabled()
+    first = shape.sample_precomputed_silhouette(mi.Point3f(CENTRE), int(np.array(indices)[0]), 0.5)
+    assert shape.bbox().contains(numbers(first.p).tolist())
+    projected = shape.primitive_silhouette_projection(mi.Point3f(CENTRE), at.si, perimeter, 0.5)
+    assert shape.bbox().contains(numbers(projected.p).tolist())
+    assert shape.silhouette_discontinuity_types() == perimeter
+    assert shape.silhouette_sampling_weight() == 1
+    assert shape.parameters_grad_enabled()
 
 
 def write_ply(at):
-    def load(path):
-        at.shape.write_ply(str(path))
-        return mi.load_dict({"type": "ply", "filename": str(path)})
-
-    found = load(at.folder / "mesh.ply")
+    path = str(at.folder / "mesh.ply")
+    at.shape.write_ply(path)
+    found = mi.load_dict({"type": "ply", "filename": path})
     close(found.vertex_positions_buffer(), numbers(at.shape.vertex_positions_buffer()))
     close(found.attribute_buffer("vertex_color"), numbers(at.shape.attribute_buffer("vertex_color")))
 
 
 def merge(at):
-    refused(lambda: at.shape.merge(at.shape), "merge: the shape's vertices follow its control points; expected")
+    refused("merge: the shape's vertices follow its control points; expected", at.shape.merge, at.shape)
 
 
 def not_of_meshes(at):
     """Mitsuba's own meshes have none of these either."""
     for method in (at.shape.ray_intersect, at.shape.ray_intersect_preliminary, at.shape.ray_test):
-        refused(lambda method=method: method(at.ray), "not implemented")
+        refused("not implemented", method, at.ray)
     # A name that no mesh has, of attributes of any size.
     assert np.count_nonzero(numbers(at.shape.eval_attribute_x("vertex_color", at.si))) == 0
 
@@ -238,18 +223,9 @@ def counts(at):
 
 def properties(at):
     shape = at.shape
-    holds(
-        [
-            shape.is_mesh(),
-            shape.is_ellipsoids(),
-            shape.is_emitter(),
-            shape.is_sensor(),
-            shape.is_medium_transition(),
-            shape.has_flipped_normals(),
-        ],
-        True,
-        *[False] * 5,
-    )
+    assert shape.is_mesh()
+    for name in ("is_ellipsoids", "is_emitter", "is_sensor", "is_medium_transition", "has_flipped_normals"):
+        assert not getattr(shape, name)()
     assert (shape.emitter(), shape.sensor(), shape.interior_medium(), shape.exterior_medium()) == (None,) * 4
     shape.set_id("name")
     assert shape.id() == "name"
@@ -265,9 +241,7 @@ def properties(at):
 
 
 def parameters(at):
-    found = mi.traverse(at.shape)
-    found["control_points"] = found["control_points"] * 2
-    found.update()
+    update(at.shape, control_points=mi.traverse(at.shape)["control_points"] * 2)
     at.shape.parameters_changed([])
     close(at.shape.bbox().max, 2 * numbers(at.surface.tessellate(RATE).positions).max() * np.ones(3), 1e-5)
 
@@ -300,13 +274,13 @@ METHODS = {
 }
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 def test_these_are_all_methods():
     called = {name for names in METHODS.values() for name in names.split()}
     assert called == {name for name in dir(mi.Mesh) if not name.startswith("_")}
 
 
-@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
+@shadings
 @pytest.mark.parametrize("check", METHODS, ids=lambda check: check.__name__)
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
 def test_methods(check, shading, tmp_path):
@@ -315,12 +289,12 @@ def test_methods(check, shading, tmp_path):
     check(at)
 
 
-@pytest.mark.parametrize("shading", ["vertex", pytest.param("exact", marks=exact)])
-@pytest.mark.usefixtures("variants_all_rgb")
+@shadings
+@every_variant
 def test_a_cage_without_texture_coordinates_has_none_to_find(shading):
-    shape = mi.load_dict({"type": "subdivision", **cube().as_properties(mi), "shading": shading})
+    shape = load(cube(), shading=shading)
     message = ": the mesh has no texture coordinates at its vertices, as the cage has none"
-    refused(lambda: shape.eval_parameterization(mi.Point2f(0.5)), f"eval_parameterization{message}")
-    refused(lambda: shape.vertex_texcoord(0), f"vertex_texcoord{message}")
-    flat = mi.load_dict({"type": "subdivision", **cube().as_properties(mi), "face_normals": True})
-    refused(lambda: flat.vertex_normal(0), "vertex_normal: the mesh has no normals at its vertices, as it has face")
+    refused(f"eval_parameterization{message}", shape.eval_parameterization, mi.Point2f(0.5))
+    refused(f"vertex_texcoord{message}", shape.vertex_texcoord, 0)
+    flat = load(cube(), face_normals=True)
+    refused("vertex_normal: the mesh has no normals at its vertices, as it has face", flat.vertex_normal, 0)

@@ -5,28 +5,26 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.rules import RULES
-from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes import register_variant
 from mitsuba_subdivision.shapes.attribute_parameters import is_attribute_parameter
 from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
 from mitsuba_subdivision.shapes.tessellation_parameters import LIMITS
 from mitsuba_subdivision.tessellation import HIGHEST_RATE
+from shapes.cages import cube, load
+from shapes.variants import every_variant, llvm, scalar
 
 ROWS = (*PARAMETERS, *STATE_PARAMETERS)
 
 
 def shown_by(**parameters):
     """Flags by name of what `traverse` shows, but for parameters of objects within."""
-    cube = named_cages.cube()
-    texcoords = upload(mi.TensorXf, cube.positions[:, :2])
-    values = {"texcoords": texcoords, "vertex_NAME": upload(mi.TensorXf, np.ones((8, 1), dtype=np.float32))}
-    found = mi.traverse(mi.load_dict({"type": "subdivision", **cube.as_properties(mi), **values, **parameters}))
+    cage = cube(texcoords=cube().positions[:, :2], attributes={"NAME": np.ones((8, 1))})
+    found = mi.traverse(load(cage, **parameters))
     return {name: found.flags(name) for name in found.keys() if "." not in name}  # noqa: SIM118
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 @pytest.mark.parametrize("limit", [None, "chord_error", "max_edge"])
 def test_traverse_shows_what_the_table_says(limit):
     adaptive = {} if limit is None else {"tessellation": "adaptive", limit: 0.5}
@@ -40,7 +38,7 @@ def test_traverse_shows_what_the_table_says(limit):
         assert ("discontinuous" in stated[name]) == bool(flags & mi.ParamFlags.Discontinuous), name
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 def test_arrays_of_exact_shading_are_on_the_page():
     parameters = {"displacement": {"type": "checkerboard"}, "shading": "auto"}
     names = shown_by(**parameters).keys() - {row.name for row in ROWS}
@@ -48,7 +46,7 @@ def test_arrays_of_exact_shading_are_on_the_page():
     assert [name for name in names if f"``{name}``" not in register_variant(mi.variant()).__doc__] == []
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_the_page_has_every_row():
     page = register_variant(mi.variant()).__doc__
     rows = re.split(r"^ \* - ", page, flags=re.MULTILINE)[1:]

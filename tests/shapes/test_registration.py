@@ -1,6 +1,5 @@
 """The plugin is there in every variant, whatever the order of import and `set_variant`."""
 
-import os
 import subprocess
 import sys
 import threading
@@ -9,71 +8,66 @@ from pathlib import Path
 import mitsuba as mi
 import mitsuba_subdivision as msub
 import pytest
-from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.llvm import llvm_problem, require_llvm
 from mitsuba_subdivision.shapes import register_variant
+from shapes.cages import cube, load
+from shapes.variants import every_variant, scalar
 
 STAR = Path(__file__).parents[2] / "scenes/cages/star.obj"
-SETUP = """
-def faces():
+BEGIN = """
+def cube():
     from mitsuba_subdivision.cage import named_cages
-    scene = mi.load_dict({"type": "scene", "s": {"type": "subdivision", **named_cages.cube().as_properties(mi)}})
-    return [shape.face_count() for shape in scene.shapes()]
+    return {"type": "subdivision", **named_cages.cube().as_properties(mi)}
+def faces():
+    return [shape.face_count() for shape in mi.load_dict({"type": "scene", "s": cube()}).shapes()]
 """
 ORDERS = {
     "import last": "import mitsuba as mi; mi.set_variant('scalar_rgb'); import mitsuba_subdivision",
     "import between": "import mitsuba as mi; import mitsuba_subdivision; mi.set_variant('scalar_rgb')",
     "import first": "import mitsuba_subdivision; import mitsuba as mi; mi.set_variant('scalar_rgb')",
 }
+needs_llvm = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
 
 
-def run(code, **environment):
-    return subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+def run(code):
+    """In a process of its own: other tests use the variant where Mitsuba looks types up."""
+    command = [sys.executable, "-W", "error", "-c", BEGIN + code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_order_of_import(order):
     again = "mitsuba_subdivision.register()\nassert faces() == [768], faces()"
-    done = run(f"{ORDERS[order]}\n{SETUP}\nassert faces() == [768], faces()\n{again}")
-    assert done.returncode == 0, done.stderr
+    run(f"{ORDERS[order]}\nassert faces() == [768], faces()\n{again}")
 
 
-@pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+@needs_llvm
 def test_switching_back_and_forth():
-    code = "import mitsuba as mi, mitsuba_subdivision\n" + SETUP
+    code = "import mitsuba as mi, mitsuba_subdivision\n"
     for variant in ("scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "scalar_spectral", "llvm_ad_rgb", "llvm_ad_spectral"):
         code += f"mi.set_variant('{variant}'); assert faces() == [768], '{variant}'\n"
-    done = run(code)
-    assert done.returncode == 0, done.stderr
+    run(code)
 
 
 def test_every_variant(variants_all):
-    cage = named_cages.cube()
-    shape = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 2})
+    shape = load(cube(), tessellation_rate=2)
     assert shape.face_count() == 6 * 2 * 4
     assert isinstance(shape, register_variant(variants_all))
 
 
-@pytest.mark.usefixtures("variants_all_rgb")
+@every_variant
 def test_a_missing_llvm_matters_to_its_own_variants_only(monkeypatch):
-    shape = {"type": "subdivision", **named_cages.cube().as_properties(mi), "tessellation_rate": 1}
     monkeypatch.setattr("mitsuba_subdivision.llvm.llvm_problem", lambda: "no LLVM here")
     require_llvm.cache_clear()
     if mi.variant().startswith("llvm"):
         with pytest.raises(RuntimeError, match="no LLVM here"):
-            mi.load_dict(shape)
+            load(cube(), tessellation_rate=1)
     else:
-        assert mi.load_dict(shape).face_count() == 12
+        assert load(cube(), tessellation_rate=1).face_count() == 12
 
 
-@pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+@needs_llvm
 def test_a_library_that_aborts_is_warned_of_where_an_llvm_variant_is_set_and_nowhere_else(monkeypatch):
     mi.set_variant("scalar_rgb")
     monkeypatch.setattr("mitsuba_subdivision.llvm.llvm_problem", lambda: "this LLVM aborts")
@@ -83,14 +77,14 @@ def test_a_library_that_aborts_is_warned_of_where_an_llvm_variant_is_set_and_now
     mi.set_variant("scalar_rgb")
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_registers_once():
     before = register_variant("scalar_rgb")
     msub.register()
     assert register_variant("scalar_rgb") is before
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_registers_once_from_many_threads():
     found = []
     threads = [threading.Thread(target=lambda: found.append(register_variant("scalar_spectral"))) for _ in range(8)]
@@ -102,35 +96,29 @@ def test_registers_once_from_many_threads():
     assert len(set(found)) == 1
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+@pytest.mark.parametrize("variant", ["scalar_rgb", pytest.param("llvm_ad_rgb", marks=needs_llvm)])
 def test_equal_shapes_of_a_dict_stay_two(variant):
-    """In a process of its own: other tests use the variant where Mitsuba looks types up."""
-    if variant.startswith("llvm") and llvm_problem():
-        pytest.skip(llvm_problem())
-    done = run(
-        f"import mitsuba_subdivision, mitsuba as mi; mi.set_variant('{variant}')\n"
-        "from mitsuba_subdivision.cage import named_cages\n"
-        "d = {'type': 'subdivision', **named_cages.cube().as_properties(mi)}\n"
-        "scene = mi.load_dict({'type': 'scene', 'left': d, 'right': dict(d)})\n"
-        "assert sorted(shape.id() for shape in scene.shapes()) == ['left', 'right']\n"
-        "assert {'left.control_points', 'right.control_points'} <= set(mi.traverse(scene).keys())\n"
-        # Whether or not objects of a scene are merged.
-        "assert len(mi.load_dict({'type': 'scene', 'a': d, 'b': d}, optimize=False).shapes()) == 2\n"
-    )
-    assert done.returncode == 0, done.stderr
+    code = """
+scene = mi.load_dict({'type': 'scene', 'left': cube(), 'right': cube()})
+assert sorted(shape.id() for shape in scene.shapes()) == ['left', 'right']
+assert {'left.control_points', 'right.control_points'} <= set(mi.traverse(scene).keys())
+# Whether or not objects of a scene are merged.
+one = cube()
+assert len(mi.load_dict({'type': 'scene', 'a': one, 'b': one}, optimize=False).shapes()) == 2
+"""
+    run(f"import mitsuba_subdivision, mitsuba as mi; mi.set_variant('{variant}')\n{code}")
 
 
-@pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+@needs_llvm
 def test_a_dict_can_be_written_as_xml():
-    done = run(
-        "import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')\n"
-        "scene = {'type': 'scene', 'left': {'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}\n"
-        "state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)\n"
-        "text = mi.parser.write_string(state)\n"
-        'assert \'<shape type="subdivision" name="left">\' in text, text\n'
-        'assert \'<integer name="tessellation_rate" value="3"\' in text, text\n'
-    )
-    assert done.returncode == 0, done.stderr
+    run("""
+import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')
+scene = {'type': 'scene', 'left': {'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}
+state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
+text = mi.parser.write_string(state)
+assert '<shape type="subdivision" name="left">' in text, text
+assert '<integer name="tessellation_rate" value="3"' in text, text
+""")
 
 
 def test_unknown_variant_is_an_error():
@@ -140,7 +128,7 @@ def test_unknown_variant_is_an_error():
 
 def test_a_first_picture_imports_little():
     # What Mitsuba itself has imported costs nothing more. These take longest of the rest.
-    code = f"""
+    run(f"""
 import sys, mitsuba as mi, numpy
 there = set(sys.modules)
 import mitsuba_subdivision
@@ -150,6 +138,4 @@ scene = {{"type": "scene", "cage": {{"type": "subdivision", "filename": {str(STA
 mi.render(mi.load_dict(scene | {{"sensor": {{"type": "perspective"}}, "integrator": {{"type": "direct"}}}}), spp=1)
 heavy = {{"scipy", "pathlib", "argparse"}}
 assert not heavy & (set(sys.modules) - there), heavy & (set(sys.modules) - there)
-"""
-    done = run(code)
-    assert done.returncode == 0, done.stderr
+""")

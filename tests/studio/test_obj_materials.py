@@ -10,6 +10,8 @@ from mitsuba_subdivision.commands.pictures import save_scene
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.studio.obj_materials import material_bsdf, read_materials
 
+pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
+SMALL = {"size": (8, 6), "rate": 2, "shading": "vertex"}
 LIBRARY = """newmtl red
 Kd 1 0 0.25 # pure
 Ks 0.5 0.5 0.5
@@ -28,17 +30,16 @@ map_Bump a.png
 @pytest.fixture
 def file(tmp_path):
     cube().save(tmp_path / "cube.obj")
-    text = (tmp_path / "cube.obj").read_text().replace("\nf ", "\nusemtl red\nf ", 1).replace("\nf ", "\nf ", 1)
+    text = (tmp_path / "cube.obj").read_text().replace("\nf ", "\nusemtl red\nf ", 1)
     head, _, tail = text.rpartition("\nf ")
     (tmp_path / "cube.obj").write_text(f"mtllib cube.mtl\n{head}\nusemtl lamp\nf {tail}")
     (tmp_path / "cube.mtl").write_text(LIBRARY)
     return tmp_path / "cube.obj"
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_each_material_is_a_shape_with_its_bsdf(file):
     with pytest.warns(CageWarning) as record:
-        scene = studio_scene(file, size=(8, 6), rate=2, shading="vertex")
+        scene = studio_scene(file, **SMALL)
     assert [str(each.message).partition(": ")[2] for each in record] == [
         "map_Bump left out; expected Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, "
         "illum, Pr and Pm",
@@ -57,21 +58,16 @@ def test_each_material_is_a_shape_with_its_bsdf(file):
     assert np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all()
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_a_missing_library_leaves_one_shape(file):
-    (file.parent / "cube.mtl").unlink()
-    with pytest.warns(CageWarning, match=r'there is no material library "cube.mtl"; its materials are grey'):
-        scene = studio_scene(file, size=(8, 6), rate=2, shading="vertex")
-    assert "material" not in scene["surface"]
-    assert "surface_2" not in scene
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_materials_that_no_library_has_are_told(file):
+def test_materials_that_no_library_has_are_grey_and_told(file):
     (file.parent / "cube.mtl").write_text("newmtl red\nKd 1 0 0\n")
     with pytest.warns(CageWarning, match='cube.obj": no material library has "lamp"; their faces are grey'):
-        scene = studio_scene(file, size=(8, 6), rate=2, shading="vertex")
-    assert scene["surface_2"]["material"] == "lamp"
+        assert studio_scene(file, **SMALL)["surface_2"]["material"] == "lamp"
+    (file.parent / "cube.mtl").unlink()
+    with pytest.warns(CageWarning, match=r'there is no material library "cube.mtl"; its materials are grey'):
+        scene = studio_scene(file, **SMALL)
+    # One shape.
+    assert "material" not in scene["surface"]
+    assert "surface_2" not in scene
 
 
 # A picture of two by two pixels, from the top: bright and dark, 0.25 and dark.
@@ -80,12 +76,12 @@ PIXELS = np.array([[1.0, 0.0], [0.25, 0.0]])
 
 @pytest.fixture
 def texture(tmp_path):
-    """Function that makes the texture of a statement of a map, and one that looks it up."""
+    """Function that makes the texture of a statement of a map."""
     mi.util.write_bitmap(str(tmp_path / "a b 01#.exr"), upload(mi.TensorXf, PIXELS[..., None]), write_async=False)
 
-    def make(statement, library="a.mtl"):
+    def make(statement):
         (tmp_path / "a.obj").write_text("mtllib a.mtl\n")
-        (tmp_path / library).write_text(f"newmtl a\n{statement}\n")
+        (tmp_path / "a.mtl").write_text(f"newmtl a\n{statement}\n")
         return material_bsdf(read_materials(tmp_path / "a.obj")["a"], "a")["bsdf"]["base_color"]
 
     return make
@@ -121,7 +117,6 @@ NAME = "a b 01#.exr"
         (f"map_Kd -clamp off -o -8 8 {NAME}", [0.25, 0, 1, 0]),
     ],
 )
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_options_of_maps(texture, statement, expected):
     picture = texture(statement)
     places = [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
@@ -129,61 +124,44 @@ def test_options_of_maps(texture, statement, expected):
     np.testing.assert_allclose(at(picture, *places), expected, atol=1e-3)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_pixels_are_blended_unless_that_is_off(texture):
     between = [0.45, 0.75]
     assert at(texture(f"map_Kd {NAME}"), between) == pytest.approx([0.6], abs=1e-3)
     assert at(texture(f"map_Kd -blendu off {NAME}"), between) == pytest.approx([1], abs=1e-3)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_options_without_meaning_here_are_told(texture):
     with pytest.warns(CageWarning, match='a.mtl": "-t 1 2" of map_Kd, "-imfchan r" of map_Kd left out; expected Kd'):
         picture = texture(f"map_Kd -t 1 2 -imfchan r {NAME}")
     assert picture["filename"].endswith(NAME)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_a_changed_picture_is_saved_with_its_scene(tmp_path, texture):
     texture(f"map_Kd -s 2 3 -o 0.5 -mm 0.5 0.25 {NAME}")
-    plain = cube()
-    cage = ControlCage(
-        plain.positions,
-        plain.face_vertices.reshape(-1, 4),
-        texcoords=Attribute(np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), "face_varying"),
-        materials={"a": range(6)},
-    )
+    corners, faces = np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), cube().face_vertices.reshape(-1, 4)
+    texcoords = Attribute(corners, "face_varying")
+    cage = ControlCage(cube().positions, faces, texcoords=texcoords, materials={"a": range(6)})
     cage.save(tmp_path / "cube.obj")
     (tmp_path / "cube.obj").write_text("mtllib a.mtl\n" + (tmp_path / "cube.obj").read_text())
     scene = studio_scene(tmp_path / "cube.obj", size=(16, 12), spp=16, rate=2, shading="vertex")
     save_scene(scene, tmp_path / "saved.xml")
     found = [mi.traverse(each) for each in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))]
     for name in ("data", "to_uv"):
-        values = [
-            np.array(getattr(each, "matrix", each))
-            for parameters in found
-            for key, each in parameters
-            if key.endswith(f"base_color.{name}")
-        ]
-        assert len(values) == 2
-        np.testing.assert_allclose(values[1], values[0], atol=1e-3)
+        values = [each for parameters in found for key, each in parameters if key.endswith(f"base_color.{name}")]
+        one, other = (np.array(getattr(each, "matrix", each)) for each in values)
+        np.testing.assert_allclose(other, one, atol=1e-3)
     # 0.5 + 0.25 c, in half floats.
     data = np.sort(np.array(next(each for key, each in found[1] if key.endswith("base_color.data"))), axis=None)
     assert data[[0, -1]] == pytest.approx([0.5, 0.75], abs=1e-3)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_statements_name_several_libraries_or_one_with_spaces(tmp_path):
     for name, colour in (("first lib.mtl", 0.25), ("b.mtl", 0.5), ("c d.MTL", 0.75)):
         (tmp_path / name).write_text(f"newmtl\t{name[0]} paint\nKd\t{colour}\t{colour} {colour}\n")
+    expected = {"f paint": 0.25, "b paint": 0.5, "c paint": 0.75}
     for statements in (
         "mtllib first lib.mtl\nmtllib b.mtl\nmtllib c d.MTL\n",
         "mtllib\tfirst lib.mtl b.mtl  c d.MTL # three\n",
     ):
         (tmp_path / "a.obj").write_text(statements)
-        found = read_materials(tmp_path / "a.obj")
-        assert {name: each["Kd"][0] for name, each in found.items()} == {
-            "f paint": 0.25,
-            "b paint": 0.5,
-            "c paint": 0.75,
-        }
+        assert {name: each["Kd"][0] for name, each in read_materials(tmp_path / "a.obj").items()} == expected

@@ -23,12 +23,9 @@ from mitsuba_subdivision.studio.studio_entries import Look
 
 SCENES = scene_path("human").parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
-TWO_SENSORS = """<scene version="3.0.0">
-    <default name="radiance" value="0.25"/>
-    <integrator type="path"/>
-    {sensors}
-    <emitter type="constant"><float name="radiance" value="$radiance"/></emitter>
-</scene>"""
+SCENE = '<scene version="3.0.0"><integrator type="path"/>{}</scene>'
+CONSTANT = """<default name="radiance" value="0.25"/>
+    <emitter type="constant"><float name="radiance" value="$radiance"/></emitter>"""
 SENSOR = """<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="{0}"/>
     <integer name="height" value="8"/></film></sensor>"""
 
@@ -63,13 +60,11 @@ def test_a_model_is_one_command_and_its_scene_the_next_step(capsys):
 
 
 def test_options_of_mitsubas_own_program(folder):
-    (folder / "two.xml").write_text(TWO_SENSORS.format(sensors=SENSOR.format(8) + SENSOR.format(12)))
+    (folder / "two.xml").write_text(SCENE.format(CONSTANT + SENSOR.format(8) + SENSOR.format(12)))
     threads, level, paths = dr.thread_count(), mi.log_level(), [str(p) for p in mi.file_resolver()]
     options = ["-m", "scalar_rgb", "-t", "1", "-a", f"{folder};/tmp", "--spp", "1"]
-    for words in (
-        ["-s", "1", "-D", "radiance=0.5"],
-        ["--sensor", "1", "--define", "radiance=0.5", "--variant", "scalar_rgb"],
-    ):
+    long = ["--sensor", "1", "--define", "radiance=0.5", "--variant", "scalar_rgb"]
+    for words in (["-s", "1", "-D", "radiance=0.5"], long):
         assert render("two.xml", "-o", "a.exr", *options, *words) == 0
         assert pixels("a.exr").shape[:2] == (8, 12)
         np.testing.assert_allclose(pixels("a.exr")[..., :3], 0.5)
@@ -78,22 +73,12 @@ def test_options_of_mitsubas_own_program(folder):
     assert pixels("b.exr").shape[:2] == (8, 8)
 
 
-ENVIRONMENT = """
-<scene version="3.0.0">
-    <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
-    <sensor type="perspective">
-        <film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>
-    </sensor>
-    <integrator type="path"/>
-</scene>
-"""
-
-
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a process cannot be kept to one core here")
 @pytest.mark.parametrize("options", [[], ["--passes", "2"]], ids=["picture", "passes"])
 def test_one_core_reads_and_writes_openexr(folder, options):
     mi.Bitmap(np.full((16, 32, 3), 0.5, np.float32)).write(str(folder / "sky.exr"))
-    (folder / "sky.xml").write_text(ENVIRONMENT)
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    (folder / "sky.xml").write_text(SCENE.format(sky + SENSOR.format(4)))
     command = ["render", "sky.xml", "-o", "a.exr", "-m", "scalar_rgb", "--spp", "2", "-t", "1", *options]
     core = min(os.sched_getaffinity(0))
     start = "from mitsuba_subdivision.__main__ import main; raise SystemExit(main())"
@@ -108,11 +93,8 @@ def test_a_turntable_comes_round():
     table = Turntable(CageScenes(named_cages.cube(), Look(size=(24, 18), spp=64, rate=4, view="front")), 4)
     assert list(table.numbers) == [1, 2, 3, 4]
     np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
-    first, quarter, between = (
-        np.array(mi.render(loaded.scene))
-        for table, n in ((table, 1), (table, 2), (table, 1.5))
-        for loaded in table.frames([n], None)
-    )
+    frames = (loaded for number in (1, 2, 1.5) for loaded in table.frames([number], None))
+    first, quarter, between = (np.array(mi.render(loaded.scene)) for loaded in frames)
     # A cube is the same after a quarter of a turn, but for noise.
     assert np.abs(first - quarter).mean() < 0.5 * np.abs(first - between).mean()
 
@@ -145,12 +127,11 @@ def test_a_video_without_encoder_names_the_extra(folder, capsys, monkeypatch):
 
 
 def moving_cages(folder):
-    """Files of a cage that moves, with other faces in the third, and of the same as times of a USD file."""
+    """Files of a cage that moves, with other faces in the third."""
     cage = msub.ControlCage.from_file(SCENES / "cages" / "propeller.obj")
     for number in (1, 2, 3):
         moved = cage.with_positions(cage.positions + 0.3 * number * np.sin(cage.positions[:, [2, 0, 1]]))
         (moved.refined() if number == 3 else moved).save(folder / f"f_{number:02d}.obj")
-    return cage
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
@@ -166,15 +147,12 @@ def test_frames_are_what_each_file_gives_alone(folder, variant, request):
             alone = {**moving.scene, "surface": source.scene(source.at())["surface"]}
         # The wire of a frame is as thick as that of the first.
         alone.pop("cage")
-        together = np.array(mi.render(loaded.scene))
-        shapes = {shape.id(): shape for shape in loaded.scene.shapes()}
-        assert {"surface", "cage"} <= set(shapes)
+        assert {"surface", "cage"} <= {shape.id() for shape in loaded.scene.shapes()}
         apart = load_quietly(alone, "box").scene
-        names = "surface.vertex_positions", "surface.vertex_normals"
-        for name in names:
+        for name in ("surface.vertex_positions", "surface.vertex_normals"):
             a, b = (np.array(mi.traverse(scene)[name]) for scene in (loaded.scene, apart))
             np.testing.assert_allclose(a, b, atol=2e-6)
-        assert np.isfinite(together).all()
+        assert np.isfinite(np.array(mi.render(loaded.scene))).all()
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
@@ -182,11 +160,11 @@ def test_each_file_is_read_once(folder, monkeypatch):
     moving_cages(folder)
     read, evaluated = [], []
     function_named = formats.function_named
-    monkeypatch.setattr(
-        formats,
-        "function_named",
-        lambda name: lambda path, *more: read.append(path.name) or function_named(name)(path, *more),
-    )
+
+    def function_that_tells(name):
+        return lambda path, *more: read.append(path.name) or function_named(name)(path, *more)
+
+    monkeypatch.setattr(formats, "function_named", function_that_tells)
     moving = frame_range(folder / "f_%02d.obj", Look(size=(20, 15), spp=1, rate=2, up="z", cage=True), range(1, 4))
     assert len([*moving.frames([1, 2, 3], None)]) == 3
     assert read == ["f_01.obj", "f_02.obj", "f_03.obj"]
@@ -199,53 +177,47 @@ def test_each_file_is_read_once(folder, monkeypatch):
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_times_of_a_usd_file_are_frames(folder):
     pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom
-
     cage = named_cages.cube()
-    stage = Usd.Stage.CreateNew("m.usda")
-    mesh = UsdGeom.Mesh.Define(stage, "/m")
-    mesh.CreateFaceVertexCountsAttr(cage.face_sizes.tolist())
-    mesh.CreateFaceVertexIndicesAttr(cage.face_vertices.tolist())
-    points = mesh.CreatePointsAttr()
-    for time in (1, 5):
-        points.Set([tuple(p) for p in (time * cage.positions).tolist()], time)
-    stage.Save()
-    del stage, mesh, points
+    points = ", ".join(f"{time}: {[*map(tuple, (time * cage.positions).tolist())]}" for time in (1, 5))
+    lines = f"""point3f[] points.timeSamples = {{ {points} }}
+        int[] faceVertexCounts = {cage.face_sizes.tolist()}
+        int[] faceVertexIndices = {cage.face_vertices.tolist()}"""
+    (folder / "m.usda").write_text(f'#usda 1.0\ndef Mesh "m" {{\n{lines}\n}}\n')
     look = Look(size=(20, 15), spp=4, rate=2)
     moving = frame_range(folder / "m.usda", look, range(1, 6, 2))
-    sizes = []
-    for loaded in moving.frames([1, 3, 5], None):
-        sizes.append(np.abs(np.array(mi.traverse(loaded.scene)["surface.control_points"])).max())
+    points = (mi.traverse(each.scene)["surface.control_points"] for each in moving.frames([1, 3, 5], None))
+    sizes = [np.abs(np.array(each)).max() for each in points]
     np.testing.assert_allclose(sizes, [1, 3, 5], rtol=1e-6)
     assert render("m.usda", "-o", "m.png", "--frames", "1:5:4", *SMALL) == 0
     assert {path.name for path in folder.glob("m_*.png")} == {"m_0001.png", "m_0005.png"}
     assert render("m.usda", "-o", "m.png", "--prim", "/none", *SMALL) == 1
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["none.obj", "-o", "a.png"], '"none.obj": there is no such file; expected a model'),
-        (["f_%04d.obj", "-o", "a.png"], "or --frames for a name of several files"),
-        (["text.obj", "-o", "a.png"], '"text.obj": there are no faces'),
-        (["cube.stl", "-o", "a.png"], "expected a Mitsuba scene (.xml) or a model (.obj"),
-        (["cube.obj", "-o", "a.tga"], "expected a name ending in one of .exr"),
-        (["cube.obj", "-o", "a.gif"], "--turntable or --frames for a video"),
-        (["cube.obj", "-o", "a.png", "--elevation", "100"], "expected -90 to 90 degrees"),
-        (["cube.obj", "-o", "a.png", "--frames", "1:2"], "expected a name such as frame_%04d.obj"),
-        (["f_%04d.obj", "-o", "a.png", "--frames", "1:2"], '"f_0001.obj": there is no such file (2 such files)'),
-        (["cube.obj", "-o", "a.png", "--prim", "/a"], "expected it for USD files only"),
-        (["cube.obj", "-o", "a.png", "--checker"], "has no texture coordinates"),
-        (["cube.obj", "-o", "a.png", "--texture-size", "8"], "expected it for a whole USD file"),
-        (["cube.obj", "-o", "a.png", "-D", "a=1"], "-D was given for the model"),
-        (["cube.obj", "-o", "a.png", "-s", "0"], "--sensor was given for the model"),
-        (["cube.obj", "-o", "a.png", "--fps", "5"], "--fps is for videos"),
-        (["cube.obj", "-o", "a.png", "--turntable", "2", "--frames", "1:2"], "expected only one of them"),
-        (["cube.obj", "-o", "a.png", "--save-scene", "a.txt"], "expected a name ending in .xml"),
-        ([str(SCENES / "rook.xml"), "-o", "a.png", "--cage"], "--cage was given for the scene"),
-        ([str(SCENES / "rook.xml"), "-o", "a.png", "-s", "2"], "there is no sensor 2; the scene has one sensor, 0"),
-    ],
-)
+MODEL = ["cube.obj", "-o", "a.png"]
+ERRORS = [
+    (["none.obj", "-o", "a.png"], '"none.obj": there is no such file; expected a model'),
+    (["f_%04d.obj", "-o", "a.png"], "or --frames for a name of several files"),
+    (["text.obj", "-o", "a.png"], '"text.obj": there are no faces'),
+    (["cube.stl", "-o", "a.png"], "expected a Mitsuba scene (.xml) or a model (.obj"),
+    (["cube.obj", "-o", "a.tga"], "expected a name ending in one of .exr"),
+    (["cube.obj", "-o", "a.gif"], "--turntable or --frames for a video"),
+    ([*MODEL, "--elevation", "100"], "expected -90 to 90 degrees"),
+    ([*MODEL, "--frames", "1:2"], "expected a name such as frame_%04d.obj"),
+    (["f_%04d.obj", "-o", "a.png", "--frames", "1:2"], '"f_0001.obj": there is no such file (2 such files)'),
+    ([*MODEL, "--prim", "/a"], "expected it for USD files only"),
+    ([*MODEL, "--checker"], "has no texture coordinates"),
+    ([*MODEL, "--texture-size", "8"], "expected it for a whole USD file"),
+    ([*MODEL, "-D", "a=1"], "-D was given for the model"),
+    ([*MODEL, "-s", "0"], "--sensor was given for the model"),
+    ([*MODEL, "--fps", "5"], "--fps is for videos"),
+    ([*MODEL, "--turntable", "2", "--frames", "1:2"], "expected only one of them"),
+    ([*MODEL, "--save-scene", "a.txt"], "expected a name ending in .xml"),
+    ([str(SCENES / "rook.xml"), "-o", "a.png", "--cage"], "--cage was given for the scene"),
+    ([str(SCENES / "rook.xml"), "-o", "a.png", "-s", "2"], "there is no sensor 2; the scene has one sensor, 0"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), ERRORS)
 def test_errors_come_before_anything_is_written(folder, capsys, words, message):
     (folder / "text.obj").write_text("v 1 2\n")
     before = {path.name for path in folder.iterdir()}
@@ -254,24 +226,24 @@ def test_errors_come_before_anything_is_written(folder, capsys, words, message):
     assert {path.name for path in folder.iterdir()} == before
 
 
+EXACT = ["--size", "20x15", "--rate", "2", "--shading", "exact"]
+
+
 @pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
 @pytest.mark.parametrize(
     "words",
     [
-        ["cube.obj", "-o", "a.exr", "--size", "20x15", "--rate", "2", "--shading", "exact"],
-        ["cube.obj", "-o", "a_%d.png", "--size", "20x15", "--rate", "2", "--shading", "exact", "--turntable", "2"],
+        ["cube.obj", "-o", "a.exr", *EXACT],
+        ["cube.obj", "-o", "a_%d.png", *EXACT, "--turntable", "2"],
         ["scene.xml", "-o", "a.exr"],
         ["scene.xml", "-o", "a.exr", "--passes", "2"],
     ],
 )
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
-    strings = {"filename": "cube.obj", "shading": "exact"}
-    shape = "".join(f'<string name="{name}" value="{value}"/>' for name, value in strings.items())
-    shape = f'<shape type="subdivision">{shape}</shape>'
-    (folder / "scene.xml").write_text(
-        TWO_SENSORS.format(sensors=SENSOR.format(8)).replace("<emitter", f"{shape}<emitter")
-    )
+    shape = """<shape type="subdivision"><string name="filename" value="cube.obj"/>
+        <string name="shading" value="exact"/></shape>"""
+    (folder / "scene.xml").write_text(SCENE.format(CONSTANT + SENSOR.format(8) + shape))
 
     def fail(*_):
         raise ValueError("no surface")
@@ -283,17 +255,9 @@ def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ["--size", "0x4"],
-        ["--size", "4"],
-        ["--view", "left"],
-        ["--turntable", "0"],
-        ["--frames", "3:1"],
-        ["--rate", "0"],
-    ],
+    "words", ["--size 0x4", "--size 4", "--view left", "--turntable 0", "--frames 3:1", "--rate 0"]
 )
 def test_words_that_are_no_values_are_refused(words, capsys):
     with pytest.raises(SystemExit):
-        render("cube.obj", "-o", "a.png", *words)
-    assert "expected" in capsys.readouterr().err or words[0] == "--view"
+        render(*MODEL, *words.split())
+    assert "expected" in capsys.readouterr().err or words == "--view left"

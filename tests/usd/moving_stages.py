@@ -2,12 +2,9 @@
 
 import mitsuba as mi
 import numpy as np
+from usd import stages
+from usd.stages import CORNERS, CUBE, FACES, SQUARE, bound, material, prim, texture
 
-CUBE = """
-    int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
-    int[] faceVertexIndices = [0,2,3,1, 4,5,7,6, 0,1,5,4, 2,6,7,3, 0,4,6,2, 1,3,7,5]
-"""
-CORNERS = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-1,-1,1), (1,-1,1), (-1,1,1), (1,1,1)"
 RAISED = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-.3,-.3,3), (.3,-.3,3), (-.3,.3,3), (.3,.3,3)"
 COLORS = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
 
@@ -18,72 +15,31 @@ def placed(at, end=None):
     return f'double3 xformOp:translate{value}\nuniform token[] xformOpOrder = ["xformOp:translate"]\n'
 
 
-def mesh(name, body, head=""):
-    return f'def Mesh "{name}" ( {head} ) {{\n{body}\n}}\n'
-
-
-MOVING = mesh("moving", f"point3f[] points.timeSamples = {{1: [{CORNERS}], 5: [{RAISED}]}}{CUBE}")
-STILL = mesh(
-    "still",
-    f"point3f[] points = [{CORNERS}]{CUBE}{placed((2.6, 0.4, 0))}color3f[] primvars:displayColor = [(.1,.2,.7)]",
-)
-TINTED = mesh(
-    "tinted",
-    f"point3f[] points = [{CORNERS}]{CUBE}{placed((-2.6, 0, 0), (-2.6, 0, 2))}"
-    f'color3f[] primvars:displayColor = [{COLORS}] (interpolation = "vertex")\n',
-)
+MOVING = prim("Mesh", "moving", f"point3f[] points.timeSamples = {{1: [{CORNERS}], 5: [{RAISED}]}}", FACES)
+STILL = prim("Mesh", "still", CUBE, placed((2.6, 0.4, 0)), "color3f[] primvars:displayColor = [(.1,.2,.7)]")
+TINTS = f'color3f[] primvars:displayColor = [{COLORS}] (interpolation = "vertex")'
+TINTED = prim("Mesh", "tinted", CUBE, placed((-2.6, 0, 0), (-2.6, 0, 2)), TINTS)
 # Polygons with a texture.
-FLOOR = (
-    mesh(
-        "floor",
-        """point3f[] points = [(-6,-6,-1.4), (6,-6,-1.4), (6,6,-1.4), (-6,6,-1.4)]
-    int[] faceVertexCounts = [4]
-    int[] faceVertexIndices = [0, 1, 2, 3]
-    uniform token subdivisionScheme = "none"
-    texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1)] (interpolation = "vertex")
-    rel material:binding = </paint>""",
-        'prepend apiSchemas = ["MaterialBindingAPI"]',
-    )
-    + """def Material "paint" {
-    token outputs:surface.connect = </paint/surface.outputs:surface>
-    def Shader "surface" {
-        uniform token info:id = "UsdPreviewSurface"
-        color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>
-        float inputs:roughness.connect = </paint/texture.outputs:r>
-        token outputs:surface
-    }
-    def Shader "texture" {
-        uniform token info:id = "UsdUVTexture"
-        asset inputs:file = @tiles.png@
-        float2 inputs:st.connect = </paint/reader.outputs:result>
-        float3 outputs:rgb
-        float outputs:r
-    }
-    def Shader "reader" {
-        uniform token info:id = "UsdPrimvarReader_float2"
-        string inputs:varname = "st"
-        float2 outputs:result
-    }
-}
-"""
+LARGE = SQUARE.replace("(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0)", "(-6,-6,-1.4), (6,-6,-1.4), (6,6,-1.4), (-6,6,-1.4)")
+FLOOR = stages.mesh("floor", LARGE, bound()) + material(
+    "color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>\n"
+    "float inputs:roughness.connect = </paint/texture.outputs:r>",
+    texture("tiles.png"),
 )
-INSTANCES = f'class Xform "ball" {{\n{mesh("ball", f"point3f[] points = [{CORNERS}]{CUBE}")}}}\n' + "".join(
-    f"""def Xform "ball{n}" (instanceable = true
- references = </ball>) {{
-    double3 xformOp:translate.timeSamples = {{1: ({x}, 3, 0), 5: ({x}, 3, 2)}}
-    float3 xformOp:scale = (.4, .4, .4)
-    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
-}}
-"""
+INSTANCES = f'class Xform "ball" {{\n{prim("Mesh", "ball", CUBE)}}}\n' + "".join(
+    prim(
+        "Xform",
+        f"ball{n}",
+        f"double3 xformOp:translate.timeSamples = {{1: ({x}, 3, 0), 5: ({x}, 3, 2)}}",
+        "float3 xformOp:scale = (.4, .4, .4)",
+        'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]',
+        head="instanceable = true\nreferences = </ball>",
+    )
     for n, x in enumerate((-2, 2))
 )
-LAMP = f"""def SphereLight "lamp" {{
-    float inputs:radius = 0.5
-    float inputs:intensity = 60
-    {placed((-4, -3, 5), (4, -3, 5))}
-}}
-"""
-SKY = 'def DomeLight "sky" {\nfloat inputs:intensity = 0.5\nasset inputs:texture:file = @sky.exr@\n}\n'
+LAMP_MOVES = placed((-4, -3, 5), (4, -3, 5))
+LAMP = prim("SphereLight", "lamp", "float inputs:radius = 0.5", "float inputs:intensity = 60", LAMP_MOVES)
+SKY = prim("DomeLight", "sky", "float inputs:intensity = 0.5", "asset inputs:texture:file = @sky.exr@")
 CAMERA = """def Camera "camera" {
     float focalLength = 35
     float horizontalAperture = 24
@@ -104,6 +60,4 @@ def write(folder, text, name="moving.usda"):
     tiles[:2, :3] = [220, 60, 40]
     mi.Bitmap(tiles).write(str(folder / "tiles.png"))
     mi.Bitmap(np.linspace(0, 1, 8 * 16 * 3, dtype=np.float32).reshape(8, 16, 3)).write(str(folder / "sky.exr"))
-    path = folder / name
-    path.write_text(f'#usda 1.0\n(\n    upAxis = "Z"\n)\n{text}')
-    return path
+    return stages.write(folder, text, name)

@@ -59,12 +59,6 @@ def test_copies_of_few_faces_are_one_shape(faces):
     assert [len(each.cage.face_sizes) for each in found.shapes] == [len(faces) * COUNT]
 
 
-def test_few_instances_stay():
-    shape = ShapeContents("/cube", cube(), np.eye(4))
-    contents = scene(group=[shape], count=LEAST_INSTANCES - 1)
-    assert with_copies(contents, {}, "exact", StageWarnings()) == (contents, {})
-
-
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
 def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
     """Twice as many triangles along each side of 10 cubes do not fit."""
@@ -77,10 +71,11 @@ def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
         assert [*rates.values()] == expected
 
 
-def test_what_is_too_much_stays_instances_and_is_told_with_numbers(monkeypatch):
-    monkeypatch.setattr(copies, "MOST_BYTES", 1)
+def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbers(monkeypatch):
     shape, notes = ShapeContents("/cube", cube(), np.eye(4)), StageWarnings()
-    contents = scene(group=[shape])
+    few, contents = scene(group=[shape], count=LEAST_INSTANCES - 1), scene(group=[shape])
+    assert with_copies(few, {}, "exact", StageWarnings()) == (few, {})
+    monkeypatch.setattr(copies, "MOST_BYTES", 1)
     assert with_copies(contents, rates_of(shape), "exact", notes) == (contents, {})
     with pytest.warns(UserWarning, match=rf"copies with {6 * COUNT:,} faces .* GB, and stay {COUNT} instances"):
         notes.warn("stage")
@@ -96,10 +91,8 @@ def test_rates_that_are_chosen_do_not_give_way(monkeypatch):
 
 def test_copies_that_are_no_instances_are_one_shape_too():
     """With attributes, which Mitsuba looks up in the wrong place of instances."""
-    attributes = {
-        "heat": Attribute(np.arange(8.0)[:, None], "vertex"),
-        "paint": Attribute(np.arange(24.0)[:, None], "face_varying"),
-    }
+    kinds = {"heat": (8, "vertex"), "paint": (24, "face_varying")}
+    attributes = {name: Attribute(np.arange(1.0 * count)[:, None], kind) for name, (count, kind) in kinds.items()}
     cage = cube(None, attributes=attributes)
     mirrored = np.diag([-1.0, 1, 1, 1])
     shapes = [ShapeContents(f"/c{k}", cage, mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
@@ -110,9 +103,8 @@ def test_copies_that_are_no_instances_are_one_shape_too():
     # Faces of mirrored copies are turned over, with what their corners have.
     corners = np.concatenate(FACES)
     at_vertices = dict(zip(zip(np.arange(24) // 4, corners, strict=True), np.arange(24.0), strict=True))
-    second = slice(24, 48)
-    vertices = joined.cage.face_vertices[second] - 8
-    values = paint.values[paint.indices[second], 0]
+    vertices = joined.cage.face_vertices[24:48] - 8
+    values = paint.values[paint.indices[24:48], 0]
     assert [at_vertices[each] for each in zip(np.arange(24) // 4, vertices, strict=True)] == values.tolist()
 
 

@@ -7,28 +7,19 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_usd.stage_scenes import StageScenes
-from usd.moving_stages import CORNERS, CUBE, mesh, write
+from usd.stages import CUBE, POLYGONS, moved, prim
 
-BODY = f"point3f[] points = [{CORNERS}]{CUBE}"
 exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-INSTANCES = f"""def Xform "source" {{
-    {mesh("inside", BODY)}
-}}
-def "one" ( instanceable = true
-    references = </source> ) {{
-}}
-def "two" ( instanceable = true
-    references = </source> ) {{
-    double3 xformOp:translate = (3, 0, 0)
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-}}
-"""
+INSTANCES = prim("Xform", "source", prim("Mesh", "inside", CUBE)) + "".join(
+    prim("Xform", name, moved(translate=(x, 0, 0)), head="instanceable = true\nreferences = </source>")
+    for name, x in (("one", 0), ("two", 3))
+)
 LOOK = Look(size=(64, 48), spp=1)
 
 
 @pytest.fixture
-def path(tmp_path):
-    return write(tmp_path, mesh("alone", BODY) + INSTANCES)
+def path(stage):
+    return stage(prim("Mesh", "alone", CUBE) + INSTANCES)
 
 
 def surfaces(scene):
@@ -72,7 +63,7 @@ def test_frames_and_saved_scenes_follow_no_sensor(path):
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
-def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, tmp_path, capfd):
+def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, stage, capfd):
     automatic, given = (surfaces(msub.usd_scene(path, mi, **more)) for more in ({}, {"shading": "vertex"}))
     assert [each["tessellation_rate"] for each in automatic[0]] == [each["tessellation_rate"] for each in given[0]]
     assert {each["shading"] for each in (*automatic[0], *automatic[1])} == {"vertex"}
@@ -82,7 +73,7 @@ def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, tmp_path
     frames = FrameRange(StageScenes(path, LOOK, {}, numbers=range(1, 4)), range(1, 4))
     assert len(list(frames.frames(frames.numbers, None))) == 3
     assert capfd.readouterr().err.count("\n") == 1
-    polygons = write(tmp_path, mesh("flat", BODY + 'uniform token subdivisionScheme = "none"\n'), "flat.usda")
+    polygons = stage(prim("Mesh", "flat", CUBE, POLYGONS), "flat.usda")
     msub.usd_scene(polygons, mi)
     msub.usd_scene(path, mi, face_normals=True)
     assert capfd.readouterr().err == ""

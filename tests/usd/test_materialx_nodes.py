@@ -72,15 +72,9 @@ def test_what_is_constant_is_computed(category, kind, inputs, expected):
 
 
 def test_operations_take_arrays_of_points():
-    """One input varies, the others are constant."""
     wide = np.random.default_rng(1).random((2, 3, 3))
-    for category, name in (
-        ("add", "in1"),
-        ("mix", "fg"),
-        ("difference", "bg"),
-        ("ifgreater", "in2"),
-        ("hsvtorgb", "in"),
-    ):
+    varying = {"add": "in1", "mix": "fg", "difference": "bg", "ifgreater": "in2", "hsvtorgb": "in"}
+    for category, name in varying.items():
         given = dict.fromkeys(("in1", "in2", "bg", "fg", "mix", "value1", "value2"), np.array([0.3]))
         assert operation(category, "color3", {**given, name: wide}).shape == (2, 3, 3)
     grey = wide[..., :1]
@@ -93,19 +87,18 @@ def test_operations_take_arrays_of_points():
 @pytest.mark.core
 def test_ramps_and_splits_lie_as_the_specification_says():
     points = Points([[0.25, 0.75], [1.5, -1]])
-    ramp = node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV)
-    np.testing.assert_allclose(evaluate(ramp, points)[..., 0], [1.5, 3])
-    ramp = node("ramptb", "float", valuet=1.0, valueb=3.0, texcoord=UV)
-    np.testing.assert_allclose(evaluate(ramp, points)[..., 0], [1.5, 3])
-    split = node("splittb", "float", valuet=1.0, valueb=3.0, center=0.5, texcoord=UV)
-    np.testing.assert_allclose(evaluate(split, points)[..., 0], [1, 3])
+    for pattern, expected in (
+        (node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV), [1.5, 3]),
+        (node("ramptb", "float", valuet=1.0, valueb=3.0, texcoord=UV), [1.5, 3]),
+        (node("splittb", "float", valuet=1.0, valueb=3.0, center=0.5, texcoord=UV), [1, 3]),
+    ):
+        np.testing.assert_allclose(evaluate(pattern, points)[..., 0], expected)
 
 
 def _hash(*words):
     full = 0xFFFFFFFF
-    values = {
-        name: (w + 0xDEADBEEF + 4 * len(words) + 13) & full for name, w in zip("abc", (*words, 0, 0), strict=False)
-    }
+    start = 0xDEADBEEF + 4 * len(words) + 13
+    values = {name: (word + start) & full for name, word in zip("abc", (*words, 0, 0), strict=False)}
     for target, source, k in (
         ("c", "b", 14), ("a", "c", 11), ("b", "a", 25), ("c", "b", 16), ("a", "c", 4), ("b", "a", 14), ("c", "b", 24),
     ):  # fmt: skip
@@ -214,9 +207,8 @@ def test_heights_become_normals(monkeypatch):
         found = baked(expression, source({"a.png": height})).values
         expected = np.array([-repeats, 0, 1]) / np.sqrt(1 + repeats**2)
         np.testing.assert_allclose(found[32, 32] * 2 - 1, expected, atol=1e-3)
-    varying = node(
-        "multiply", "float", in1=picture("r"), in2=node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
-    )
+    one = node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
+    varying = node("multiply", "float", in1=picture("r"), in2=one)
     expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
     found = baked(expression, source({"a.png": height})).values
     np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)

@@ -27,12 +27,8 @@ PERSPECTIVE = {"type": "perspective", "fov": 30.0, "fov_axis": "x", "near_clip":
 def _sensor(distance, width=WIDTH, **changes):
     """Looks along z from so far in front of the origin."""
     to_world = mi.ScalarTransform4f().translate([0, 0, -distance])
-    return {
-        **PERSPECTIVE,
-        "to_world": to_world,
-        "film": {"type": "hdrfilm", "width": width, "height": width // 2},
-        **changes,
-    }
+    film = {"type": "hdrfilm", "width": width, "height": width // 2}
+    return {**PERSPECTIVE, "to_world": to_world, "film": film, **changes}
 
 
 def _shape(cage, matrix=None, name="/shape"):
@@ -48,7 +44,7 @@ def _segments(contents, sensor, shading):
     return {shape: of_copies.max() for shape, of_copies in found.items()}
 
 
-def _rate(shape, sensor, shading):
+def _rate(shape, sensor, shading="exact"):
     return _segments(_scene(shape), sensor, shading)[shape]
 
 
@@ -88,20 +84,16 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
 @pytest.mark.core
 def test_segments_follow_the_size_in_the_picture():
     cage = named_cages.torus(8, 5)
-    near, far, larger = (_rate(_shape(cage), each, "exact") for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))
+    near, far, larger = (_rate(_shape(cage), each) for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))
     assert far < near < larger
     # Around the camera, a picture may show any part from near.
-    assert _rate(_shape(cage), _sensor(0), "exact") == FINEST_RATE
+    assert _rate(_shape(cage), _sensor(0)) == FINEST_RATE
     # Four times the size, four times as far away.
-    assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), _sensor(8), "exact") == near
+    assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), _sensor(8)) == near
     wide = mi.ScalarTransform4f().translate([0, 0, -8]).scale([3, 3, 1])
-    flat = {
-        "type": "orthographic",
-        "to_world": wide,
-        "film": {"type": "hdrfilm", "width": WIDTH, "height": WIDTH},
-        "near_clip": 0.01,
-    }
-    assert _rate(_shape(cage), flat, "exact") == _rate(_shape(cage, _moved(0, 0, 100)), flat, "exact") > 1
+    film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH}
+    flat = {"type": "orthographic", "to_world": wide, "film": film, "near_clip": 0.01}
+    assert _rate(_shape(cage), flat) == _rate(_shape(cage, _moved(0, 0, 100)), flat) > 1
 
 
 def test_the_nearest_instance_decides():
@@ -111,7 +103,7 @@ def test_the_nearest_instance_decides():
     def rate(instances):
         return _segments(_scene(groups=[[shape]], instances=instances), _sensor(8), "exact")[shape]
 
-    assert rate(places) == rate(places[:1]) == _rate(shape, _sensor(8), "exact") > rate(places[1:]) > rate(places[2:])
+    assert rate(places) == rate(places[:1]) == _rate(shape, _sensor(8)) > rate(places[1:]) > rate(places[2:])
 
 
 def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
@@ -131,7 +123,7 @@ def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
     assert set(_triangles(contents, sensor, "vertex")[shape]) == {"tessellation_rate"}
     # A few uniform triangles need no choice.
     far = _sensor(40.0)
-    assert _triangles(contents, far)[shape] == {"tessellation_rate": _rate(shape, far, "exact")}
+    assert _triangles(contents, far)[shape] == {"tessellation_rate": _rate(shape, far)}
 
 
 @pytest.mark.core
@@ -149,15 +141,11 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
     """None of which is far from it; unused vertices and those of holes do not count."""
     cage = named_cages.torus(80, 40)
     assert cage.face_count >= DENSE
-    contents = cage.contents
-    holes = np.arange(40)
-    contents = replace(
-        contents, positions=np.concatenate([contents.positions, [[1e3, 0, 0]]]), holes=holes, scheme="catmull_clark"
-    )
+    points = np.concatenate([cage.positions, [[1e3, 0, 0]]])
+    contents = replace(cage.contents, positions=points, holes=np.arange(40), scheme="catmull_clark")
     with pytest.warns(CageWarning, match="used by no face"):
         surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
-    surfaces = Surfaces()
-    points = surfaces.points(_scene(ShapeContents("/shape", contents, _moved(1, 2, 3))))
+    points = Surfaces().points(_scene(ShapeContents("/shape", contents, _moved(1, 2, 3))))
     exact = points_at(frame_table(surface).apply(surface.cage.positions)[0], _moved(1, 2, 3))
     for direction in np.random.default_rng(0).normal(size=(50, 3)):
         unit = direction / np.linalg.norm(direction)

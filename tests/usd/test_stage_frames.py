@@ -1,6 +1,5 @@
 """Whole USD files in frames, and saved as scenes."""
 
-import warnings
 from collections import Counter
 
 import mitsuba as mi
@@ -19,33 +18,22 @@ from mitsuba_usd.limit_surfaces import Surfaces
 from mitsuba_usd.scene_entries import SceneEntries
 from mitsuba_usd.stage_scenes import StageReader, StageScenes
 from mitsuba_usd.stage_walk import is_still, open_checked
-from usd.moving_stages import (
-    BARE,
-    CAMERA,
-    CORNERS,
-    CUBE,
-    FLOOR,
-    INSTANCES,
-    LAMP,
-    MOVING,
-    STILL,
-    WHOLE,
-    mesh,
-    placed,
-    write,
-)
+from usd.moving_stages import BARE, CAMERA, FLOOR, INSTANCES, LAMP, LAMP_MOVES, MOVING, STILL, WHOLE, placed, write
+from usd.stages import CUBE, FACES, POINTS, SQUARE, moved, prim, told
 
 pytest.importorskip("pxr")
+scalar = pytest.mark.usefixtures("variant_scalar_rgb")
+both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 
 LOOK = Look(size=(24, 18), spp=4)
 RATE = {"tessellation_rate": 3}
-FLYING = """def PointInstancer "flying" {
-    rel prototypes = </still>
-    int[] protoIndices.timeSamples = {1: [0]}
-    point3f[] positions.timeSamples = {1: [(0, 0, 5)]}
-    vector3f[] velocities.timeSamples = {1: [(1, 0, 0)]}
-}
-"""
+FLYING = prim(
+    "PointInstancer",
+    "flying",
+    "rel prototypes = </still>\nint[] protoIndices.timeSamples = {1: [0]}",
+    "point3f[] positions.timeSamples = {1: [(0, 0, 5)]}\nvector3f[] velocities.timeSamples = {1: [(1, 0, 0)]}",
+)
+RIG = placed((0, 0, 0), (1, 0, 0))
 
 
 def frame_range(path, numbers):
@@ -60,6 +48,23 @@ def alone(path, time):
     return pixels(load_scene(msub.usd_scene(path, mi, time=time, size=LOOK.size, spp=LOOK.spp, **RATE), None, "box"))
 
 
+def recorded(monkeypatch, module, name):
+    """What a function of a module is called with from now on."""
+    found, call = [], getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *given, **more: found.append((given, more)) or call(*given, **more))
+    return found
+
+
+def frames(path, times):
+    return [pixels(loaded) for loaded in frame_range(path, range(1, 6, 2)).frames(times, "box")]
+
+
+def assert_each_is_as_alone(path, times, found):
+    for time, picture in zip(times, found, strict=True):
+        np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
+    assert np.abs(found[0] - found[1]).mean() > 0.01
+
+
 def on_film(loaded, points):
     """Where points are on the film, from 0 to 1."""
     found = mi.Interaction3f()
@@ -70,100 +75,75 @@ def on_film(loaded, points):
     return np.array(places) / loaded.size
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 @pytest.mark.parametrize("more", ["", LAMP, CAMERA, LAMP + CAMERA], ids=["bare", "lamp", "camera", "lamp and camera"])
 def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
     path = write(tmp_path, STILL + FLOOR + more)
     table = Turntable(StageScenes(path, LOOK, RATE), 4)
+    assert ("key_light" in table.scene) == (LAMP not in more)
     points = Surfaces().points(StageReader(path).at())
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    # A half turn and a quarter, counter-clockwise from above.
-    turned = {1: points, 2: (points - middle) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + middle}
-    turned[3] = (turned[2] - middle) @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]] + middle
+    quarter = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     first = None
-    for number, loaded in zip((1, 2, 3), table.frames([1, 2, 3], "box"), strict=True):
+    for turns, loaded in enumerate(table.frames([1, 2, 3], "box")):
         if first is None:
             first = load_scene(with_meshes(table.scene), None, "box")
             if CAMERA in more:
                 np.testing.assert_array_equal(pixels(loaded), alone(path, None))
-        np.testing.assert_allclose(on_film(loaded, points), on_film(first, turned[number]), atol=1e-4)
+        # Counter-clockwise from above.
+        turned = (points - middle) @ np.linalg.matrix_power(quarter, turns) + middle
+        np.testing.assert_allclose(on_film(loaded, points), on_film(first, turned), atol=1e-4)
         if CAMERA not in more:
             # All of the stage is seen at all times.
-            assert on_film(loaded, points).min() > 0
-            assert on_film(loaded, points).max() < 1
-        lights = {shape.id(): shape for shape in loaded.scene.shapes() if shape.is_emitter()}
+            assert (np.abs(on_film(loaded, points) - 0.5) < 0.5).all()
         if more == LAMP:
-            np.testing.assert_allclose(np.array(lights["lamp"].bbox().center()), [-4, -3, 5], atol=1e-5)
-        assert ("key_light" in table.scene) == (LAMP not in more)
+            (lamp,) = (shape for shape in loaded.scene.shapes() if shape.is_emitter() and shape.id() == "lamp")
+            np.testing.assert_allclose(np.array(lamp.bbox().center()), [-4, -3, 5], atol=1e-5)
         if more == "":
             # Seen from the camera, the studio's light stays where it is.
-            centers = [
-                np.array(mi.traverse(each.scene)["key_light.to_world"].matrix)[:3, 3] for each in (loaded, first)
-            ]
+            matrices = [mi.traverse(each.scene)["key_light.to_world"].matrix for each in (loaded, first)]
+            centers = np.array(matrices)[:, :3, 3]
             np.testing.assert_allclose(on_film(loaded, centers[:1]), on_film(first, centers[1:]), atol=1e-4)
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+@both_variants
 def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, variant):
     """Points, transforms, instances, lights and camera move; weights are made once for each cage."""
     request.getfixturevalue(f"variant_{variant}")
-    made = Counter()
-    subdivision = loaded_shapes.subdivision
-    monkeypatch.setattr(
-        loaded_shapes, "subdivision", lambda shape, *more: made.update([shape.name]) or subdivision(shape, *more)
-    )
-    path = write(tmp_path, WHOLE)
-    times = (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
-    moving = frame_range(path, range(1, 6, 2))
-    found = [pixels(loaded) for loaded in moving.frames(times, "box")]
-    assert made == {"/moving": 1, "/still": 1, "/tinted": 1, "/ball": 1}
-    for time, picture in zip(times, found, strict=True):
-        np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
-    assert np.abs(found[0] - found[1]).mean() > 0.01
+    made = recorded(monkeypatch, loaded_shapes, "subdivision")
+    path, times = write(tmp_path, WHOLE), (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
+    found = frames(path, times)
+    assert sorted(shape.name for (shape, *_), _ in made) == ["/ball", "/moving", "/still", "/tinted"]
+    assert_each_is_as_alone(path, times, found)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, monkeypatch):
     """On a rig, with its focal length and its focus."""
-    made = Counter()
-    for module, name in ((stage_scenes, "SceneEntries"), (stage_scenes, "read_open_stage")):
-        call = getattr(module, name)
-        monkeypatch.setattr(
-            module, name, lambda *given, name=name, call=call, **more: made.update([name]) or call(*given, **more)
-        )
+    made = [recorded(monkeypatch, stage_scenes, name) for name in ("SceneEntries", "read_open_stage")]
     focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
     lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"
-    rig = f'def Xform "rig" {{\n{placed((0, 0, 0), (1, 0, 0))}{CAMERA.replace("float focalLength = 35", lens)}}}\n'
-    path = write(
-        tmp_path, STILL + FLOOR + LAMP.replace(".timeSamples = {1: (-4, -3, 5), 5: (4, -3, 5)}", " = (4, -3, 5)") + rig
-    )
-    times = (1, 3, 5)
-    found = [pixels(loaded) for loaded in frame_range(path, range(1, 6, 2)).frames(times, "box")]
-    assert made == {"SceneEntries": 1, "read_open_stage": 1}
-    for time, picture in zip(times, found, strict=True):
-        np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
-    assert np.abs(found[0] - found[2]).mean() > 0.01
+    rig = prim("Xform", "rig", RIG, CAMERA.replace("float focalLength = 35", lens))
+    path = write(tmp_path, STILL + FLOOR + LAMP.replace(LAMP_MOVES, placed((4, -3, 5))) + rig)
+    found = frames(path, (1, 3, 5))
+    assert [len(each) for each in made] == [1, 1]
+    assert_each_is_as_alone(path, (1, 3, 5), found)
 
 
-@pytest.mark.parametrize(
-    "moving", [MOVING, LAMP, INSTANCES, FLYING, f'def Xform "rig" {{\n{placed((0, 0, 0), (1, 0, 0))}{STILL}}}']
-)
+@pytest.mark.parametrize("moving", [MOVING, LAMP, INSTANCES, FLYING, prim("Xform", "rig", RIG, STILL)])
 def test_a_stage_is_still_only_if_nothing_but_cameras_moves(tmp_path, moving):
     assert is_still(open_checked(write(tmp_path, STILL + CAMERA)))
     assert not is_still(open_checked(write(tmp_path, STILL + CAMERA + moving)))
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
     """Visibility, other faces and other colours; a studio that sees all frames and stands still."""
-    other = CUBE.replace("Counts = [4, 4, 4, 4, 4, 4]", "Counts.timeSamples = {1: [4, 4, 4, 4, 4, 4], 3: [4, 4]}")
-    other = other.replace("Indices = [", "Indices.timeSamples = {1: [").replace("5]", "5], 3: [0,2,3,1, 4,5,7,6]}")
+    faces = FACES.replace("Counts = [4, 4, 4, 4, 4, 4]", "Counts.timeSamples = {1: [4, 4, 4, 4, 4, 4], 3: [4, 4]}")
+    faces = faces.replace("Indices = [", "Indices.timeSamples = {1: [").replace("5]", "5], 3: [0,2,3,1, 4,5,7,6]}")
     text = (
-        mesh(
-            "hidden",
-            f'point3f[] points = [{CORNERS}]{CUBE}token visibility.timeSamples = {{1: "invisible", 3: "inherited"}}',
-        )
-        + mesh("other", f"point3f[] points = [{CORNERS.replace('(1,', '(4,')}]{other}")
+        prim("Mesh", "hidden", CUBE, 'token visibility.timeSamples = {1: "invisible", 3: "inherited"}')
+        + prim("Mesh", "other", f"{POINTS.replace('(1,', '(4,')}\n{faces}")
         + STILL.replace("displayColor = [(.1,.2,.7)]", "displayColor.timeSamples = {1: [(1,0,0)], 5: [(0,1,0)]}")
         + MOVING
     )
@@ -179,7 +159,7 @@ def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
         frame_range(write(tmp_path, LAMP + CAMERA, "empty.usda"), range(1, 3))
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
+@both_variants
 def test_a_saved_stage_renders_to_the_same_picture(tmp_path, request, variant):
     request.getfixturevalue(f"variant_{variant}")
     path = write(tmp_path, WHOLE)
@@ -189,19 +169,17 @@ def test_a_saved_stage_renders_to_the_same_picture(tmp_path, request, variant):
     np.testing.assert_allclose(pixels(load_scene(written[-1], None, "box")), alone(path, 2), atol=1e-5)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write(tmp_path, BARE)
     small = ["--size", "16x12", "--spp", "1", "--rate", "2", "-m", "scalar_rgb"]
-    assert (
-        main(["render", "moving.usda", "-o", "turn.png", "--turntable", "2", "--save-scene", "s/one.xml", *small]) == 0
-    )
+    saved = ["--turntable", "2", "--save-scene", "s/one.xml"]
+    assert main(["render", "moving.usda", "-o", "turn.png", *saved, *small]) == 0
     assert main(["render", "moving.usda", "-o", "f.png", "--frames", "1:5:4", *small]) == 0
     assert main(["render", "s/one.xml", "-o", "again.png", "-m", "scalar_rgb"]) == 0
-    first, second, third, again = (
-        np.array(mi.Bitmap(name)).astype(int) for name in ("turn_0001.png", "turn_0002.png", "f_0005.png", "again.png")
-    )
+    names = ("turn_0001.png", "turn_0002.png", "f_0005.png", "again.png")
+    first, second, third, again = (np.array(mi.Bitmap(name)).astype(int) for name in names)
     np.testing.assert_allclose(first, again, atol=1)
     assert np.abs(first - second).mean() > 1
     assert np.abs(first - third).mean() > 1
@@ -216,14 +194,13 @@ def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys)
 
 TEXTURE_SIDE = 64
 # The camera moves from afar to near; the nearest frame is neither the first nor the last.
-APPROACH = """def Camera "camera" {
-    float horizontalAperture = 24
-    float focalLength = 35
-    float verticalAperture = 18
-    double3 xformOp:translate.timeSamples = {1: (0, 0, 90), 2: (0, 0, 40), 3: (0, 0, 70)}
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-}
-"""
+APPROACH = prim(
+    "Camera",
+    "camera",
+    "float horizontalAperture = 24\nfloat verticalAperture = 18\nfloat focalLength = 35",
+    "double3 xformOp:translate.timeSamples = {1: (0, 0, 90), 2: (0, 0, 40), 3: (0, 0, 70)}",
+    'uniform token[] xformOpOrder = ["xformOp:translate"]',
+)
 
 
 def floor_with_tiles(folder, camera):
@@ -255,30 +232,24 @@ def texture_side(entries):
 @pytest.fixture
 def asked(monkeypatch):
     """What entries of scenes are made of."""
-    found = []
-    monkeypatch.setattr(
-        stage_scenes, "SceneEntries", lambda *given, **more: found.append((given, more)) or SceneEntries(*given, **more)
-    )
-    return found
+    return recorded(monkeypatch, stage_scenes, "SceneEntries")
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 @pytest.mark.filterwarnings("ignore:.*shutters of cameras have no effect")
 def test_textures_are_as_fine_as_the_part_of_a_frame_that_shows_most_of_them_needs(tmp_path, asked):
     """While the shutter is open, the camera comes nearer."""
-    opened = "double shutter:open = 0\ndouble shutter:close = 1\n"
-    camera = APPROACH.replace('"camera" {', '"camera" {\n' + opened).replace("2: (0, 0, 40)", "2: (0, 0, 10)")
+    opened = "double shutter:open = 0\ndouble shutter:close = 1\nfloat focal"
+    camera = APPROACH.replace("float focal", opened).replace("2: (0, 0, 40)", "2: (0, 0, 10)")
     path = floor_with_tiles(tmp_path, camera)
     sides = sides_of_stills(path, (1, 1.25, 1.75), asked)
-    numbers = range(1, 2)
-    assert (
-        len([*FrameRange(StageScenes(path, LOOK, RATE, numbers=numbers, shutter=2), numbers).frames([1], "box")]) == 2
-    )
+    opened = StageScenes(path, LOOK, RATE, numbers=range(1, 2), shutter=2)
+    assert len([*FrameRange(opened, range(1, 2)).frames([1], "box")]) == 2
     assert sides[0] == sides[1] < sides[2] < TEXTURE_SIDE
     assert texture_side(asked[0]) == sides[2]
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 @pytest.mark.parametrize("shown", ["frames", "turntable"])
 def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_path, asked, shown):
     """Alike in all frames, so that nothing changes from one to the next, and no finer than that."""
@@ -296,52 +267,26 @@ def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_pat
         assert texture_side(asked[1]) == TEXTURE_SIDE
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_warnings_of_all_frames_are_told_once(tmp_path):
-    fin = f"point3f[] points = [{CORNERS}]" + CUBE.replace("4]", "4, 4]", 1).replace("7,5]", "7,5, 0,1,7,6]")
-    path = write(tmp_path, mesh("fin", fin) + 'def BasisCurves "hair" {}\n' + LAMP)
-    with warnings.catch_warnings(record=True) as record:
-        warnings.simplefilter("always", CageWarning)
-        moving = frame_range(path, range(1, 3))
-        assert len([*moving.frames([1, 2], "box")]) == 2
-    messages = sorted((str(each.message) for each in record), key=len)
-    assert len(messages) == 2
+    fin = CUBE.replace("4]", "4, 4]", 1).replace("7,5]", "7,5, 0,1,7,6]")
+    path = write(tmp_path, prim("Mesh", "fin", fin) + prim("BasisCurves", "hair") + LAMP)
+    shown, messages = told(lambda: [*frame_range(path, range(1, 3)).frames([1, 2], "box")])
+    assert (len(shown), len(messages)) == (2, 2)
+    messages.sort(key=len)
     assert "BasisCurves are ignored (/hair)" in messages[0]
     assert "prim /fin: the faces are no manifold" in messages[1]
 
 
 def crossing(folder, opens, closes):
     """A bright square, a quarter of the picture wide, that moves by half a picture from time 0 to 1."""
-    square = mesh(
-        "square",
-        """point3f[] points = [(-.5,-1,0), (.5,-1,0), (.5,1,0), (-.5,1,0)]
-    int[] faceVertexCounts = [4]
-    int[] faceVertexIndices = [0, 1, 2, 3]
-    uniform token subdivisionScheme = "none"
-    color3f inputs:color = (1, 1, 1)
-    double3 xformOp:translate.timeSamples = {0: (-1.5, 0, 0), 1: (0.5, 0, 0)}
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-""",
-        'prepend apiSchemas = ["MeshLightAPI"]',
-    )
-    camera = f"""def Camera "camera" {{
-    token projection = "orthographic"
-    float horizontalAperture = 40
-    float verticalAperture = 20
-    double shutter:open = {opens}
-    double shutter:close = {closes}
-    double3 xformOp:translate = (0, 0, 5)
-    uniform token[] xformOpOrder = ["xformOp:translate"]
-}}
-"""
-    return write(folder, square + camera)
-
-
-def blurred(path, *more):
-    picture = path.with_suffix(".exr")
-    options = ["--size", "16x8", "--spp", "64", "--filter", "box", "-m", "scalar_rgb", "-o", str(picture), *more]
-    assert main(["render", str(path), *options]) == 0
-    return np.array(mi.Bitmap(str(picture)))[..., 1]
+    square = SQUARE.replace("(-1,", "(-.5,").replace("(1,", "(.5,"), "color3f inputs:color = (1, 1, 1)"
+    move = moved(translate="").replace(" = \n", ".timeSamples = {0: (-1.5, 0, 0), 1: (0.5, 0, 0)}\n", 1)
+    aperture = "float horizontalAperture = 40\nfloat verticalAperture = 20"
+    shutter = f"double shutter:open = {opens}\ndouble shutter:close = {closes}"
+    view = 'token projection = "orthographic"', aperture, shutter, moved(translate=(0, 0, 5))
+    text = prim("Mesh", "square", *square, move, apis=["MeshLightAPI"]) + prim("Camera", "camera", *view)
+    return write(folder, text)
 
 
 def test_a_shutter_blurs_a_moving_square_by_the_time_that_it_covers_a_pixel(tmp_path):
@@ -350,7 +295,13 @@ def test_a_shutter_blurs_a_moving_square_by_the_time_that_it_covers_a_pixel(tmp_
     moment = np.linspace(0.25, 0.75, 20001)[:, None]
     start = -2 + 2 * moment
     covered = np.clip(np.minimum(start + 1, left + 0.25) - np.maximum(start, left), 0, 0.25).mean(axis=0) / 0.25
-    image = blurred(crossing(tmp_path, -0.25, 0.25), "--time", "0.5", "--shutter", "16")
+    picture, options = (
+        str(tmp_path / "a.exr"),
+        ["--filter", "box", "-m", "scalar_rgb", "--time", "0.5", "--shutter", "16"],
+    )
+    path = str(crossing(tmp_path, -0.25, 0.25))
+    assert main(["render", path, "-o", picture, "--size", "16x8", "--spp", "64", *options]) == 0
+    image = np.array(mi.Bitmap(picture))[..., 1]
     # Each sub-frame has 4 samples in a row of the pixel, of which an edge of the square may hit one more or fewer.
     np.testing.assert_allclose(image, np.tile(covered, (8, 1)), atol=1 / 16)
     np.testing.assert_allclose(image.mean(axis=0), covered, atol=1 / 64)

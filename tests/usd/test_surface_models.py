@@ -1,7 +1,6 @@
 """Models of surfaces: their energy and colour against closed forms, and against each other."""
 
 import math
-import warnings
 
 import mitsuba as mi
 import numpy as np
@@ -15,14 +14,12 @@ from mitsuba_usd.materialx_nodes import node
 from mitsuba_usd.stage_warnings import StageWarnings
 from mitsuba_usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
 from mitsuba_usd.textures import Textures
+from usd.stages import told
 
 pytest.importorskip("MaterialX")
+pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
-IDS = {
-    "standard_surface": "ND_standard_surface_surfaceshader",
-    "open_pbr_surface": "ND_open_pbr_surface_surfaceshader",
-    "gltf_pbr": "ND_gltf_pbr_surfaceshader",
-}
+MATERIALX = ("standard_surface", "open_pbr_surface", "gltf_pbr")
 COLOR = [0.2, 0.4, 0.8]
 # Of means of 65,536 samples whose lobes are chosen by other odds.
 SAMPLED = 0.02
@@ -30,17 +27,12 @@ SAMPLED = 0.02
 ABSORBED = 1e-3
 
 
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
-
-
 def look(model, **given):
     """A material of a model; what is not given is as the library defines it."""
     if model == "UsdPreviewSurface":
         usual = dict(PREVIEW)
     else:
-        declared = library().getNodeDef(IDS[model]).getActiveInputs()
+        declared = library().getNodeDef(f"ND_{model}_surfaceshader").getActiveInputs()
         usual = {e.getName(): numbers(e.getValueString(), e.getType()) for e in declared if e.getValueString()}
     assert not set(given) - set(usual) - {"attenuation_distance"}
     return surface_models.material("/paint", model, {**usual, **given})
@@ -53,17 +45,19 @@ def entry(material):
     return Bsdfs(Textures(notes), notes).surface(material, shape), notes
 
 
+def bsdf_of(model, **given):
+    """The entry of a BSDF that is the same from both sides."""
+    return entry(look(model, **given))[0]["bsdf"]
+
+
 def albedo(bsdf, degrees, count=1 << 16):
     """What a surface reflects and what it lets through of light from an angle, by its own sampling."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(7, count)
     si = mi.SurfaceInteraction3f()
     si.wi = mi.Vector3f(math.sin(math.radians(degrees)), 0, math.cos(math.radians(degrees)))
-    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
-    si.n = mi.Normal3f(0, 0, 1)
-    si.t = mi.Float(1)
-    si.p = mi.Point3f(0)
-    si.uv = mi.Point2f(0.5)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.t, si.p, si.uv = mi.Float(1), mi.Point3f(0), mi.Point2f(0.5)
     sample, weight = bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
     weights = np.broadcast_to(np.array(weight), (3, count))
     up = np.broadcast_to(np.array(sample.wo.z) > 0, (count,))
@@ -83,7 +77,6 @@ def both(model, degrees=0.0, **given):
     ],
 )
 def test_what_is_diffuse_reflects_its_colour(model, given):
-    """Lambert's law, from every angle."""
     for degrees in (0, 60):
         reflected, transmitted = both(model, degrees, **given)
         np.testing.assert_allclose(reflected, [0.1, 0.2, 0.4], rtol=1e-3)
@@ -117,9 +110,8 @@ def test_roughness_beyond_1_is_1():
     """Networks of nodes divide by masks, and a roughness of 80,000 shines like a lamp."""
     mask = TextureContents("none.png", "r", "raw", "repeat", [1] * 4, [0] * 4, np.eye(3), "st", [0.00001] * 4)
     for beyond in (5.0, node("divide", "float", in1=0.8, in2=mask)):
-        expected, found = (
-            both("standard_surface", 30, base_color=COLOR, specular_roughness=each) for each in (1.0, beyond)
-        )
+        given = {"degrees": 30, "base_color": COLOR}
+        expected, found = (both("standard_surface", specular_roughness=each, **given) for each in (1.0, beyond))
         np.testing.assert_allclose(found, expected, rtol=SAMPLED)
 
 
@@ -139,28 +131,23 @@ def test_edges_of_metals_have_the_colour_that_the_models_say():
 
 
 COPPER = [0.955, 0.638, 0.538]
-SCHLICK = [
-    ("UsdPreviewSurface", {"metallic": 1.0, "diffuseColor": COPPER, "roughness": 0.0}),
-    ("gltf_pbr", {"metallic": 1.0, "base_color": COPPER, "roughness": 0.0}),
-]
+SCHLICK = {"UsdPreviewSurface": "diffuseColor", "gltf_pbr": "base_color"}
 
 
-@pytest.mark.parametrize(("model", "given"), SCHLICK)
-def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, given):
+@pytest.mark.parametrize(("model", "color"), SCHLICK.items())
+def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, color):
     """A conductor of Gulbrandsen's with a white edge is 0.13 too pale at 75 degrees."""
     for degrees in (0, 45, 60, 75, 82):
         expected = np.array(COPPER) + (1 - np.array(COPPER)) * (1 - np.cos(np.radians(degrees))) ** 5
-        np.testing.assert_allclose(both(model, degrees, **given)[0], expected, atol=0.025)
+        found = both(model, degrees, metallic=1.0, roughness=0.0, **{color: COPPER})[0]
+        np.testing.assert_allclose(found, expected, atol=0.025)
 
 
 def test_edge_colours_below_a_coat_are_only_missed_where_they_are_not_white():
     given = {"base_metalness": 1.0, "base_color": COPPER, "coat_weight": 1.0}
     for color, is_missed in (([1.0, 1.0, 1.0], False), ([0.6, 0.6, 0.6], True)):
         _, notes = entry(look("open_pbr_surface", specular_color=color, **given))
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            notes.warn("stage")
-        assert any("edge colours" in str(each.message) for each in said) == is_missed
+        assert any("edge colours" in message for message in told(notes.warn, "stage")[1]) == is_missed
 
 
 def test_fresnel_equations_of_conductors_are_those_of_dielectrics_without_absorption():
@@ -237,52 +224,53 @@ def test_white_surfaces_nearly_keep_their_light_and_hardly_add_to_it(model, give
 
 
 def test_models_agree_where_they_mean_the_same():
-    """A red plastic with a coat, and brushed steel."""
-    same = [
-        look("standard_surface", base_color=COLOR, specular_roughness=0.4, specular_IOR=1.6),
-        look("open_pbr_surface", base_color=COLOR, specular_roughness=0.4, specular_ior=1.6),
-        look("gltf_pbr", base_color=COLOR, metallic=0.0, roughness=0.4, ior=1.6),
-        look("UsdPreviewSurface", diffuseColor=COLOR, roughness=0.4, ior=1.6),
-    ]
-    entries = [entry(each)[0]["bsdf"] for each in same]
-    assert all(each == pytest.approx(entries[0]) for each in entries if isinstance(each, float))
+    usual = {"base_color": COLOR, "specular_roughness": 0.4}
+    entries = [bsdf_of("standard_surface", specular_IOR=1.6, **usual)]
+    entries.append(bsdf_of("open_pbr_surface", specular_ior=1.6, **usual))
+    entries.append(bsdf_of("gltf_pbr", base_color=COLOR, metallic=0.0, roughness=0.4, ior=1.6))
+    entries.append(bsdf_of("UsdPreviewSurface", diffuseColor=COLOR, roughness=0.4, ior=1.6))
     for each in entries:
         assert each["base_color"]["value"] == pytest.approx(COLOR)
         assert (each["roughness"], each["eta"]) == (pytest.approx(0.4), pytest.approx(1.6))
 
 
-def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters():
-    """Of Standard Surface: widths are r^2 / sqrt(1 - a) and r^2 sqrt(1 - a); OpenPBR has others."""
-    metal = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}
-    bsdf = entry(look("standard_surface", **metal))[0]["bsdf"]
-    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(0.5), pytest.approx(0.125))
-    turned = entry(look("standard_surface", specular_rotation=0.25, **metal))[0]["bsdf"]
-    assert (turned["alpha_u"], turned["alpha_v"]) == (pytest.approx(0.125), pytest.approx(0.5))
-    metal = {"base_metalness": 1.0, "specular_roughness": 0.5, "specular_roughness_anisotropy": 0.5}
-    bsdf = entry(look("open_pbr_surface", **metal))[0]["bsdf"]
-    wide = 0.25 * np.sqrt(2 / (1 + 0.5**2))
-    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(wide), pytest.approx(wide / 2))
-    metal = {"metallic": 1.0, "base_color": COLOR, "roughness": 0.5, "anisotropy_strength": 0.5}
-    bsdf = entry(look("gltf_pbr", **metal))[0]["bsdf"]
-    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(0.25 + 0.75 * 0.25), pytest.approx(0.25))
-    bsdf = entry(look("gltf_pbr", **{**metal, "anisotropy_strength": 1.0}))[0]["bsdf"]
-    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == (pytest.approx(1), pytest.approx(0.25))
-    metal = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
-    skew, notes = entry(look("standard_surface", **metal))
+ROUGH_METAL = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}
+OPEN_METAL = {"base_metalness": 1.0, "specular_roughness": 0.5, "specular_roughness_anisotropy": 0.5}
+GLTF_METAL = {"metallic": 1.0, "base_color": COLOR, "roughness": 0.5}
+OPEN_WIDTH = 0.25 * np.sqrt(2 / (1 + 0.5**2))
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "widths"),
+    [
+        # Of Standard Surface: widths are r^2 / sqrt(1 - a) and r^2 sqrt(1 - a); the others have others.
+        ("standard_surface", ROUGH_METAL, (0.5, 0.125)),
+        ("standard_surface", {**ROUGH_METAL, "specular_rotation": 0.25}, (0.125, 0.5)),
+        ("open_pbr_surface", OPEN_METAL, (OPEN_WIDTH, OPEN_WIDTH / 2)),
+        ("gltf_pbr", {**GLTF_METAL, "anisotropy_strength": 0.5}, (0.25 + 0.75 * 0.25, 0.25)),
+        ("gltf_pbr", {**GLTF_METAL, "anisotropy_strength": 1.0}, (1, 0.25)),
+    ],
+)
+def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters(model, given, widths):
+    bsdf = bsdf_of(model, **given)
+    assert (bsdf["alpha_u"], bsdf["alpha_v"]) == pytest.approx(widths)
+
+
+def test_other_rotations_of_anisotropy_are_rounded_and_told():
+    skew, notes = entry(look("standard_surface", metalness=1.0, specular_anisotropy=0.5, specular_rotation=0.1))
     assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
     with pytest.warns(UserWarning, match="rounded to quarter turns"):
         notes.warn("file")
     # Of principled, the widths are r^2 / sqrt(1 - 0.9 a) and r^2 sqrt(1 - 0.9 a).
-    plastic = entry(look("standard_surface", specular_anisotropy=0.45))[0]["bsdf"]
-    assert plastic["anisotropic"] == pytest.approx(0.5)
+    assert bsdf_of("standard_surface", specular_anisotropy=0.45)["anisotropic"] == pytest.approx(0.5)
 
 
 def test_the_strength_of_reflections_is_an_index_of_refraction():
     """Half of 0.04 head-on, and what a specular workflow says."""
-    half = entry(look("standard_surface", specular=0.5))[0]["bsdf"]
-    assert ((half["eta"] - 1) / (half["eta"] + 1)) ** 2 == pytest.approx(0.02)
-    strong = entry(look("UsdPreviewSurface", useSpecularWorkflow=1.0, specularColor=[0.2] * 3, metallic=1.0))[0]["bsdf"]
-    assert ((strong["eta"] - 1) / (strong["eta"] + 1)) ** 2 == pytest.approx(0.2)
+    half = bsdf_of("standard_surface", specular=0.5)
+    strong = bsdf_of("UsdPreviewSurface", useSpecularWorkflow=1.0, specularColor=[0.2] * 3, metallic=1.0)
+    for bsdf, expected in ((half, 0.02), (strong, 0.2)):
+        assert ((bsdf["eta"] - 1) / (bsdf["eta"] + 1)) ** 2 == pytest.approx(expected)
     assert strong["metallic"] == 0
 
 
@@ -293,7 +281,7 @@ def test_coats_dim_what_lies_below():
     found = look("open_pbr_surface", base_color=[0.5] * 3, coat_weight=1.0, coat_ior=1.5).inputs["base_color"]
     inner = 1 - 0.96 / 1.5**2
     np.testing.assert_allclose(found, 0.5 * 0.96 * (1 - inner) / (1 - 0.5 * inner))
-    coated = entry(look("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2))[0]["bsdf"]
+    coated = bsdf_of("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2)
     assert coated["clearcoat"] == pytest.approx((0.6 / 2.6) ** 2 / 0.04)
     assert coated["clearcoat_gloss"] == pytest.approx(0.06 / 0.099)
     _, notes = entry(look("standard_surface", coat=1.0, coat_roughness=0.6))
@@ -324,33 +312,31 @@ def test_bodies_absorb_all_of_a_colour_that_they_have_none_of():
     ],
 )
 def test_sheets_let_through_the_part_of_diffuse_light_that_the_model_says(model, given, part):
-    """A thin sheet of paper."""
     reflected, transmitted = both(model, base_color=[0.8] * 3, subsurface_color=[0.8] * 3, **given)
     np.testing.assert_allclose(transmitted, 0.8 * part, rtol=SAMPLED)
     assert (reflected > 0.8 * (1 - part) - SAMPLED).all()
 
 
 def test_emission_and_presence():
-    assert look("standard_surface", emission=2.0, emission_color=COLOR).inputs["emission"] == pytest.approx(
-        [0.4, 0.8, 1.6]
-    )
-    assert look("open_pbr_surface", emission_luminance=2.0).inputs["emission"] == [2.0] * 3
-    assert look("gltf_pbr", emissive=COLOR, emissive_strength=3.0).inputs["emission"] == pytest.approx([0.6, 1.2, 2.4])
+    for model, given, expected in (
+        ("standard_surface", {"emission": 2.0, "emission_color": COLOR}, [0.4, 0.8, 1.6]),
+        ("open_pbr_surface", {"emission_luminance": 2.0}, [2.0] * 3),
+        ("gltf_pbr", {"emissive": COLOR, "emissive_strength": 3.0}, [0.6, 1.2, 2.4]),
+    ):
+        assert look(model, **given).inputs["emission"] == pytest.approx(expected)
     assert look("standard_surface", opacity=[0.5] * 3).inputs["opacity"] == pytest.approx(0.5)
     for mode, expected in ((0.0, None), (1.0, 0.0), (2.0, 0.4)):
         assert look("gltf_pbr", alpha=0.4, alpha_mode=mode).inputs.get("opacity") == expected
 
 
 def test_every_input_of_every_model_is_taken_or_told():
-    """None is forgotten: a model reads it, or says that it leaves it."""
     silent = {"subsurface_radius", "subsurface_scale", "subsurface_anisotropy", "subsurface_radius_scale"}
     silent |= {"subsurface_scatter_anisotropy", "occlusion", "tangent", "geometry_tangent", "geometry_coat_tangent"}
     # Of what is left itself.
     silent |= {"thin_film_IOR", "thin_film_ior", "transmission_dispersion_abbe_number", "iridescence_ior"}
     silent |= {"iridescence_thickness", "coat_rotation", "sheen_roughness", "fuzz_roughness"}
     silent |= {"coat_normal", "geometry_coat_normal", "clearcoat_normal", "normal", "geometry_normal"}
-    ids = {**IDS, "UsdPreviewSurface": "ND_UsdPreviewSurface_surfaceshader"}
-    for model, name in ids.items():
+    for model in (*MATERIALX, "UsdPreviewSurface"):
         read = set()
 
         def given(key, read=read):
@@ -359,7 +345,7 @@ def test_every_input_of_every_model_is_taken_or_told():
 
         MODELS[model].inputs(given)
         MODELS[model].inputs(lambda key, given=given: 1.0 if key == "useSpecularWorkflow" else given(key))
-        declared = {each.getName() for each in library().getNodeDef(name).getActiveInputs()}
+        declared = {each.getName() for each in library().getNodeDef(f"ND_{model}_surfaceshader").getActiveInputs()}
         assert read <= declared | {"attenuation_distance"}
         missing = declared - read - set(MODELS[model].left) - silent
         assert missing <= {"alpha_cutoff", "thin_film_thickness"}, (model, missing)

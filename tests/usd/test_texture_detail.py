@@ -1,5 +1,7 @@
 """Images that are finer than a picture shows are loaded smaller."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -33,17 +35,8 @@ JPEG_LEVELS = 4
 
 
 def texture(file="a.png", **changes):
-    usual = {
-        "channel": "rgb",
-        "color_space": "sRGB",
-        "wrap": "repeat",
-        "scale": [1] * 4,
-        "bias": [0] * 4,
-        "to_uv": np.eye(3),
-        "texcoords": "st",
-        "fallback": [0, 0, 0, 1],
-    }
-    return TextureContents(file, **{**usual, **changes})
+    usual = TextureContents(file, "rgb", "sRGB", "repeat", [1] * 4, [0] * 4, np.eye(3), "st", [0, 0, 0, 1])
+    return replace(usual, **changes)
 
 
 def square(side=1.0, uv_side=1.0, to_world=None, *, has_texcoords=True):
@@ -58,14 +51,10 @@ def scene(*shapes, inputs, groups=(), instances=()):
 
 
 def sensor(distance=DISTANCE):
-    return {
-        "type": "perspective",
-        "fov": FOV,
-        "fov_axis": "x",
-        "near_clip": 0.01,
-        "to_world": mi.ScalarTransform4f().translate([0, 0, -distance]),
-        "film": {"type": "hdrfilm", "width": WIDTH, "height": WIDTH // 2},
-    }
+    to_world = mi.ScalarTransform4f().translate([0, 0, -distance])
+    film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH // 2}
+    view = {"fov": FOV, "fov_axis": "x", "near_clip": 0.01}
+    return {"type": "perspective", **view, "to_world": to_world, "film": film}
 
 
 def needed_for(contents):
@@ -86,19 +75,15 @@ def test_texels_follow_from_pixels(side, uv_side):
 def test_the_copy_that_is_largest_in_the_picture_decides():
     near = np.eye(4)
     near[2, 3] = -DISTANCE / 2
-    shapes = scene(
-        square(), inputs={"base_color": texture()}, groups=[[square()]], instances=[InstanceContents("/i", 0, near)]
-    )
-    found = needed_for(shapes)["a.png"]
+    copies = {"groups": [[square()]], "instances": [InstanceContents("/i", 0, near)]}
+    found = needed_for(scene(square(), inputs={"base_color": texture()}, **copies))["a.png"]
     assert found == pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit(DISTANCE / 2), rel=ROUNDED)
 
 
 def test_where_the_detail_is_unknown_nothing_is_reduced():
-    without = scene(square(has_texcoords=False), inputs={"base_color": texture()})
-    assert needed_for(without) == {"a.png": np.inf}
-    elsewhere = NodeContents(
-        "image", "color3", {"file": texture(), "texcoord": NodeContents("texcoord", "vector2", {})}
-    )
+    assert needed_for(scene(square(has_texcoords=False), inputs={"base_color": texture()})) == {"a.png": np.inf}
+    texcoord = NodeContents("texcoord", "vector2", {})
+    elsewhere = NodeContents("image", "color3", {"file": texture(), "texcoord": texcoord})
     assert needed_for(scene(square(), inputs={"base_color": elsewhere})) == {}
 
 
@@ -110,9 +95,8 @@ def test_reduced_images_have_the_same_mean_light(seed, channels, is_srgb):
     assert small.shape == (4, 8, channels)
     expected = linear(pixels, is_srgb).reshape(4, 4, 8, 4, channels).mean(axis=(1, 3))
     if is_srgb:
-        expected[..., :3] = np.where(
-            expected[..., :3] <= 0.0031308, 12.92 * expected[..., :3], 1.055 * expected[..., :3] ** (1 / 2.4) - 0.055
-        )
+        color = expected[..., :3]
+        expected[..., :3] = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
     np.testing.assert_allclose(small / 255, expected, rtol=0, atol=LEVEL)
 
 
@@ -126,8 +110,7 @@ def linear(pixels, is_srgb):
 
 @pytest.mark.parametrize(("needed", "side"), [(np.inf, 64), (65, 64), (33, 64), (32, 32), (17, 32), (1, 1), (0, 1)])
 def test_images_keep_as_many_pixels_as_are_needed(needed, side):
-    pixels = np.full((64, 64, 3), 200, dtype=np.uint8)
-    found = reduced(pixels, needed, is_srgb=True)
+    found = reduced(np.full((64, 64, 3), 200, dtype=np.uint8), needed, is_srgb=True)
     assert found.shape == (side, side, 3)
     assert (found == 200).all()
 
@@ -141,8 +124,7 @@ def test_a_picture_that_repeats_needs_fewer_texels():
 
 @pytest.mark.parametrize(("size", "most", "side"), [((63, 64), 33, 32), ((64, 64), 64, 64), ((5, 3), 1, 1)])
 def test_a_limit_holds_for_all_sizes(size, most, side):
-    pixels = np.full((*size, 3), 200, dtype=np.uint8)
-    found = reduced(pixels, np.inf, most, is_srgb=True)
+    found = reduced(np.full((*size, 3), 200, dtype=np.uint8), np.inf, most, is_srgb=True)
     assert max(found.shape[:2]) == side
     assert (found == 200).all()
 
@@ -153,9 +135,8 @@ def test_images_of_other_types_are_halved_as_bytes_are(dtype, is_srgb):
     pixels = np.random.default_rng(0).integers(0, 256, (16, 8, 4), dtype=np.uint8)
     others = pixels * np.uint16(257) if dtype == np.uint16 else (pixels / 255).astype(dtype)
     found = reduced(others, 4, is_srgb=is_srgb)
-    np.testing.assert_allclose(
-        found / (65535 if dtype == np.uint16 else 1), reduced(pixels, 4, is_srgb=is_srgb) / 255, rtol=0, atol=LEVEL
-    )
+    found = found / (65535 if dtype == np.uint16 else 1)
+    np.testing.assert_allclose(found, reduced(pixels, 4, is_srgb=is_srgb) / 255, rtol=0, atol=LEVEL)
 
 
 @pytest.mark.parametrize(("channels", "space"), [(1, "auto"), (3, "auto"), (3, "raw")])
@@ -183,9 +164,8 @@ def test_one_file_is_read_for_each_of_its_uses(tmp_path):
     for order in (uses, uses[::-1]):
         textures = Textures(StageWarnings(), {path: 8.0})
         textures.read(order)
-        of_colours, of_numbers = (textures.mean(each) for each in uses)
-        np.testing.assert_allclose(of_colours, 0.5, rtol=0, atol=0.01)
-        np.testing.assert_allclose(of_numbers, 0.5, rtol=0, atol=0.01)
+        for each in uses:
+            np.testing.assert_allclose(textures.mean(each), 0.5, rtol=0, atol=0.01)
         assert textures.radiance(path, np.ones(3)).size().x == 64
 
 
@@ -208,9 +188,8 @@ def test_two_components_are_red_and_green(monkeypatch):
 def test_tiles_are_read_smaller_each(tmp_path):
     for number in (1001, 1002):
         mi.Bitmap(np.full((64, 64, 3), number - 1000, np.uint8)).write(str(tmp_path / f"a.{number}.png"))
-    found = read_texture_image(str(tmp_path / "a.<UDIM>.png"), "raw", 20)
-    assert found.pixels.shape == (32, 64, 3)
-    assert read_texture_image(str(tmp_path / "a.<UDIM>.png"), "raw", 20, 16).pixels.shape == (16, 32, 3)
+    for limits, shape in (([20], (32, 64, 3)), ([20, 16], (16, 32, 3))):
+        assert read_texture_image(str(tmp_path / "a.<UDIM>.png"), "raw", *limits).pixels.shape == shape
 
 
 def test_halves_are_counted():

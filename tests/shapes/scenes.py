@@ -1,0 +1,53 @@
+"""Sensors and textures for scenes, rays that hit shapes, and what shapes hold at their vertices."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# Sums of some tens of terms of order one, in single precision.
+SINGLE = 2e-6
+# Numbers of a vertex, where they are not three.
+WIDTHS = {"vertex_texcoords": 2, "vertex_weight": 1, "vertex_label": 1}
+
+
+def buffer(shape, name):
+    values = np.array(mi.traverse(shape)[name])
+    return values if name == "face_element" else values.reshape(-1, WIDTHS.get(name, 3))
+
+
+def vertices(shape):
+    return tuple(buffer(shape, f"vertex_{name}") for name in ("positions", "normals"))
+
+
+def rows(value):
+    return np.array(value, dtype=np.float64).T
+
+
+def hit(shape, x=0.1, y=0.2):
+    """Of a ray from above."""
+    return mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(mi.Ray3f([x, y, 5], [0, 0, -1]))
+
+
+def film(width, height=None):
+    """Samples beyond the border spare a warning of projective integrators."""
+    size = {"width": width, "height": height or width}
+    return {"type": "hdrfilm", **size, "rfilter": {"type": "box"}, "pixel_format": "rgb", "sample_border": True}
+
+
+def perspective(size, origin, target=(0, 0, 0), up=(0, 0, 1), **more):
+    to_world = mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
+    return {"type": "perspective", "to_world": to_world, "film": size if isinstance(size, dict) else film(size), **more}
+
+
+def waves():
+    """A texture in Python, without a gradient of its own."""
+
+    class Waves(mi.Texture):
+        def __init__(self, props):
+            mi.Texture.__init__(self, props)
+
+        def eval_1(self, si, active=True):  # noqa: ARG002 - as Mitsuba calls it
+            return dr.sin(3 * si.uv.x) * dr.cos(2 * si.uv.y)
+
+    mi.register_texture("waves", Waves)
+    return mi.load_dict({"type": "waves"})

@@ -1,0 +1,63 @@
+"""How parameters are updated and differentiated."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from mitsuba_subdivision import upload
+
+
+def update(of, values=(), **named):
+    """Assign parameters of an object, or of what `traverse` has shown of it, which is returned."""
+    parameters = of if isinstance(of, mi.SceneParameters) else mi.traverse(of)
+    for name, value in {**dict(values), **named}.items():
+        parameters[name] = value
+    parameters.update()
+    return parameters
+
+
+def differentiated(parameters, key):
+    """Have a parameter differentiated, as an array that is assigned to it."""
+    values = type(parameters[key])(dr.detach(parameters[key]))
+    dr.enable_grad(values)
+    update(parameters, {key: values})
+    return values
+
+
+MODES = ("backward", "forward", "difference")
+
+
+def derivative(mode, assign, loss, step=1e-3):
+    """Of a loss by the steps that are assigned: one of `MODES`, of which the last is central, over a step."""
+    if mode == "difference":
+        ends = []
+        with dr.suspend_grad():
+            for side in (step, -step):
+                assign(mi.Float(side))
+                ends.append(float(np.array(loss()).ravel()[0]))
+        return (ends[0] - ends[1]) / (2 * step)
+    # As a constant, Dr.Jit would widen it.
+    by = dr.opaque(mi.Float, 0)
+    dr.enable_grad(by)
+    assign(by)
+    value = loss()
+    if mode == "forward":
+        dr.forward(by)
+    else:
+        dr.backward(value)
+    return float(np.array(dr.grad(value if mode == "forward" else by)).ravel()[0])
+
+
+def moving(parameters, by, rng):
+    """Function that moves a parameter along a random direction by so many steps."""
+    is_matrix = by.endswith("to_world")
+    start = dr.opaque(parameters[by].matrix if is_matrix else parameters[by])
+    along = rng.normal(size=np.array(start).shape)
+    if is_matrix:
+        along[3] = 0
+    along = type(start)(along.tolist()) if is_matrix else upload(type(start), along)
+
+    def assign(step):
+        value = start + along * step
+        update(parameters, {by: mi.AffineTransform4f(value) if is_matrix else value})
+
+    return assign

@@ -1,0 +1,92 @@
+"""Text of small USD stages, and what is told of them."""
+
+import warnings
+
+from mitsuba_subdivision.cage import CageWarning
+
+CORNERS = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-1,-1,1), (1,-1,1), (-1,1,1), (1,1,1)"
+POINTS = f"point3f[] points = [{CORNERS}]"
+FACES = """int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
+int[] faceVertexIndices = [0,2,3,1, 4,5,7,6, 0,1,5,4, 2,6,7,3, 0,4,6,2, 1,3,7,5]
+"""
+CUBE = f"{POINTS}\n{FACES}"
+POLYGONS = 'uniform token subdivisionScheme = "none"\n'
+# Two units wide, in the plane z = 0, seen from above.
+SQUARE = f"""{POLYGONS}
+    point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0)]
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1)] (interpolation = "vertex")
+"""
+
+
+def write(folder, text, name="stage.usda", up="Z", head=""):
+    path = folder / name
+    path.write_text(f'#usda 1.0\n(\n    upAxis = "{up}"\n    {head}\n)\n{text}')
+    return path
+
+
+def prim(kind, name, *body, apis=(), head=""):
+    """A prim; each part of its body is one statement or several."""
+    schemas = ", ".join(f'"{each}"' for each in apis)
+    head = f"prepend apiSchemas = [{schemas}]\n{head}" if apis else head
+    return "\n".join([f'def {kind} "{name}" (\n{head}\n) {{', *body, "}\n"])
+
+
+def moved(**steps):
+    """Operations of a transform in the order in which they are given."""
+    types = {"translate": "double3", "scale": "float3", "rotateXYZ": "float3"}
+    lines = [f"{types.get(name, 'float')} xformOp:{name} = {value}\n" for name, value in steps.items()]
+    order = ", ".join(f'"xformOp:{name}"' for name in steps)
+    return "".join([*lines, f"uniform token[] xformOpOrder = [{order}]\n"])
+
+
+def mesh(name, *body):
+    return prim("Mesh", name, *body, apis=["MaterialBindingAPI"])
+
+
+def bound(name="paint"):
+    return f"rel material:binding = </{name}>"
+
+
+def subset(faces, material="paint", name="part"):
+    kind = 'uniform token elementType = "face"\nuniform token familyName = "materialBind"'
+    return prim("GeomSubset", name, kind, f"int[] indices = {faces}", bound(material), apis=["MaterialBindingAPI"])
+
+
+def shader(name, kind, *body):
+    return prim("Shader", name, f'uniform token info:id = "{kind}"', *body)
+
+
+def material(inputs, *nodes, name="paint"):
+    surface = shader("surface", "UsdPreviewSurface", inputs, "token outputs:surface")
+    output = f"token outputs:surface.connect = </{name}/surface.outputs:surface>"
+    return prim("Material", name, output, surface, *nodes)
+
+
+def texture(file, space="sRGB", more="", where="inputs:st.connect = </paint/reader.outputs:result>", name="st"):
+    """Nodes of a texture, and of what reads its coordinates from a primvar of the mesh."""
+    repeat = 'token inputs:wrapS = "repeat"\ntoken inputs:wrapT = "repeat"'
+    inputs = f'asset inputs:file = @{file}@\n{repeat}\ntoken inputs:sourceColorSpace = "{space}"\nfloat2 {where}'
+    nodes = shader("texture", "UsdUVTexture", inputs, more, "float3 outputs:rgb\nfloat outputs:r\nfloat outputs:a")
+    return nodes + shader(
+        "reader", "UsdPrimvarReader_float2", f'string inputs:varname = "{name}"\nfloat2 outputs:result'
+    )
+
+
+ABOVE = moved(translate=(0, 0, 10))
+
+
+def camera(*lines, name="camera", focal_length=50, aperture=10, placed=ABOVE):
+    """Looks down; as a rule from z = 10, where the aperture shows two units in the plane z = 0."""
+    apertures = [f"float {direction}Aperture = {aperture}" for direction in ("horizontal", "vertical")]
+    return prim("Camera", name, f"float focalLength = {focal_length}", *apertures, *lines, placed)
+
+
+def told(call, *given, **options):
+    """What a call returns, and the messages of its warnings, all of which must be about cages."""
+    with warnings.catch_warnings(record=True) as record:
+        warnings.simplefilter("always")
+        found = call(*given, **options)
+    assert all(issubclass(each.category, CageWarning) for each in record), [str(each.message) for each in record]
+    return found, [str(each.message) for each in record]
