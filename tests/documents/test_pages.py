@@ -3,13 +3,11 @@
 import re
 from pathlib import Path
 
-import mitsuba_subdivision
 import pytest
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
 from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, regular_signature
 from mitsuba_subdivision.mesh.signature import Signature
 from mitsuba_subdivision.schemes import scheme_named
-from test_import_direction import ALLOWED, NUMPY_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "plugin" / "mitsuba_subdivision"
@@ -20,10 +18,8 @@ SUFFIXES = (".py", ".md", ".toml", ".obj", ".xml", ".json", ".cff")
 # Stands for a name of the reader's own.
 PLACEHOLDER = "NAME"
 SOURCES = [*sorted((ROOT / "plugin").rglob("*.py")), *sorted((ROOT / "tests").rglob("*.py"))]
-PAGES = [
-    *sorted(ROOT.glob("*.md")),
-    *sorted(path for folder in (".github", "plugin", "scenes") for path in (ROOT / folder).rglob("*.md")),
-]
+PAGES = sorted(ROOT.glob("*.md"))
+PAGES += sorted(path for folder in (".github", "plugin", "scenes") for path in (ROOT / folder).rglob("*.md"))
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 BOTH = pytest.mark.parametrize("page", [ARCHITECTURE, MATHEMATICS], ids=lambda page: page.name)
 # "[Author year]", "[Author and Author year, section]", "[.. year; .. year]"; brackets may be broken over lines.
@@ -90,9 +86,8 @@ def test_every_relative_link_leads_somewhere(page):
         assert other.exists(), target
         if anchor:
             headings = re.findall(r"^#+ (.+)$", text_of(other), flags=re.MULTILINE)
-            assert anchor in {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}, (
-                target
-            )
+            anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+            assert anchor in anchors, target
 
 
 def test_code_cites_pages_that_exist():
@@ -124,27 +119,14 @@ def test_citations_are_found(text, keys):
     assert citations(text) == keys
 
 
-def test_the_table_of_packages_is_what_imports_are_checked_by():
-    stated = {}
-    for cell, _, allowed in table_below(ARCHITECTURE, "packages"):
-        package = cell.strip("`")
-        above = set(NUMPY_PACKAGES[: NUMPY_PACKAGES.index(package)]) if package in NUMPY_PACKAGES else set()
-        stated[package] = set(re.findall(r"`(\w+)`", allowed))
-        if "numpy packages" in allowed:
-            stated[package] |= above if "above" in allowed else set(NUMPY_PACKAGES)
-    assert stated == ALLOWED
-
-
 def test_the_table_of_eigenvalues_is_what_the_rules_give():
     rows = table_below(MATHEMATICS, "eigenvalues")
     assert {row[0] for row in rows} == {"catmull_clark", "loop", "doo_sabin"}
     for name, cell, *stated in rows:
         scheme, valence = scheme_named(name), int(cell)
-        regular = regular_signature(scheme)
-        if scheme.element == "face":
-            signature = Signature("face", ((scheme.regular_face_size,) * valence, *regular.fans[1:]))
-        else:
-            signature = Signature("vertex", ((valence, *regular.fans[0][1:]),))
+        first, *others = regular_signature(scheme).fans
+        of_face = ((scheme.regular_face_size,) * valence, *others)
+        signature = Signature(scheme.element, of_face if scheme.element == "face" else ((valence, *first[1:]),))
         basis = irregular_patch(scheme, irregular_structure(scheme, signature)).basis
         second, fourth = basis.subdominant, basis.moduli[3]
         assert stated == [f"{value:.4f}" for value in (second, fourth / second, fourth / second**2)], (name, valence)
@@ -162,8 +144,3 @@ def test_formulas_survive_markdown(page):
         assert not re.search(r"\\[^A-Za-z]|[*`|]|[})\]]_\w", formula), formula
         assert formula.count("{") == formula.count("}"), formula
     assert "$" not in re.sub(r"\$[^$]+\$", "", rest)
-
-
-def test_the_citation_file_states_the_version():
-    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"version: {mitsuba_subdivision.__version__}\n" in text
