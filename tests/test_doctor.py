@@ -36,11 +36,14 @@ def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
     assert capsys.readouterr().out.endswith("there are PROBLEMS, listed above\n")
 
 
-def test_a_missing_package_is_told(monkeypatch):
+def test_a_missing_package_and_a_surface_at_the_wrong_place_are_told(monkeypatch):
     monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "unheard-of-package"))
     found = doctor.diagnose({})
     assert not found.healthy
     assert "unheard-of-package   MISSING" in str(found)
+    monkeypatch.setattr(doctor, "CUBE_HEIGHT", 0.84)
+    told = "the limit surface of a cube was rendered at the height 0.839506; expected 0.840000"
+    assert doctor._wrong_height(68 / 81) == told
 
 
 CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no signals here")
@@ -68,10 +71,3 @@ def test_a_library_that_is_none_is_told(monkeypatch, tmp_path):
     found = try_variant("llvm_ad_rgb")
     assert found.works is False
     assert found.problem.startswith(f'Dr.Jit could not use "{tmp_path}')
-
-
-def test_a_surface_at_the_wrong_place_is_told(monkeypatch):
-    monkeypatch.setattr(doctor, "CUBE_HEIGHT", 0.84)
-    assert doctor._wrong_height(68 / 81) == (
-        "the limit surface of a cube was rendered at the height 0.839506; expected 0.840000"
-    )

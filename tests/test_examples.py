@@ -13,10 +13,7 @@ def test_examples_are_found_from_any_folder(tmp_path, monkeypatch, name):
     assert Path(example_file(name)).is_file()
 
 
-def test_an_example_is_a_cage():
+def test_an_example_is_a_cage_and_a_missing_one_an_error_that_names_the_folders():
     assert len(ControlCage.from_file(example_file("cages/rook.obj")).positions) > 100
-
-
-def test_a_missing_example_is_an_error_that_names_the_folders():
     with pytest.raises(FileNotFoundError, match=r'there is no example "rook\.obj", neither in ".*scenes" nor in "'):
         example_file("rook.obj")

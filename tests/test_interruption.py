@@ -33,10 +33,15 @@ sys.exit(main(sys.argv[1:]))"""
 SAMPLES = "100000"
 
 
-def test_work_gives_its_result_or_its_error():
+def test_work_gives_its_result_or_its_error_and_another_thread_does_its_own():
     assert interruptible(lambda: 3) == 3
     with pytest.raises(ZeroDivisionError):
         interruptible(lambda: 1 / 0)
+    found = []
+    thread = threading.Thread(target=lambda: found.append(interruptible(threading.get_ident)))
+    thread.start()
+    thread.join()
+    assert found == [thread.ident]
 
 
 def test_ctrl_c_does_not_wait_for_the_work():
@@ -60,14 +65,6 @@ def test_ctrl_c_does_not_wait_for_the_work():
         signal.signal(signal.SIGINT, handler)
         end.set()
         presser.join()
-
-
-def test_another_thread_does_its_work_itself():
-    found = []
-    thread = threading.Thread(target=lambda: found.append(interruptible(threading.get_ident)))
-    thread.start()
-    thread.join()
-    assert found == [thread.ident]
 
 
 def test_work_that_ends_itself_by_an_interrupt_is_told(monkeypatch, capsys):

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from mitsuba_subdivision import llvm
 
-OLD_SYSTEM_LIBRARIES = [
-    path for path in sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM-1[56].so.1")) if llvm.lowest_version() == 17
-]
+OLD_SYSTEM_LIBRARIES = sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM-1[56].so.1"))
+TOO_OLD = OLD_SYSTEM_LIBRARIES and llvm.lowest_version() == 17
+NEEDS_TOO_OLD = pytest.mark.skipif(not TOO_OLD, reason="no LLVM that is too old")
+NEEDS_LLVM = pytest.mark.skipif(llvm.llvm_problem() is not None, reason="no usable LLVM")
 
 # Runs before the package, which chooses on import: hides the Python environment's libraries, sets the system's folder.
 HIDE = """
@@ -26,17 +27,14 @@ llvm._SYSTEM_FOLDERS = (os.environ["SYSTEM_FOLDER"],)
 
 
 def run(code, **environment):
-    clean = {
-        name: value for name, value in os.environ.items() if name not in (llvm.ENVIRONMENT_VARIABLE, "LD_LIBRARY_PATH")
-    }
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env={**clean, **environment},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    clean = {name: os.environ[name] for name in {*os.environ} - {llvm.ENVIRONMENT_VARIABLE, "LD_LIBRARY_PATH"}}
+    clean |= environment
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=clean, capture_output=True, text=True, timeout=120, check=False)
+
+
+def run_with_an_old_one(code):
+    return run(code, DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]))
 
 
 @pytest.fixture
@@ -105,14 +103,10 @@ def test_libraries_of_the_wheel_are_found_wherever_they_lie(monkeypatch, tmp_pat
 
 
 def test_without_the_wheel_nothing_is_imported_to_look_for_it(fresh):
-    found = run(
-        "import sys; sys.modules['importlib.metadata'] = None\n"
-        + HIDE.replace("import importlib.metadata, ", "import ").replace(
-            "llvm._wheel_libraries = lambda: []", "llvm._WHEEL = 'no-such-wheel'"
-        )
-        + "llvm.select_llvm()",
-        SYSTEM_FOLDER=str(fresh[1]),
-    )
+    hide = HIDE.replace("import importlib.metadata, ", "import ")
+    hide = hide.replace("llvm._wheel_libraries = lambda: []", "llvm._WHEEL = 'no-such-wheel'")
+    code = f"import sys; sys.modules['importlib.metadata'] = None\n{hide}llvm.select_llvm()"
+    found = run(code, SYSTEM_FOLDER=str(fresh[1]))
     assert found.returncode == 0, found.stderr
 
 
@@ -125,10 +119,12 @@ def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
     assert sorted(found) == [str(tmp_path / f"llvm-{version}/lib/libLLVM-{version}.so") for version in (18, 19)]
 
 
-def test_newest_of_the_system(fresh):
-    _, system = fresh
+def test_the_newest_of_the_system_is_chosen_and_no_file_that_is_no_library(fresh):
+    (fresh[1] / "libLLVM.so").touch()
+    assert llvm.select_llvm().path is None
     for name in ("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1"):
-        (system / name).touch()
+        (fresh[1] / name).touch()
+    llvm.select_llvm.cache_clear()
     assert llvm.select_llvm().version == 19
 
 
@@ -154,11 +150,6 @@ def test_nothing_found_leaves_the_search_to_drjit():
     assert llvm.ENVIRONMENT_VARIABLE not in os.environ
 
 
-def test_a_file_that_is_no_library_is_passed_over(fresh):
-    (fresh[1] / "libLLVM.so").touch()
-    assert llvm.select_llvm().path is None
-
-
 def test_users_own_setting_stands(fresh, monkeypatch):
     (fresh[0] / "libLLVM.so.19.1").touch()
     monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/opt/libLLVM-15.so")
@@ -173,13 +164,15 @@ def test_what_a_parent_process_did_not_find_is_looked_for_again(fresh, monkeypat
     assert llvm.select_llvm().version == 19
 
 
-@pytest.mark.skipif(llvm.llvm_problem() is not None, reason="no usable LLVM")
-def test_llvm_runs_maximum_and_is_the_best_variant():
+@NEEDS_LLVM
+def test_a_good_library_runs_maximum_is_the_best_variant_and_does_not_warn():
     done = run(
         "from mitsuba_subdivision.llvm import best_variant; import mitsuba as mi, drjit as dr;"
         "mi.set_variant(best_variant()); print(mi.variant(), dr.maximum(mi.Float([1, 4]), mi.Float(2)))"
     )
     assert done.stdout.strip() == "llvm_ad_rgb [2, 4]", done.stderr
+    done = run("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.skipif(llvm.lowest_version() != 17, reason="old LLVM works on this processor")
@@ -201,44 +194,40 @@ def test_without_a_usable_library_variants_fail_with_an_exception(tmp_path):
     assert llvm.ENVIRONMENT_VARIABLE in line
 
 
-@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+# Mitsuba before the package, which then comes too late.
+LATE = "import mitsuba as mi, os; del os.environ['DRJIT_LIBLLVM_PATH'];"
+TOO_LATE = "import mitsuba_subdivision before mitsuba and drjit"
+
+
+@NEEDS_TOO_OLD
 @pytest.mark.parametrize(
     ("code", "message"),
     [
         ("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')", "(DRJIT_LIBLLVM_PATH is set)"),
-        (
-            "import mitsuba as mi, os; del os.environ['DRJIT_LIBLLVM_PATH']; import mitsuba_subdivision;"
-            "mi.set_variant('scalar_rgb'); mi.set_variant('llvm_ad_rgb')",
-            "import mitsuba_subdivision before mitsuba and drjit",
-        ),
-        (
-            "import mitsuba as mi, os; del os.environ['DRJIT_LIBLLVM_PATH']; mi.set_variant('llvm_ad_rgb');"
-            "import mitsuba_subdivision",
-            "import mitsuba_subdivision before mitsuba and drjit",
-        ),
+        (f"{LATE} import mitsuba_subdivision; mi.set_variant('scalar_rgb'); mi.set_variant('llvm_ad_rgb')", TOO_LATE),
+        (f"{LATE} mi.set_variant('llvm_ad_rgb'); import mitsuba_subdivision", TOO_LATE),
     ],
     ids=["user's setting", "imported late", "imported after set_variant"],
 )
 def test_a_library_that_aborts_is_warned_of_once_an_llvm_variant_is_set(code, message):
-    done = run(code, DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]))
+    done = run_with_an_old_one(code)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("which aborts the process, and needs 17 or newer") == 1
     assert message in done.stderr
 
 
-@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+@NEEDS_TOO_OLD
 def test_the_shape_is_an_error_where_its_kernels_would_abort():
     cage = Path(__file__).parents[1] / "scenes" / "cages" / "valence3.obj"
-    done = run(
+    done = run_with_an_old_one(
         "import mitsuba as mi, mitsuba_subdivision; mi.set_variant('llvm_ad_rgb');"
-        f"mi.load_dict({{'type': 'subdivision', 'filename': {str(cage)!r}}})",
-        DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]),
+        f"mi.load_dict({{'type': 'subdivision', 'filename': {str(cage)!r}}})"
     )
     assert done.returncode == 1
     assert "RuntimeError: Dr.Jit has loaded LLVM" in done.stderr
 
 
-@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+@NEEDS_TOO_OLD
 @pytest.mark.parametrize(
     "code",
     [
@@ -253,29 +242,19 @@ def test_the_shape_is_an_error_where_its_kernels_would_abort():
 )
 def test_what_runs_kernels_is_an_error_where_they_would_abort(code):
     """Earlier, the first evaluation of `on_device` ended the process."""
-    done = run(
-        "import mitsuba as mi, numpy as np, os; del os.environ['DRJIT_LIBLLVM_PATH']\n"
+    done = run_with_an_old_one(
+        f"{LATE} import numpy as np\n"
         "from mitsuba_subdivision import LimitSurface, usd_scene\n"
         "from mitsuba_subdivision.cage.named_cages import cube\n"
         "from mitsuba_subdivision.device_arrays import upload; from mitsuba_subdivision.variants import set_variant\n"
-        f"mi.set_variant('llvm_ad_rgb'); from mitsuba_subdivision import fit\n{code}",
-        DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]),
+        f"mi.set_variant('llvm_ad_rgb'); from mitsuba_subdivision import fit\n{code}"
     )
     assert done.returncode == 1
     assert "RuntimeError: Dr.Jit has loaded LLVM" in done.stderr
-    assert "import mitsuba_subdivision before mitsuba and drjit" in done.stderr
+    assert TOO_LATE in done.stderr
 
 
-@pytest.mark.skipif(not OLD_SYSTEM_LIBRARIES, reason="no LLVM that is too old")
+@NEEDS_TOO_OLD
 def test_a_library_that_aborts_does_not_matter_to_scalar_variants():
-    done = run(
-        "import mitsuba_subdivision, mitsuba as mi; mi.set_variant('scalar_rgb')",
-        DRJIT_LIBLLVM_PATH=str(OLD_SYSTEM_LIBRARIES[-1]),
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.skipif(llvm.llvm_problem() is not None, reason="no usable LLVM")
-def test_good_library_does_not_warn():
-    done = run("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')")
+    done = run_with_an_old_one("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('scalar_rgb')")
     assert (done.returncode, done.stderr) == (0, "")

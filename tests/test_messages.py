@@ -1,7 +1,5 @@
 """What the command line tells of wrong input: one line, without tracebacks."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import os
@@ -21,18 +19,25 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
         <integer name="height" value="4"/></film></sensor>
     <shape type="subdivision"><string name="filename" value="cube.obj"/>{}</shape>
 </scene>"""
+PLAIN = SCENE.format("")
+RENDER = ["render", "scene.xml", "-o", "picture.exr"]
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     cube().save(tmp_path / "cube.obj")
+    (tmp_path / "scene.xml").write_text(PLAIN)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
+def render(*more):
+    return main([*RENDER, "--variant", "scalar_rgb", *more])
+
+
 def test_errors_of_a_shape_in_a_scene_have_no_traceback(folder, capsys):
     (folder / "scene.xml").write_text(SCENE.format('<string name="scheme" value="loop"/>'))
-    assert main(["render", "scene.xml", "-o", "picture.exr", "--variant", "scalar_rgb"]) == 1
+    assert render() == 1
     told = capsys.readouterr().err
     assert told.startswith("mitsuba-subdivision: error:")
     assert told.endswith("numbers count from 1)\n")
@@ -42,20 +47,19 @@ def test_errors_of_a_shape_in_a_scene_have_no_traceback(folder, capsys):
 
 
 def test_a_scene_without_an_integrator_is_told(folder, capsys):
-    (folder / "scene.xml").write_text(SCENE.format("").replace('<integrator type="direct"/>', ""))
-    assert main(["render", "scene.xml", "-o", "picture.exr", "--variant", "scalar_rgb"]) == 1
+    (folder / "scene.xml").write_text(PLAIN.replace('<integrator type="direct"/>', ""))
+    assert render() == 1
     assert capsys.readouterr().err.endswith('error: scene "scene.xml" has no integrator; expected one\n')
 
 
 def test_warnings_name_no_place_in_the_code(folder, capsys):
     with (folder / "cube.obj").open("a") as file:
         file.write("t unheard 0/0/0\n")
-    (folder / "scene.xml").write_text(SCENE.format(""))
-    expected = 'mitsuba-subdivision: warning: "{}cube.obj", line 16: tag "unheard 0/0/0" is not supported'
+    expected = 'cube.obj", line 16: tag "unheard 0/0/0" is not supported'
     assert main(["info", "cube.obj"]) == 0
-    assert capsys.readouterr().err.startswith(expected.format(""))
-    assert main(["render", "scene.xml", "-o", "picture.exr", "--variant", "scalar_rgb", "--spp", "1"]) == 0
-    assert 'cube.obj", line 16: tag "unheard 0/0/0" is not supported' in capsys.readouterr().err
+    assert capsys.readouterr().err.startswith(f'mitsuba-subdivision: warning: "{expected}')
+    assert render("--spp", "1") == 0
+    assert expected in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -82,16 +86,13 @@ def test_saving_into_a_missing_folder_is_told_by_its_name(suffix):
         cube().save(f"missing/cube.{suffix}")
 
 
-RENDER = ["render", "scene.xml", "-o", "picture.exr"]
+NEEDS_PASSES = "--batch is for passes; expected --pass, --passes, --dask or --reference beside it"
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (
-            [*RENDER, "--batch", "4"],
-            "--batch is for passes; expected --pass, --passes, --dask or --reference beside it",
-        ),
+        ([*RENDER, "--batch", "4"], NEEDS_PASSES),
         ([*RENDER, "--tolerance", "alpha=0.1"], "--tolerance is stored with a reference; expected --reference"),
         ([*RENDER, "--filter", "foo"], 'Plugin "foo" not found'),
         (["render", "scene.xml", "-o", "picture.tif"], "expected a name ending in one of .exr, .png, .jpg, .hdr"),
@@ -106,7 +107,6 @@ RENDER = ["render", "scene.xml", "-o", "picture.exr"]
     ],
 )
 def test_what_does_nothing_or_harm_is_refused(folder, capsys, words, message):
-    (folder / "scene.xml").write_text(SCENE.format(""))
     before = sorted(folder.iterdir())
     assert main([*words, *(["--variant", "scalar_rgb"] if words[0] == "render" else [])]) == 1
     told = capsys.readouterr().err
@@ -115,16 +115,15 @@ def test_what_does_nothing_or_harm_is_refused(folder, capsys, words, message):
     assert sorted(folder.iterdir()) == before
 
 
-def test_a_variant_that_does_not_run_is_one_line(folder, capsys, monkeypatch):
+@pytest.mark.usefixtures("folder")
+def test_a_variant_that_does_not_run_is_one_line(capsys, monkeypatch):
     monkeypatch.setattr("drjit.has_backend", lambda _: False)
-    (folder / "scene.xml").write_text(SCENE.format(""))
     assert main([*RENDER, "--variant", "cuda_ad_rgb"]) == 1
     expected = "mitsuba-subdivision: error: variant cuda_ad_rgb needs an NVIDIA GPU, and Dr.Jit finds none\n"
     assert capsys.readouterr().err == expected
 
 
 def test_no_render_begins_for_an_output_that_cannot_be(folder, capsys, monkeypatch):
-    (folder / "scene.xml").write_text(SCENE.format(""))
     (folder / "a.exr").mkdir()
     monkeypatch.setattr(mi, "render", lambda *_, **__: pytest.fail("rendered"))
     for output, message in (
@@ -133,7 +132,7 @@ def test_no_render_begins_for_an_output_that_cannot_be(folder, capsys, monkeypat
         ("/proc/b.exr", 'output "/proc/b.exr": '),
     ):
         for more in ([], ["--passes", "2"]):
-            assert main(["render", "scene.xml", "-o", output, "--variant", "scalar_rgb", *more]) == 1
+            assert render("-o", output, *more) == 1
             assert message in capsys.readouterr().err
 
 
@@ -142,18 +141,16 @@ def test_a_picture_of_the_scene_is_no_output(folder, capsys, more):
     light = folder / "light.exr"
     write_exr(light, np.ones((2, 4, 3)))
     emitter = '</shape><emitter type="envmap"><string name="filename" value="light.exr"/></emitter>'
-    (folder / "scene.xml").write_text(SCENE.format("").replace("</shape>", emitter))
+    (folder / "scene.xml").write_text(PLAIN.replace("</shape>", emitter))
     before = light.read_bytes()
-    assert main(["render", "scene.xml", "-o", str(light), "--variant", "scalar_rgb", "--spp", "2", *more]) == 1
+    assert render("-o", str(light), "--spp", "2", *more) == 1
     assert "is an input as well; expected another file" in capsys.readouterr().err
     assert light.read_bytes() == before
 
 
 def test_every_command_makes_the_folder_of_its_output(folder):
-    (folder / "scene.xml").write_text(SCENE.format(""))
-    common = ["--variant", "scalar_rgb", "--spp", "2"]
     picture = str(folder / "a" / "b" / "picture.exr")
-    assert main(["render", "scene.xml", "-o", picture, *common, "--passes", "1"]) == 0
+    assert render("-o", picture, "--spp", "2", "--passes", "1") == 0
     assert main(["merge", picture, "-o", "c/d/merged.exr"]) == 0
     assert main(["compare", picture, "c/d/merged.exr", "--json", "e/f.json", "--html", "g/h"]) == 0
     assert main(["tessellate", "cube.obj", "-o", "i/j/cube.ply"]) == 0
@@ -163,9 +160,8 @@ def test_every_command_makes_the_folder_of_its_output(folder):
 
 
 def test_names_of_formats_may_have_capital_letters(folder):
-    (folder / "scene.xml").write_text(SCENE.format(""))
     for name, start in (("A.EXR", b"v/1\x01"), ("A.PNG", b"\x89PNG"), ("A.JPG", b"\xff\xd8\xff")):
-        assert main(["render", "scene.xml", "-o", name, "--variant", "scalar_rgb", "--spp", "1"]) == 0
+        assert render("-o", name, "--spp", "1") == 0
         assert (folder / name).read_bytes().startswith(start)
 
 
@@ -194,12 +190,9 @@ def test_a_closed_pipe_is_no_error(folder, words):
     assert not done.stderr
 
 
-def test_the_reason_is_told_that_a_message_refers_to(capsys):
-    reason = RuntimeError("the texture is odd")
-    error = RuntimeError("drjit.custom(<op>): error while performing a custom differentiable operation. (see above).")
-    error.__cause__ = reason
-    print_error(error)
-    assert capsys.readouterr().err == "mitsuba-subdivision: error: the texture is odd\n"
+# The reason is told that its message refers to.
+CAUSED = RuntimeError("drjit.custom(<op>): error while performing a custom differentiable operation. (see above).")
+CAUSED.__cause__ = RuntimeError("the texture is odd")
 
 
 @pytest.mark.parametrize(
@@ -209,6 +202,7 @@ def test_the_reason_is_told_that_a_message_refers_to(capsys):
         (OSError(errno.EROFS, "Read-only file system", "a.exr"), '"a.exr": Read-only file system'),
         (MemoryError(), "there is not enough memory"),
         (ValueError("wrong"), "wrong"),
+        (CAUSED, "the texture is odd"),
     ],
 )
 def test_errors_are_sentences(capsys, error, told):

@@ -22,15 +22,11 @@ def terminal(monkeypatch):
     return replaced
 
 
-def test_a_line_counts_and_is_wiped(terminal):
+def test_a_line_counts_and_is_wiped_and_messages_stand_on_lines_of_their_own(terminal):
     stream = terminal(Terminal())
     assert list(progress.counted("abc", "Letters")) == ["a", "b", "c"]
     assert "Letters" in stream.getvalue()
     assert not stream.getvalue().split("\r")[-1].strip()
-
-
-def test_messages_stand_on_lines_of_their_own(terminal):
-    stream = terminal(Terminal())
     for letter in progress.counted("ab", "Letters"):
         print_remark(letter)
     assert all(f"\r\x1b[Kmitsuba-subdivision: {letter}\n" in stream.getvalue() for letter in "ab")

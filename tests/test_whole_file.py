@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -119,11 +120,8 @@ def test_two_processes_write_one_file_without_mixing(tmp_path):
 
 def test_threads_write_one_file_without_mixing(tmp_path):
     path = tmp_path / "a.txt"
-    threads = [threading.Thread(target=write, args=(path, letter * 1000)) for letter in "abcdefgh"]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, [path] * 8, [letter * 1000 for letter in "abcdefgh"]))
     text = path.read_text()
     assert text == text[0] * 1000
     assert names(tmp_path) == ["a.txt"]
@@ -214,10 +212,6 @@ def test_inputs_are_refused_as_outputs(tmp_path):
     assert names(tmp_path / "new") == []
 
 
-def environment():
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-
-
 FULL = """
 import resource, sys
 import numpy as np
@@ -256,11 +250,9 @@ for name, write in writers.items():
 
 @pytest.mark.posix
 def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path):
-    pytest.importorskip("pxr")
-    pytest.importorskip("plyfile")
-    pytest.importorskip("matplotlib")
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, str(tmp_path)], capture_output=True, text=True, check=True, env=environment()
-    )
+    for package in ("pxr", "plyfile", "matplotlib"):
+        pytest.importorskip(package)
+    command, environment = [sys.executable, "-c", FULL, str(tmp_path)], {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **environment})
     kinds = ["a.exr", "b.exr", "b.hdr", "c.png", *(f"{c}.{s}" for c in "de" for s in ("obj", "ply", "usda", "usdc"))]
     assert done.stdout.splitlines() == [f"{name} old 1 True False" for name in kinds], done.stderr

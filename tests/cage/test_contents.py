@@ -6,23 +6,17 @@ from mitsuba_subdivision.cage import Attribute, CageError, ControlCage
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.cage.rules import RULES
+from reference.refined_cages import tagged
 
 
 def test_a_cage_of_its_own_contents_is_the_same(np_rng):
     base = extraordinary(5, closed=False)
-    corner_count = len(base.face_vertices)
-    cage = ControlCage.from_arrays(
-        base.positions,
-        base.face_sizes,
-        base.face_vertices,
-        creases=[(0, 1, 0.3), (0, 2, 12)],
-        corners=[(3, 1 / 3)],
-        holes=[4, 2],
-        texcoords=Attribute(np_rng.random((7, 2)), "face_varying", np_rng.integers(7, size=corner_count)),
-        attributes={"weight": np_rng.random((base.vertex_count, 1))},
-        scheme="loop",
-        **{rule: values[-1] for rule, values in RULES.items()},
-    )
+    indices = np_rng.integers(7, size=len(base.face_vertices))
+    values = {"texcoords": Attribute(np_rng.random((7, 2)), "face_varying", indices)}
+    values["attributes"] = {"weight": np_rng.random((base.vertex_count, 1))}
+    tags = {"creases": [(0, 1, 0.3), (0, 2, 12)], "corners": [(3, 1 / 3)], "holes": [4, 2]}
+    rules = {rule: values[-1] for rule, values in RULES.items()}
+    cage = tagged(base, **tags, **values, **rules, scheme="loop")
     again = ControlCage.from_arrays(**cage.contents.as_arguments())
     for name in ("positions", "face_sizes", "face_vertices", "holes"):
         np.testing.assert_array_equal(getattr(again, name), getattr(cage, name))
@@ -59,30 +53,22 @@ def test_given_arrays_are_not_copied_before_a_cage_takes_them():
     values = np.zeros((8, 2))
     attribute = Attribute(values)
     assert attribute.values is values
-    box = cube()
-    cage = ControlCage.from_arrays(box.positions, box.face_sizes, box.face_vertices, texcoords=attribute)
+    cage = tagged(cube(), texcoords=attribute)
     values[:] = 7
     np.testing.assert_array_equal(cage.texcoords.values, 0)
 
 
-def test_rows_of_different_lengths_are_an_error_with_the_name_of_the_attribute():
-    box = cube()
-    with pytest.raises(CageError, match=r'attribute "age" has values that are no table of numbers: .*inhomogeneous'):
-        ControlCage.from_arrays(
-            box.positions, box.face_sizes, box.face_vertices, attributes={"age": Attribute([[1], [2, 3]])}
-        )
+RAGGED = Attribute(np.zeros((2, 1)), "face_varying", [[0, 1], [0]])
 
 
-def test_indices_of_different_lengths_are_an_error_with_the_name_of_the_attribute():
-    box = cube()
-    age = Attribute(np.zeros((2, 1)), "face_varying", [[0, 1], [0]])
-    with pytest.raises(CageError, match=r'attribute "age" has indices of .*; expected 24 integers, one per face'):
-        ControlCage.from_arrays(box.positions, box.face_sizes, box.face_vertices, attributes={"age": age})
-
-
-def test_texture_coordinates_among_attributes_are_an_error():
-    box = cube()
-    with pytest.raises(CageError, match='control cage: an attribute is called "texcoords"; expected another name'):
-        ControlCage.from_arrays(
-            box.positions, box.face_sizes, box.face_vertices, attributes={"texcoords": np.zeros((8, 2))}
-        )
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"age": Attribute([[1], [2, 3]])}, '"age" has values that are no table of numbers: .*inhomogeneous'),
+        ({"age": RAGGED}, 'attribute "age" has indices of .*; expected 24 integers, one per face'),
+        ({"texcoords": np.zeros((8, 2))}, 'control cage: an attribute is called "texcoords"; expected another name'),
+    ],
+)
+def test_malformed_attributes_are_errors_with_their_names(attributes, message):
+    with pytest.raises(CageError, match=message):
+        tagged(cube(), attributes=attributes)

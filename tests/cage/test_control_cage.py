@@ -8,6 +8,7 @@ import pytest
 from mitsuba_subdivision import Attribute
 from mitsuba_subdivision.cage import CageError, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube, torus
+from reference.refined_cages import tagged
 
 
 def assert_same(cage, other):
@@ -26,12 +27,9 @@ def test_all_forms_of_faces_agree():
     assert (cage.vertex_count, cage.face_count) == (8, 6)
     assert cage.positions.dtype == np.float64
     assert (cage.face_sizes.dtype, cage.face_vertices.dtype) == (np.int64, np.int32)
-
-
-def test_faces_of_mixed_sizes():
-    cage = ControlCage(np.zeros((5, 3)), [[0, 1, 2, 3], (1, 0, 4)])
-    np.testing.assert_array_equal(cage.face_sizes, [4, 3])
-    np.testing.assert_array_equal(cage.face_vertices, [0, 1, 2, 3, 1, 0, 4])
+    mixed = ControlCage(np.zeros((5, 3)), [[0, 1, 2, 3], (1, 0, 4)])
+    np.testing.assert_array_equal(mixed.face_sizes, [4, 3])
+    np.testing.assert_array_equal(mixed.face_vertices, [0, 1, 2, 3, 1, 0, 4])
 
 
 def test_cage_is_immutable():
@@ -48,21 +46,16 @@ def test_inputs_are_copied():
     positions, sizes, vertices = np.eye(3), np.array([3]), np.array([0, 1, 2])
     cage = ControlCage.from_arrays(positions, sizes, vertices)
     positions[:], sizes[:], vertices[:] = 7, 7, 7
-    np.testing.assert_array_equal(cage.positions, np.eye(3))
-    np.testing.assert_array_equal(cage.face_sizes, [3])
-    np.testing.assert_array_equal(cage.face_vertices, [0, 1, 2])
+    assert_same(cage, ControlCage(np.eye(3), [[0, 1, 2]]))
 
 
-def test_cages_compare_by_identity():
+def test_cages_compare_by_identity_and_are_told_by_source_and_sizes():
     cage, other = cube(), cube()
     same = cage
     assert cage == same
     assert cage != other
     assert len({cage, same, other}) == 2
-
-
-def test_repr_names_source_and_sizes():
-    assert repr(cube()) == "ControlCage(cube, 8 vertices, 6 faces)"
+    assert repr(cage) == "ControlCage(cube, 8 vertices, 6 faces)"
 
 
 class NamedCage(ControlCage):
@@ -115,11 +108,6 @@ def test_unknown_formats_name_the_known_ones(name, tmp_path):
         cube().save(tmp_path / name)
 
 
-def test_missing_file_is_an_os_error(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"missing\.obj"):
-        ControlCage.from_file(tmp_path / "missing.obj")
-
-
 def test_validation_errors_of_a_file_name_its_line(obj_file):
     path = obj_file("# cube\nv 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 3\nf 1 2 \\\n 3\n")
     with pytest.raises(CageError, match=r'cube\.obj", line 6: face 1 and face 2 \(line 7\) .* edge \(1, 2\)'):
@@ -130,13 +118,9 @@ def test_properties_are_mitsuba_tensors():
     mi = mitsuba.scalar_rgb
     cage = torus(3, 4)
     properties = cage.as_properties(mi)
-    assert isinstance(properties["positions"], mi.TensorXd)
-    assert isinstance(properties["face_sizes"], mi.TensorXu)
-    assert isinstance(properties["face_vertices"], mi.TensorXu)
-    again = ControlCage.from_arrays(**properties)
-    np.testing.assert_array_equal(again.positions, cage.positions)
-    np.testing.assert_array_equal(again.face_sizes, cage.face_sizes)
-    np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)
+    types = {"positions": mi.TensorXd, "face_sizes": mi.TensorXu, "face_vertices": mi.TensorXu}
+    assert {name: type(properties[name]) for name in types} == types
+    assert_same(ControlCage.from_arrays(**properties), cage)
 
 
 def test_bare_arrays_have_a_row_for_each_vertex(np_rng):
@@ -161,21 +145,19 @@ def test_bare_arrays_have_a_row_for_each_vertex(np_rng):
 )
 def test_attributes_of_a_wrong_type_are_an_error(options, message):
     with pytest.raises(CageError, match=message):
-        ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), **options)
+        tagged(cube(), **options)
 
 
-def test_a_path_of_a_wrong_type_is_an_error():
+def test_a_path_of_a_wrong_type_or_to_no_file_is_an_error(tmp_path):
     for call in (ControlCage.from_file, cube().save):
         with pytest.raises(CageError, match="path 3; expected a str or Path"):
             call(3)
+    with pytest.raises(FileNotFoundError, match=r"missing\.obj"):
+        ControlCage.from_file(tmp_path / "missing.obj")
 
 
 def test_more_indices_than_corners_are_refused_before_they_are_copied():
     # They would take 800 GB.
     indices = np.broadcast_to(0, 10**11)
     with pytest.raises(CageError, match=r"indices of shape \(100000000000,\).*; expected 24 integers"):
-        ControlCage(
-            cube().positions,
-            cube().face_vertices.reshape(-1, 4),
-            texcoords=Attribute([[0, 0]], "face_varying", indices),
-        )
+        tagged(cube(), texcoords=Attribute([[0, 0]], "face_varying", indices))

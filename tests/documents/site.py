@@ -14,14 +14,8 @@ def test_the_documentation_is_built_without_warnings(tmp_path):
     """One site: the README begins it, and guide, formulas, notebooks and API reference lead to each other."""
     assert f"\n{SPHINX} " in (ROOT / "plugin" / "CONTRIBUTING.md").read_text(encoding="utf-8")
     *command, source = SPHINX.split()[1:]
-    done = subprocess.run(
-        [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    words = [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
 
     def page(name):

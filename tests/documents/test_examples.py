@@ -12,8 +12,6 @@ A comment above a block says where it runs in another way here:
 - ``test command`` is for `.ci/run`.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import re
@@ -32,6 +30,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.rules import RULES
+from mitsuba_subdivision.figures import FIGURES
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
 from mitsuba_subdivision.regression.tiers import TIERS
@@ -44,12 +43,8 @@ else:
 
 ROOT = Path(__file__).resolve().parents[2]
 PLUGIN, GUIDE = ROOT / "plugin", ROOT / "plugin" / "guide"
-PAGES = [
-    ROOT / "README.md",
-    *sorted(GUIDE.glob("*.md")),
-    PLUGIN / "CONTRIBUTING.md",
-    *sorted((ROOT / ".github").glob("*.md")),
-]
+PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md")), PLUGIN / "CONTRIBUTING.md"]
+PAGES += sorted((ROOT / ".github").glob("*.md"))
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 BLOCK = re.compile(
     r"^(?: *<!-- (?P<mark>[^\n]+) -->\n)? *```(?P<language>\w*)\n(?P<text>.*?)^ *```$", flags=re.MULTILINE | re.DOTALL
@@ -132,16 +127,10 @@ class Block(NamedTuple):
 
 def blocks(page):
     text = page.read_text(encoding="utf-8")
-    found = [
-        Block(
-            page,
-            text.count("\n", 0, match.start("text")) + 1,
-            match["mark"] or "",
-            match["language"],
-            textwrap.dedent(match["text"]),
-        )
-        for match in BLOCK.finditer(text)
-    ]
+    found = []
+    for match in BLOCK.finditer(text):
+        line, mark = text.count("\n", 0, match.start("text")) + 1, match["mark"] or ""
+        found.append(Block(page, line, mark, match["language"], textwrap.dedent(match["text"])))
     assert [block.mark for block in found if not MARK.fullmatch(block.mark)] == []
     # None was missed.
     assert 2 * len(found) == len(re.findall(r"^ *```", text, flags=re.MULTILINE))
@@ -181,9 +170,8 @@ def run_as_tests(block, folder):
     """Run a block as a file of tests, which first write their references."""
     (folder / "scenes" / "my_scene.xml").write_text(SCENE)
     (folder / "test_example.py").write_text(block.text)
-    done = subprocess.run(
-        [sys.executable, "-c", PYTEST_TWICE], capture_output=True, text=True, timeout=120, check=False
-    )
+    command = [sys.executable, "-c", PYTEST_TWICE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.count("1 passed") == 2, done.stdout + done.stderr
     assert list((folder / "renders" / "references").iterdir()) == [folder / "renders" / "references" / "my_scene.exr"]
 
@@ -210,15 +198,7 @@ def requirements(extra):
     """Names of the packages that an extra brings, with those of the extras that it names."""
     for requirement in EXTRAS[extra]:
         name, _, extras = re.match(r"([\w.-]+)(\[([\w,]+)\])?", requirement).groups(default="")
-        if name == OURS:
-            for other in extras.split(","):
-                yield from requirements(other)
-        else:
-            yield name
-
-
-def script_options(words):
-    return {word for word in words if word.startswith("--")}
+        yield from itertools.chain(*map(requirements, extras.split(","))) if name == OURS else [name]
 
 
 def check_scripts(scripts):
@@ -227,21 +207,14 @@ def check_scripts(scripts):
     for path, *words in scripts:
         program = ROOT / path / "__main__.py" if (ROOT / path).is_dir() else ROOT / path
         has_options = "argparse" in program.read_text(encoding="utf-8")
-        assert has_options or not script_options(words), path
+        assert has_options or not any(word.startswith("--") for word in words), path
         arguments += [path, "__main__" if has_options else "imported"]
-    done = subprocess.run(
-        [sys.executable, "-c", HELP_OF_SCRIPTS, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "COLUMNS": "200"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    command, wide = [sys.executable, "-c", HELP_OF_SCRIPTS, *arguments], {**os.environ, "COLUMNS": "200"}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    done = subprocess.run(command, cwd=ROOT, env=wide, timeout=120, check=False, **streams)
     assert done.returncode == 0, done.stdout
     for (path, *words), said in zip(scripts, done.stdout.split(END_OF_HELP)[:-1], strict=True):
-        assert [option for option in script_options(words) if option not in said] == [], path
+        assert [word for word in words if word.startswith("--") and word not in said] == [], path
 
 
 def module(words):
@@ -334,9 +307,8 @@ def test_pages_have_blocks_of_every_kind():
     assert {block.language for block in found} == {"python", "sh", "xml", "bibtex"}
     commands = [words for block in found if block.language == "sh" for words in block.commands]
     assert len(commands) > 25
-    assert {words[1] for words in commands if words[0] == OURS} == {
-        "compare", "doctor", "figure", "info", "merge", "render", "tessellate"
-    }  # fmt: skip
+    ours = {words[1] for words in commands if words[0] == OURS}
+    assert ours == {"compare", "doctor", "figure", "info", "merge", "render", "tessellate"}
 
 
 @pytest.mark.parametrize(
@@ -360,21 +332,15 @@ def test_wrong_examples_are_found(text, error, folder):
 
 
 @EVERY_PAGE
-def test_every_option_in_the_text_of_a_page_is_an_option(page):
-    """Of the command line, of pytest with this package, or of a script of the tests."""
-    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    options = {option for code in re.findall(r"`([^`]+)`", text) for option in re.findall(r"--[a-z-]+", code)}
-    sources = [*PLUGIN.rglob("*.py"), *(ROOT / "tests").rglob("*.py")]
-    sources.append(ROOT / "scenes" / "export_cage.py")
-    known = {option for path in sources for option in re.findall(r'"(--[a-z-]+)"', path.read_text(encoding="utf-8"))}
-    assert sorted(options - known) == []
-
-
-@EVERY_PAGE
-def test_every_picture_of_a_page_is_there(page):
-    """Those of HTML, which has their size; other tests follow the links of Markdown."""
+def test_every_picture_of_a_page_is_there_and_every_option_in_its_text_is_one(page):
+    """Of the command line, of pytest with this package, or of a script; other tests follow the links of Markdown."""
     sources = re.findall(r'<img src="([^"]+)"', page.read_text(encoding="utf-8"))
     assert [source for source in sources if not (page.parent / source).is_file()] == []
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    options = {option for code in re.findall(r"`([^`]+)`", text) for option in re.findall(r"--[a-z-]+", code)}
+    sources = [*PLUGIN.rglob("*.py"), *(ROOT / "tests").rglob("*.py"), ROOT / "scenes" / "export_cage.py"]
+    known = {option for path in sources for option in re.findall(r'"(--[a-z-]+)"', path.read_text(encoding="utf-8"))}
+    assert sorted(options - known) == []
 
 
 def rows_below(page, mark):
@@ -387,9 +353,7 @@ def named(cell):
     return re.findall(r"`([^`]+)`", cell)
 
 
-@pytest.mark.parametrize(
-    ("mark", "parameters"), [("parameters", PARAMETERS), ("state parameters", STATE_PARAMETERS)], ids=["given", "state"]
-)
+@pytest.mark.parametrize(("mark", "parameters"), [("parameters", PARAMETERS), ("state parameters", STATE_PARAMETERS)])
 def test_the_tables_of_parameters_are_those_of_the_shape(mark, parameters):
     lines = ["| Parameter | Type | Description | Flags |", "|---|---|---|---|"]
     signs = {"exposed": "P", "readonly": "R", "differentiable": "∂", "discontinuous": "D"}
@@ -423,17 +387,12 @@ def test_statements_of_the_table_of_tags_mean_what_it_says():
     assert contents["rules"].keys() == RULES.keys()
 
 
-def test_the_table_of_tiers_has_every_tier():
+def test_the_tables_of_tiers_and_of_figures_have_all_and_their_formats_and_options():
     assert [named(row[0])[0] for row in rows_below(GUIDE / "comparing-renders.md", "tiers")] == list(TIERS)
-
-
-def test_the_table_of_figures_has_their_formats_and_options():
-    from mitsuba_subdivision.figures import FIGURES
-
-    stated = {
-        named(name)[0]: (tuple(formats.split(", ")), tuple(option.removeprefix("--") for option in named(options)))
-        for name, _, formats, options in rows_below(GUIDE / "figures.md", "figures")
-    }
+    stated = {}
+    for name, _, formats, options in rows_below(GUIDE / "figures.md", "figures"):
+        words = tuple(option.removeprefix("--") for option in named(options))
+        stated[named(name)[0]] = tuple(formats.split(", ")), words
     assert stated == {name: (figure.formats, figure.options) for name, figure in FIGURES.items()}
 
 

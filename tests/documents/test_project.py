@@ -88,25 +88,18 @@ def test_the_newest_mitsuba_is_tested_as_the_readme_says():
 
 
 def test_packages_are_pinned_as_the_text_says():
-    text = read("plugin/ARCHITECTURE.md")
-    mitsuba, drjit = re.search(r"Mitsuba ([\d.]+) and Dr\.Jit ([\d.]+), which `pyproject\.toml` pins", text).groups()
-
-    def after(version):
+    pinned = re.compile(r"Mitsuba ([\d.]+) and Dr\.Jit ([\d.]+), which `pyproject\.toml` pins")
+    versions = pinned.search(read("plugin/ARCHITECTURE.md")).groups()
+    for package, version in zip(("mitsuba", "drjit"), versions, strict=True):
         major, minor = map(int, version.split(".")[:2])
-        return f"{major}.{minor + 1}"
-
-    assert requirement("mitsuba") == f">={mitsuba},<{after(mitsuba)}"
-    assert requirement("drjit") == f">={drjit},<{after(drjit)}"
+        assert requirement(package) == f">={version},<{major}.{minor + 1}"
 
 
-def test_the_changelog_and_the_citation_have_the_version_and_its_day():
+def test_the_changelog_and_the_citation_have_the_version_and_its_day_and_the_usual_headings():
     (day,) = re.findall(rf"^## {re.escape(VERSION)} - (\d{{4}}-\d\d-\d\d)$", read("CHANGELOG.md"), flags=re.MULTILINE)
     citation = yaml.safe_load(read("CITATION.cff"))
     assert (str(citation["version"]), str(citation["date-released"])) == (VERSION, day)
     assert citation.get("repository-code") == PROJECT["urls"].get("Repository")
-
-
-def test_the_changelog_has_the_usual_headings():
     heading = re.compile(r"^#+ .+$", flags=re.MULTILINE)
     for version in read("CHANGELOG.md").split("\n## ")[1:]:
         kinds = [line.removeprefix("### ") for line in heading.findall(version)]
@@ -135,19 +128,15 @@ def test_links_of_the_long_description_work_on_a_package_index(long_description,
     found = ["".join(pair) for pair in targets(text)]
     assert found
     assert [target for target in found if not target.startswith("https://")] == []
-    paths = {
-        match[1] for target in found if (match := re.match(rf"{REPOSITORY}/(?:blob|raw)/v1\.2\.3/([^#]+)", target))
-    }
+    paths = set(re.findall(rf"^{REPOSITORY}/(?:blob|raw)/v1\.2\.3/([^#\n]+)", "\n".join(found), flags=re.MULTILINE))
     relative = {"".join(pair).partition("#")[0] for pair in targets(readme)}
     relative = {path for path in relative if not path.startswith("https:")}
     assert paths == (relative if repository else set())
     # All else is as it was.
     assert re.findall(r"```.*?```", text, flags=re.DOTALL) == re.findall(r"```.*?```", readme, flags=re.DOTALL)
     assert "<!--" not in text
-    if repository:
-        assert f'<img src="{REPOSITORY}/raw/v1.2.3/renders/figures/hero.png" width=' in text
-    else:
-        assert "\nThe control cage of a human figure, and its limit surface\n" in text
+    picture = f'<img src="{REPOSITORY}/raw/v1.2.3/renders/figures/hero.png" width='
+    assert (picture if repository else "\nThe control cage of a human figure, and its limit surface\n") in text
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -192,20 +181,12 @@ def test_the_checks_say_which_programs_are_missing(commands):
 
 
 @pytest.mark.posix
-def test_the_checks_install_nothing_for_users_without_the_right(commands):
+def test_the_checks_install_nothing_without_the_right_or_on_other_systems_or_where_all_is_there(commands):
+    assert "this system has no Debian packages" in commands(id="echo 0").stderr
     done = commands(dpkg="exit 1", id="echo 1000", apt_get="echo installed >&2")
     assert "missing: g++ libosd-dev libembree-dev chromium." in done.stderr
     assert "installed" not in done.stderr
-
-
-@pytest.mark.posix
-def test_the_checks_say_nothing_of_what_is_there(commands):
     assert commands(dpkg="exit 0", id="echo 0", blender="exit 0", google_chrome="exit 0").stderr == ""
-
-
-@pytest.mark.posix
-def test_the_checks_say_that_other_systems_have_no_packages(commands):
-    assert "this system has no Debian packages" in commands(id="echo 0").stderr
 
 
 def test_checks_before_a_commit_are_those_of_the_script():

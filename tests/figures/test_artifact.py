@@ -1,11 +1,11 @@
 """The dark spot as a number: luminance around the extraordinary vertex of the two scenes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision.figures.artifact import ROWS, RULES, project, vertex_normal
 
 SCENES = Path(__file__).parents[2] / "scenes"
 # Sampled at u = v = offset, float32 loses the normal of Stam's form at |c1| = 10.
@@ -21,9 +21,6 @@ SIGMAS, INTERPOLATION = 4, 0.003
 
 def disc_luminance(valence, **parameters):
     """Mean luminance of the disc around the vertex, and its standard error."""
-    import mitsuba as mi
-    from mitsuba_subdivision.figures.artifact import ROWS, project
-
     scene = mi.load_file(
         str(SCENES / f"valence{valence}.xml"), resolution=str(RESOLUTION), spp=str(SPP), fov="5", **parameters
     )
@@ -56,8 +53,6 @@ def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(valence, variant
 
 
 def test_the_artefact_comes_from_the_offset_of_the_cage():
-    from mitsuba_subdivision.figures.artifact import ROWS
-
     for row in ROWS:
         surface = row.surface()
         limit = surface.evaluate(0, [[0.0, 0.0]]).p[0]
@@ -70,8 +65,6 @@ def test_the_artefact_comes_from_the_offset_of_the_cage():
 
 
 def test_vertex_normals_of_the_three_rules():
-    from mitsuba_subdivision.figures.artifact import ROWS, RULES, vertex_normal
-
     for row in ROWS:
         stam, stabilised, limit = (vertex_normal(row, rule) for rule in RULES)
         assert stam.error > 45

@@ -1,12 +1,33 @@
 """Every figure draws, and the numbers in them are those of the surfaces."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.__main__ import parser
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from mitsuba_subdivision.figures import FIGURES, FigureError, FigureOptions, peers
+from mitsuba_subdivision.figures.ball_fits import DIAGONAL, Course, Measurement, ball_cage
+from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence
+from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, labels
+from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
+from mitsuba_subdivision.figures.displacement import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
+from mitsuba_subdivision.figures.domains import sub_domain
+from mitsuba_subdivision.figures.figure_scenes import load_stage
+from mitsuba_subdivision.figures.fit import in_front
+from mitsuba_subdivision.figures.normal_error import offset_cage
+from mitsuba_subdivision.figures.output import scene_path, write_plot
+from mitsuba_subdivision.figures.own_cage import around_vertices, frame
+from mitsuba_subdivision.figures.projection import project, visible
+from mitsuba_subdivision.figures.refinement import RefinementStep
+from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, regular_elements
+from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
+from mitsuba_subdivision.regression.image import read_channels
+from mitsuba_subdivision.schemes import scheme_named
+from scipy.spatial import cKDTree
 
 # Small enough that all together take seconds.
 RESOLUTION, SPP, DPI = 12, 1, 20
@@ -20,72 +41,55 @@ COLUMN, LEAST_TEXT = 84, 6
 
 @pytest.fixture
 def options(tmp_path):
-    from mitsuba_subdivision.figures import FigureOptions
-
-    return lambda **other: FigureOptions(
-        tmp_path, **{"resolution": RESOLUTION, "spp": SPP, "report": lambda _: None, **other}
-    )
+    common = {"resolution": RESOLUTION, "spp": SPP, "report": lambda _: None}
+    return lambda **other: FigureOptions(tmp_path, **{**common, **other})
 
 
 @pytest.fixture
-def coarse(monkeypatch):
+def set_constants(monkeypatch):
+    def set_in(module, **values):
+        for name, value in values.items():
+            monkeypatch.setattr(f"mitsuba_subdivision.figures.{module}.{name}", value)
+
+    return set_in
+
+
+@pytest.fixture
+def coarse(monkeypatch, set_constants):
     """Figures without the pixels and triangles that a printer needs: most of the time to draw one goes into these."""
     from matplotlib.figure import Figure
-    from mitsuba_subdivision.figures import creases, displacement, normal_error, output, zebra
 
     save = Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, path, **options: save(figure, path, **{**options, "dpi": DPI})
-    )
-    monkeypatch.setitem(output.write_plot.__kwdefaults__, "layouts", 1)
-    for module, names in {
-        creases: {"RATE": 3},
-        normal_error: {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
-        displacement: {"COLUMNS": 96, "ROWS": 96},
-        zebra: {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
-    }.items():
-        for name, value in names.items():
-            monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
+    monkeypatch.setitem(write_plot.__kwdefaults__, "layouts", 1)
+    set_constants("creases", RATE=3)
+    set_constants("normal_error", VALENCES=(3,), OFFSETS=(0,), LEVELS=np.arange(3))
+    set_constants("displacement", COLUMNS=96, ROWS=96)
+    set_constants("zebra", FINE_LEVEL=3, OWN_LEVEL=3, STRIPE_PIXELS=256)
 
 
 @pytest.fixture
-def few_steps(monkeypatch):
+def few_steps(set_constants):
     """Fits that go a little way only."""
-    from mitsuba_subdivision.figures import ball_fits, crease_fit, fit
-
-    for module, names in {
-        fit: {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4},
-        ball_fits: {"PIXELS": 12, "VIEWS": 2, "SPP": 1, "TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
-        crease_fit: {"PIXELS": 12, "SPP": 1},
-    }.items():
-        for name, value in names.items():
-            monkeypatch.setattr(module, name, value)
+    set_constants("fit", STEPS=2, CREASE_STEPS=1, RATE=4)
+    set_constants("ball_fits", PIXELS=12, VIEWS=2, SPP=1, TARGET_SPP=1, SAMPLES=500, FINE=3, DENSE=3)
+    set_constants("crease_fit", PIXELS=12, SPP=1)
 
 
-def test_the_command_line_knows_every_figure():
-    from mitsuba_subdivision.__main__ import parser
-    from mitsuba_subdivision.figures import FIGURES
-
+def test_the_command_line_knows_every_figure_and_the_table_every_module_that_draws():
     assert tuple(FIGURES) == FIGURE_NAMES
     for name in (*FIGURES, "all"):
         assert parser().parse_args(["figure", name]).name == name
+    modules = {path.stem for path in Path(peers.__file__).parent.glob("*.py") if "\ndef draw(" in path.read_text()}
+    assert {figure.module for figure in FIGURES.values()} == modules
 
 
 def test_figures_of_users_leave_a_checkout_as_it_is():
     """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
-    from mitsuba_subdivision.__main__ import parser
-
     output = parser().parse_args(["figure", "artifact"]).output
     root = Path(__file__).resolve().parents[2]
     assert f"{output.as_posix()}/" in (root / ".gitignore").read_text(encoding="utf-8").splitlines()
     assert f"`{output.as_posix()}/`" in (root / "README.md").read_text(encoding="utf-8")
-
-
-def test_every_module_that_draws_is_in_the_table():
-    from mitsuba_subdivision import figures
-
-    modules = {path.stem for path in Path(figures.__file__).parent.glob("*.py") if "\ndef draw(" in path.read_text()}
-    assert {figure.module for figure in figures.FIGURES.values()} == modules
 
 
 # One function renders the pictures of all figures, and one writes their plots: these figures are drawn twice.
@@ -96,8 +100,6 @@ RENDERED_TWICE, WRITTEN_TWICE = "shading", "refinement"
 @pytest.mark.parametrize("name", FIGURE_NAMES)
 def test_a_figure_draws_without_warnings_fit_for_print(name, options):
     """In a column, where its PDF has text of 6 points, embedded fonts and the pixels that were rendered."""
-    from mitsuba_subdivision.figures import FIGURES
-
     figure = FIGURES[name]
 
     def drawn(formats):
@@ -128,9 +130,6 @@ def test_a_figure_draws_without_warnings_fit_for_print(name, options):
 @pytest.fixture
 def own_cage(tmp_path):
     """A bent box with two creases, far from the origin and not of the size of any figure."""
-    from mitsuba_subdivision import ControlCage
-    from mitsuba_subdivision.cage.named_cages import cube
-
     positions = 30 * cube().positions * [1, 0.7, 1.5] + [50, -20, 10] + np.random.default_rng(3).normal(size=(8, 3))
     faces = cube().face_vertices.reshape(-1, 4)
     cage = ControlCage(positions, faces, creases=[[*cube().edges[0], 2.5], [*cube().edges[1], 10]])
@@ -139,10 +138,6 @@ def own_cage(tmp_path):
 
 
 def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage):
-    from mitsuba_subdivision import ControlCage, LimitSurface
-    from mitsuba_subdivision.cage.named_cages import extraordinary
-    from mitsuba_subdivision.figures.own_cage import around_vertices, frame
-
     like = frame(LimitSurface(extraordinary(5)))
     ((valence, cage),) = around_vertices(own_cage, 3, like).items()
     assert valence == 3 == cage.topology.vertex_face_count[0]
@@ -161,8 +156,6 @@ def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage)
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
 @pytest.mark.parametrize("name", ["artifact", "error", "creases", "subdivision", "curvature", "zebra"])
 def test_figures_take_cages_of_users(name, options, own_cage):
-    from mitsuba_subdivision.figures import FIGURES
-
     (path,) = FIGURES[name](options(formats=("png",), cage=own_cage))
     first = path.read_bytes()
     FIGURES[name](options(formats=("png",)))
@@ -171,9 +164,6 @@ def test_figures_take_cages_of_users(name, options, own_cage):
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_cages_that_do_not_fit_a_figure_are_told(options, tmp_path):
-    from mitsuba_subdivision.cage.named_cages import torus
-    from mitsuba_subdivision.figures import FIGURES, FigureError
-
     torus(5, 4).save(tmp_path / "torus.obj")
     for name, message in (("error", "no extraordinary vertex"), ("creases", "no creases")):
         with pytest.raises(FigureError, match=f'torus.obj" has {message}'):
@@ -184,15 +174,11 @@ def test_cages_that_do_not_fit_a_figure_are_told(options, tmp_path):
 @pytest.mark.parametrize("name", ["subdivision", "zebra", "displacement"])
 def test_scalar_variants_draw_too(name, options):
     """So do `artifact` and `creases`, by commands of the README and of the guide."""
-    from mitsuba_subdivision.figures import FIGURES
-
     assert len(FIGURES[name](options(formats=("png",)))) == 1
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_fits_without_derivatives_are_refused(options):
-    from mitsuba_subdivision.figures import FIGURES, FigureError
-
     with pytest.raises(FigureError, match="variant scalar_rgb; expected one with derivatives"):
         FIGURES["fit"](options())
 
@@ -200,8 +186,6 @@ def test_fits_without_derivatives_are_refused(options):
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_the_distance_of_surfaces_is_that_of_spheres():
     """Of two spheres around one point, the difference of their radii, but for gaps between samples."""
-    from mitsuba_subdivision.figures.ball_fits import DIAGONAL, Course, Measurement, ball_cage
-
     inner, outer = (ball_cage(4, radius) for radius in (0.5, 0.6))
     course = Course()
     Measurement(outer, 8)(course, lambda: inner)
@@ -210,9 +194,6 @@ def test_the_distance_of_surfaces_is_that_of_spheres():
 
 
 def test_numbers_stand_on_edges_that_the_camera_sees():
-    from mitsuba_subdivision.cage.named_cages import cube
-    from mitsuba_subdivision.figures.fit import in_front
-
     seen = in_front(cube(), cube().edges, np.array([5.0, -6, 4]))
     hidden = cube().positions[cube().edges[~seen]]
     # Those that meet in the corner across.
@@ -221,15 +202,28 @@ def test_numbers_stand_on_edges_that_the_camera_sees():
     assert in_front(cube(), cube().edges, np.array([5.0, 0, 0])).sum() == 4
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
-def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_path):
-    from mitsuba_subdivision.figures import FIGURES
-    from mitsuba_subdivision.figures.peers import VARIABLE
-    from mitsuba_subdivision.regression.image import read_channels
-
-    monkeypatch.delenv(VARIABLE, raising=False)
+@pytest.fixture
+def no_programs(monkeypatch, tmp_path):
+    monkeypatch.delenv(peers.VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
     monkeypatch.setenv("PATH", str(tmp_path / "none"))
+
+
+@pytest.fixture
+def answering(tmp_path):
+    """Function that writes a program of the shell, and returns its path."""
+
+    def write(name, text):
+        program = tmp_path / name
+        program.write_text(f"#!/bin/sh\n{text}\n")
+        program.chmod(0o755)
+        return program
+
+    return write
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "no_programs")
+def test_other_programs_are_drawn_only_where_they_are(options):
     for name, pictures in (("zebra", (2, 1)), ("zoom", (4, 2))):
         (path,) = FIGURES[name](options(formats=("exr",)))
         height, width = read_channels(path)[0]["R"].shape
@@ -237,10 +231,6 @@ def test_other_programs_are_drawn_only_where_they_are(options, monkeypatch, tmp_
 
 
 def test_each_panel_of_creases_has_tags_of_its_own():
-    from mitsuba_subdivision import ControlCage
-    from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, labels
-    from mitsuba_subdivision.figures.output import scene_path
-
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
     smooth, own, infinite = (_tagged(cage, name).tags.edges for name in TITLES)
     assert not smooth.any()
@@ -253,10 +243,6 @@ def test_each_panel_of_creases_has_tags_of_its_own():
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
-    from mitsuba_subdivision import ControlCage
-    from mitsuba_subdivision.figures.displacement import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
-    from mitsuba_subdivision.figures.output import scene_path
-
     heights = quilt()
     assert heights.shape == (ROWS, COLUMNS)
     # The last column is as near to the first one as any two neighbours.
@@ -272,8 +258,6 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
 @pytest.mark.core
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_a_refinement_step_has_the_points_of_the_report(valence):
-    from mitsuba_subdivision.figures.refinement import RefinementStep
-
     step = RefinementStep.at_valence(valence)
     assert len(step.old) == 2 * valence + 8
     assert len(step.new) == 2 * valence + 17
@@ -285,10 +269,6 @@ def test_a_refinement_step_has_the_points_of_the_report(valence):
 
 @pytest.mark.core
 def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
-    from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence
-    from mitsuba_subdivision.figures.domains import sub_domain
-    from mitsuba_subdivision.schemes import scheme_named
-
     for name in ("catmull_clark", "loop", "doo_sabin"):
         scheme = scheme_named(name)
         patch = patch_of_valence(scheme, 5)
@@ -301,10 +281,6 @@ def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
 
 
 def test_subdivision_keeps_the_number_of_extraordinary_points():
-    from mitsuba_subdivision import ControlCage, LimitSurface
-    from mitsuba_subdivision.figures.output import scene_path
-    from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, regular_elements
-
     cage = ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")
     assert set(cage.face_sizes) == {3, 4, 5, 6}
     shares = []
@@ -320,25 +296,15 @@ def test_subdivision_keeps_the_number_of_extraordinary_points():
 
 
 def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG001
-    import mitsuba as mi
-    from mitsuba_subdivision.figures.projection import project, visible
-
     to_world = mi.ScalarTransform4f().look_at([3, -4, 5], [0, 0, 0], [0, 0, 1])
     place = np.array([0.3, -0.2, 0.4])
-    for sensor, transform in (
-        ({"type": "perspective", "fov": 30}, to_world),
-        ({"type": "orthographic"}, to_world @ mi.ScalarTransform4f().scale(2)),
-    ):
+    twice = to_world @ mi.ScalarTransform4f().scale(2)
+    for sensor, transform in (({"type": "perspective", "fov": 30}, to_world), ({"type": "orthographic"}, twice)):
         film = {"type": "hdrfilm", "width": 64, "height": 64, "pixel_format": "rgba", "rfilter": {"type": "box"}}
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {"type": "direct", "hide_emitters": True},
-                "light": {"type": "constant"},
-                "sensor": {**sensor, "to_world": transform, "film": film},
-                "ball": {"type": "sphere", "center": place.tolist(), "radius": 0.1},
-            }
-        )
+        ball = {"type": "sphere", "center": place.tolist(), "radius": 0.1}
+        light, integrator = {"type": "constant"}, {"type": "direct", "hide_emitters": True}
+        sensor |= {"to_world": transform, "film": film}
+        scene = mi.load_dict({"type": "scene", "i": integrator, "light": light, "sensor": sensor, "ball": ball})
         alpha = np.array(mi.render(scene, spp=64), dtype=np.float64)[..., 3]
         y, x = np.indices(alpha.shape) + 0.5
         centre = np.array([(alpha * x).sum(), (alpha * y).sum()]) / alpha.sum()
@@ -350,18 +316,11 @@ def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG00
 
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_curvature_grows_as_the_eigenvalues_say(valence):
-    from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
-
     largest = largest_by_level(bent_ball(valence), valence)
     assert (largest[-1] / largest[-5]) ** (1 / 4) == pytest.approx(growth(valence), abs=0.02)
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
-    from mitsuba_subdivision.cage.named_cages import extraordinary
-    from mitsuba_subdivision.figures.figure_scenes import load_stage
-    from mitsuba_subdivision.figures.normal_error import offset_cage
-    from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
-
     view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
     stage = load_stage("zoom", resolution=RESOLUTION)
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
@@ -376,97 +335,63 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
 
 @pytest.mark.posix
 @pytest.mark.parametrize("name", ["osd_peer", "blender"])
-def test_programs_are_found_where_the_user_says(name, tmp_path, monkeypatch):
-    from mitsuba_subdivision.figures import peers
-
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "none"))
-    monkeypatch.setenv("PATH", str(tmp_path / "none"))
-    monkeypatch.delenv(peers.VARIABLE, raising=False)
+@pytest.mark.usefixtures("no_programs")
+def test_programs_are_found_where_the_user_says(name, tmp_path, monkeypatch, answering):
     assert getattr(peers, name)() is None
-    program = _answering(tmp_path, "exit 0", name)
+    program = answering(name, "exit 0")
     monkeypatch.setenv(peers.VARIABLE, str(tmp_path))
     assert getattr(peers, name)() == program
 
 
-def _answering(tmp_path, text, name="osd_peer"):
-    program = tmp_path / name
-    program.write_text(f"#!/bin/sh\n{text}\n")
-    program.chmod(0o755)
-    return program
-
-
 @pytest.mark.posix
-def test_a_failing_opensubdiv_says_why(tmp_path):
-    from mitsuba_subdivision.cage.named_cages import cube
-    from mitsuba_subdivision.figures import FigureError
-    from mitsuba_subdivision.figures.peers import osd_samples
-
+def test_a_failing_program_says_why(answering):
     with pytest.raises(FigureError, match="osd_peer fails: no such cage"):
-        osd_samples(_answering(tmp_path, "echo no such cage >&2; exit 1"), cube(), 0, [[0.0, 0.0]], "far", 2)
+        peers.osd_samples(answering("osd_peer", "echo no such cage >&2; exit 1"), cube(), 0, [[0.0, 0.0]], "far", 2)
+    for text in ("echo no such module >&2; exit 1", "echo no such module >&2"):
+        with pytest.raises(FigureError, match="blender fails: no such module"):
+            peers.blender_mesh(answering("blender", text), cube(), 2)
 
 
 @pytest.mark.posix
-def test_samples_of_opensubdiv_are_those_it_answers(tmp_path):
-    from mitsuba_subdivision.cage.named_cages import cube
-    from mitsuba_subdivision.figures.peers import osd_samples, read_records, write_records
-
+def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
     answers = {"p": [1.0, 2, 3, 4, 5, 6], "du": [2.0, 0, 0, 0, 0, 0], "dv": [0, 3.0, 0, 1, 0, 0]}
-    write_records(tmp_path / "answers", {name: np.array(values) for name, values in answers.items()})
-    program = _answering(tmp_path, f'cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"')
-    points, normals = osd_samples(program, cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
+    peers.write_records(tmp_path / "answers", {name: np.array(values) for name, values in answers.items()})
+    program = answering("osd_peer", f'cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"')
+    points, normals = peers.osd_samples(program, cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
     assert np.array_equal(points, [[1, 2, 3], [4, 5, 6]])
     # Where a derivative vanishes there is no normal.
     assert np.array_equal(normals, [[0, 0, 1], [np.nan] * 3], equal_nan=True)
-    asked = read_records(tmp_path / "asked")
+    asked = peers.read_records(tmp_path / "asked")
     assert np.array_equal(asked["face"], [3, 3])
     assert np.array_equal(asked["uv"], [0.5, 0.25, 1, 0])
     assert np.array_equal(asked["values"], cube().positions.ravel())
 
 
 @pytest.mark.posix
-def test_a_failing_blender_says_why(tmp_path):
-    from mitsuba_subdivision.cage.named_cages import cube
-    from mitsuba_subdivision.figures import FigureError
-    from mitsuba_subdivision.figures.peers import blender_mesh
-
-    for text in ("echo no such module >&2; exit 1", "echo no such module >&2"):
-        with pytest.raises(FigureError, match="blender fails: no such module"):
-            blender_mesh(_answering(tmp_path, text, "blender"), cube(), 2)
-
-
-@pytest.mark.posix
-def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path):
-    from mitsuba_subdivision.cage.named_cages import cube
-    from mitsuba_subdivision.figures.peers import BLENDER_SCRIPT, blender_mesh, read_records, write_records
-
+def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path, answering):
     points, normals, quad = np.arange(12.0), np.tile([0.0, 0, 1], 4), np.arange(4, dtype=np.int32)
     version = np.array([3, 4, 1], dtype=np.int32)
-    write_records(tmp_path / "answers", {"p": points, "n": normals, "corners": quad, "version": version})
+    peers.write_records(tmp_path / "answers", {"p": points, "n": normals, "corners": quad, "version": version})
     # The last three words are both files and the level.
     said = f'while [ $# -gt 3 ]; do echo "$1"; shift; done > {tmp_path}/words; echo "$3" >> {tmp_path}/words'
-    program = _answering(tmp_path, f'{said}; cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"', "blender")
-    mesh = blender_mesh(program, cube(), 5)
+    program = answering("blender", f'{said}; cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"')
+    mesh = peers.blender_mesh(program, cube(), 5)
     assert np.array_equal(mesh.positions, points.reshape(4, 3))
     assert np.array_equal(mesh.normals, normals.reshape(4, 3))
     assert (mesh.quads.tolist(), mesh.version) == ([[0, 1, 2, 3]], "3.4")
     words = (tmp_path / "words").read_text().split()
     assert "--background" in words
-    assert words[-3:] == [str(BLENDER_SCRIPT), "--", "5"]
-    asked = read_records(tmp_path / "asked")
+    assert words[-3:] == [str(peers.BLENDER_SCRIPT), "--", "5"]
+    asked = peers.read_records(tmp_path / "asked")
     assert np.array_equal(asked["values"], cube().positions.ravel())
     assert np.array_equal(asked["corners"], cube().face_vertices)
 
 
 def test_blender_has_the_cage_on_its_limit_surface():
-    from mitsuba_subdivision import LimitSurface
-    from mitsuba_subdivision.cage.named_cages import cube
-    from mitsuba_subdivision.figures.peers import blender, blender_mesh
-    from scipy.spatial import cKDTree
-
-    if blender() is None:
+    if peers.blender() is None:
         pytest.skip("no program blender")
     level = 4
-    mesh = blender_mesh(blender(), cube(), level)
+    mesh = peers.blender_mesh(peers.blender(), cube(), level)
     exact = LimitSurface(cube()).tessellate(2**level)
     distance, nearest = cKDTree(exact.positions).query(mesh.positions)
     assert len(mesh.quads) == 6 * 4**level

@@ -1,7 +1,5 @@
 """The curves of normal error against level."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

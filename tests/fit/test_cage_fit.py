@@ -8,10 +8,13 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.fit import CageFit, View, regularizer
+from reference.refined_cages import tagged
 
 SIZE = 24
 SKY = {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}}
 LIGHT = {"sun": {"type": "directional", "direction": [-1, -0.6, -1.4]}}
+# Edges that pictures show from above.
+TOP = [edge for edge in cube().edges.tolist() if (cube().positions[edge, 2] > 0).all()]
 # Sums on several threads are in no fixed order.
 ORDER = 1e-3
 # Of values that were float32 on the device, and of sums of a few dozen of them.
@@ -60,12 +63,9 @@ def test_a_box_is_found_from_a_cube(views):
     fit = made(cube(), views, smoothing=1.0, learning_rate=0.08, edge_spp=4).run(28)
     # What is left is noise of four samples.
     assert np.mean(fit.losses[-5:]) < 0.5 * fit.losses[0]
-    np.testing.assert_allclose(extents(fit.cage), extents(scaled(cube(), FACTORS)), rtol=0.03)
-
-
-def extents(cage):
-    boxes = LimitSurface(cage).bounds()
-    return boxes.upper.max(axis=0) - boxes.lower.min(axis=0)
+    found, expected = (LimitSurface(cage).bounds() for cage in (fit.cage, scaled(cube(), FACTORS)))
+    sizes = [each.upper.max(axis=0) - each.lower.min(axis=0) for each in (found, expected)]
+    np.testing.assert_allclose(*sizes, rtol=0.03)
 
 
 def test_a_step_that_collapses_the_surface_is_told(views):
@@ -88,11 +88,9 @@ def test_regularizers_are_losses_of_control_points(name, np_rng):
     """By the matrices they are made of, and by their derivatives along a random direction."""
     surface = LimitSurface(cube())
     moved, way = (np_rng.normal(size=(8, 3)) for _ in range(2))
-    matrix = {
-        "laplacian": surface.cage.laplacian().T @ surface.cage.laplacian() / 8,
-        "bending": surface.bending(),
-        "anchor": np.eye(8) / 8,
-    }[name]
+    laplacian = surface.cage.laplacian()
+    matrices = {"laplacian": laplacian.T @ laplacian / 8, "bending": surface.bending(), "anchor": np.eye(8) / 8}
+    matrix = matrices[name]
     x = moved - surface.cage.positions if name == "anchor" else moved
     points = upload(mi.Float, moved.astype(np.float32))
     dr.enable_grad(points)
@@ -106,14 +104,9 @@ def test_regularizers_are_losses_of_control_points(name, np_rng):
 @pytest.mark.parametrize("integrator", ["prb", "prb_projective"])
 def test_any_differentiable_integrator_will_do(views, integrator):
     """Without outlines, `prb` knows less, but of the same scene."""
-    scene = {
-        **SKY,
-        **LIGHT,
-        "integrator": {"type": integrator, "max_depth": 2} | ({"sppi": 0} if "_" in integrator else {}),
-    }
-    fit = CageFit(cube(), views, scene, learning_rate=0.01)
-    expected = made(cube(), views).step()
-    assert fit.step() == pytest.approx(expected, rel=0.3)
+    integrator = {"type": integrator, "max_depth": 2} | ({"sppi": 0} if "_" in integrator else {})
+    fit = CageFit(cube(), views, {**SKY, **LIGHT, "integrator": integrator}, learning_rate=0.01)
+    assert fit.step() == pytest.approx(made(cube(), views).step(), rel=0.3)
     moved = fit.control_points - cube().positions
     assert np.isfinite(moved).all()
     assert 1e-3 < np.abs(moved).max() < 0.1
@@ -129,9 +122,7 @@ def test_refining_keeps_the_surface(views):
     before = fit.cage.refined().positions
     fit.refine()
     np.testing.assert_allclose(fit.control_points, before, atol=1e-6)
-
-
-def test_it_refines_when_the_loss_has_stopped_falling(views):
+    # It refines when the loss has stopped falling.
     fit = made(cube(), views[:1], learning_rate=1e-9, refine=1).run(21)
     assert fit.refinements == 1
 
@@ -150,11 +141,8 @@ def test_other_parameters_are_found():
 def test_colours_at_the_cage_are_found_and_refined():
     """They become part of the cage, and go on when it is refined."""
     colours = np.random.default_rng(4).random((8, 3))
-    plain = ControlCage(
-        cube().positions, cube().face_vertices.reshape(-1, 4), attributes={"colour": np.full((8, 3), 0.5)}
-    )
+    plain, target = (tagged(cube(), attributes={"colour": each}) for each in (np.full((8, 3), 0.5), colours))
     shown = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
-    target = ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), attributes={"colour": colours})
     options = {"shape": shown, "others": {"surface.cage_colour": 0.12}, "regularizers": {"anchor": 100.0}}
     fit = made(plain, views_of(target, **shown), **options).run(36)
     # Of those that no view sees nothing is known.
@@ -169,12 +157,9 @@ def test_colours_at_the_cage_are_found_and_refined():
 
 def test_sharpness_is_found_from_pictures():
     """Of the four edges around the top, which pictures show from above."""
-    positions, faces = cube().positions, cube().face_vertices.reshape(-1, 4)
-    top = [edge for edge in cube().edges.tolist() if (positions[edge, 2] > 0).all()]
-    target = ControlCage(positions, faces, creases=[(*edge, 1.6) for edge in top])
-    start = ControlCage(positions, faces, creases=[(*edge, 0.5) for edge in top])
+    target, start = (tagged(cube(), creases=[(*edge, sharpness) for edge in TOP]) for sharpness in (1.6, 0.5))
     rates = [(0, 0.15), (8, 0.1), (16, 0.01)]
-    options = {"sharp_edges": top, "highest_sharpness": 2, "sharpness_rate": rates, "regularizers": {"anchor": 100.0}}
+    options = {"sharp_edges": TOP, "highest_sharpness": 2, "sharpness_rate": rates, "regularizers": {"anchor": 100.0}}
     views = views_of(target, tessellation_rate=16)
     fit = made(start, views, shape={"tessellation_rate": 8}, edge_spp=4, **options).run(20)
     np.testing.assert_allclose(fit.sharpness, 1.6, atol=0.25)
@@ -184,12 +169,11 @@ def test_sharpness_is_found_from_pictures():
 
 def test_edges_of_a_crease_have_one_sharpness():
     """Four edges around the top and four uprights, each with a sharpness of their own."""
-    positions, faces = cube().positions, cube().face_vertices.reshape(-1, 4)
-    heights = positions[cube().edges, 2]
+    heights = cube().positions[cube().edges, 2]
     crease_of = np.where((heights > 0).all(axis=1), 0, np.where(heights[:, 0] != heights[:, 1], 1, -1))
     edges, crease_of = cube().edges[crease_of >= 0], crease_of[crease_of >= 0]
-    target = ControlCage(positions, faces, creases=[(*e, (1.6, 0.7)[k]) for e, k in zip(edges, crease_of, strict=True)])
-    start = ControlCage(positions, faces, creases=[(*e, 0.2 * i) for i, e in enumerate(edges)])
+    target = tagged(cube(), creases=[(*e, (1.6, 0.7)[k]) for e, k in zip(edges, crease_of, strict=True)])
+    start = tagged(cube(), creases=[(*e, 0.2 * i) for i, e in enumerate(edges)])
     options = {"sharp_edges": edges, "crease_of": crease_of, "highest_sharpness": 2, "regularizers": {"anchor": 100.0}}
     views = views_of(target, tessellation_rate=16)
     fit = made(start, views, shape={"tessellation_rate": 8}, sharpness_rate=0.1, edge_spp=4, **options)
@@ -202,9 +186,8 @@ def test_edges_of_a_crease_have_one_sharpness():
 
 def test_unknown_sharpness_is_refined_with_the_cage(views, tmp_path):
     """The surface stays, and halves of an edge have what is left of its sharpness; also after a checkpoint."""
-    top = [edge for edge in cube().edges.tolist() if (cube().positions[edge, 2] > 0).all()]
-    start = ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), creases=[(*each, 1.6) for each in top])
-    options = {"sharp_edges": top, "crease_of": [0, 0, 1, 1], "refine": [3], "regularizers": {"anchor": 0.1}}
+    start = tagged(cube(), creases=[(*each, 1.6) for each in TOP])
+    options = {"sharp_edges": TOP, "crease_of": [0, 0, 1, 1], "refine": [3], "regularizers": {"anchor": 0.1}}
     fit = made(start, views, **options).run(3)
     before = fit.cage, fit.sharpness
     fit.refine()
@@ -247,9 +230,8 @@ def test_a_checkpoint_resumes_the_fit(views, tmp_path):
 
 def test_nothing_is_compiled_after_the_second_step(views):
     """Weights and rates that change from step to step are no part of kernels."""
-    fit = made(
-        cube(), views, learning_rate=[(0, 0.01), (9, 0.001)], regularizers={"laplacian": [(0, 1e-2), (9, 1e-4)]}
-    ).run(2)
+    rates, weights = [(0, 0.01), (9, 0.001)], {"laplacian": [(0, 1e-2), (9, 1e-4)]}
+    fit = made(cube(), views, learning_rate=rates, regularizers=weights).run(2)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         fit.run(2)
@@ -258,23 +240,17 @@ def test_nothing_is_compiled_after_the_second_step(views):
     assert all(each["cache_hit"] for each in kernels)
 
 
-def test_callbacks_see_each_step(views):
-    seen = []
-    made(cube(), views, callbacks=[lambda fit: seen.append(len(fit.losses))]).run(3)
+def test_callbacks_see_each_step_and_a_cage_keeps_its_tags(views, tmp_path):
+    creased, seen = tagged(cube(), creases=[(0, 1, 2.0)]), []
+    fit = made(creased, views, callbacks=[lambda fit: seen.append(len(fit.losses))]).run(3)
     assert seen == [1, 2, 3]
-
-
-def test_a_cage_keeps_its_tags_and_scheme(views, tmp_path):
-    creased = ControlCage(cube().positions, cube().face_vertices.reshape(-1, 4), creases=[(0, 1, 2.0)])
-    fit = made(creased, views).run(1)
     fit.cage.save(tmp_path / "found.obj")
     found = ControlCage.from_file(tmp_path / "found.obj")
     np.testing.assert_array_equal(found.tags.creases(found.topology), creased.tags.creases(creased.topology))
     np.testing.assert_array_equal(found.positions, fit.control_points)
 
 
-def picture():
-    return np.zeros((SIZE, SIZE, 3))
+PICTURE = np.zeros((SIZE, SIZE, 3))
 
 
 @pytest.mark.parametrize(
@@ -283,7 +259,7 @@ def picture():
         ({"views": []}, "no views: expected one at least"),
         (
             {"views": [np.zeros((SIZE, SIZE + 1, 3))]},
-            r"view 0: a picture of the shape \(24, 25, 3\); expected \(24, 24, ch",
+            r"view 0: a picture of the shape \(24, 25, 3\); expected \(24, 24",
         ),
         ({"views": [np.full((SIZE, SIZE, 3), np.nan)]}, "view 0: a picture with values that are not finite"),
         ({"scene": {"surface": {"type": "sphere"}}}, 'scene has an entry "surface"; expected all but the surface'),
@@ -294,27 +270,22 @@ def picture():
         ({"crease_of": [0]}, "crease_of without sharp_edges; expected both"),
         ({"sharp_edges": [(0, 1)], "crease_of": [0, 1]}, r"crease_of of the shape \(2,\) and type int64; expec"),
         ({"sharp_edges": [(0, 1)], "crease_of": [1]}, "crease_of skips crease 0; expected consecutive indices from 0"),
-        (
-            {"sharp_edges": [(0, 1)], "crease_of": [-1]},
-            "crease_of has a crease -1; expected consecutive indices from 0",
-        ),
+        ({"sharp_edges": [(0, 1)], "crease_of": [-1]}, "crease_of has a crease -1; expected consecutive indices fr"),
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
     ],
 )
 def test_what_cannot_be_fitted_is_told(changes, message):
-    changes = {"views": [picture()], "scene": SKY, **changes}
+    changes = {"views": [PICTURE], "scene": SKY, **changes}
     views = [View(sensor(PLACES[0]), each) for each in changes.pop("views")]
     with pytest.raises(ValueError, match=message):
         CageFit(cube(), views, changes.pop("scene"), **changes)
 
 
-def test_masks_are_checked():
+def test_masks_and_variants_without_derivatives_are_refused():
     for mask, message in ((np.ones((3, 3)), r"a mask of the shape \(3, 3\)"), (-np.ones((SIZE, SIZE)), "negative")):
         with pytest.raises(ValueError, match=message):
-            CageFit(cube(), [View(sensor(PLACES[0]), picture(), mask)], SKY)
+            CageFit(cube(), [View(sensor(PLACES[0]), PICTURE, mask)], SKY)
 
-
-def test_variants_without_derivatives_are_refused():
     mi.set_variant("scalar_rgb")
     with pytest.raises(ValueError, match="variant scalar_rgb: expected one with derivatives"):
         CageFit(cube(), [View(None, None)], {})

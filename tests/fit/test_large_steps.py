@@ -38,9 +38,8 @@ def test_a_step_is_that_of_mitsuba(surface, np_rng):
     cage = ControlCage(surface.cage.positions, surface.cage.triangles)
     points, gradient = upload(mi.Float, cage.positions), np_rng.normal(size=cage.positions.shape)
     theirs = mi.ad.LargeSteps(points, upload(mi.UInt32, cage.triangles), 3.0)
-    expected = theirs.from_differential(
-        theirs.to_differential(points) + upload(mi.Float, gradient[np.array(theirs.index)])
-    )
+    their_step = upload(mi.Float, gradient[np.array(theirs.index)])
+    expected = theirs.from_differential(theirs.to_differential(points) + their_step)
     own = LargeSteps(cage.laplacian(), 3.0)
     found = own.from_differential(own.to_differential(points) + upload(mi.Float, gradient))
     np.testing.assert_allclose(np.array(found), np.array(expected), atol=SINGLE)
@@ -54,16 +53,12 @@ def test_derivatives_are_solutions_of_the_same_system(surface, np_rng):
     given = np_rng.normal(size=surface.cage.positions.shape)
     expected = np.linalg.solve(dense, given)
 
-    u = upload(mi.Float, given)
-    dr.enable_grad(u)
+    u, v = upload(mi.Float, given), upload(mi.Float, given)
+    dr.enable_grad(u, v)
     dr.backward(dr.dot(steps.from_differential(u), upload(mi.Float, given)))
-    np.testing.assert_allclose(np.array(u.grad).reshape(-1, 3), expected, atol=SINGLE)
-
-    u = upload(mi.Float, given)
-    dr.enable_grad(u)
-    dr.set_grad(u, upload(mi.Float, given))
-    forward = dr.forward_to(steps.from_differential(u))
-    np.testing.assert_allclose(np.array(forward).reshape(-1, 3), expected, atol=SINGLE)
+    dr.set_grad(v, upload(mi.Float, given))
+    for found in (u.grad, dr.forward_to(steps.from_differential(v))):
+        np.testing.assert_allclose(np.array(found).reshape(-1, 3), expected, atol=SINGLE)
 
 
 def test_a_step_of_one_point_moves_what_is_around(surface):
@@ -75,11 +70,6 @@ def test_a_step_of_one_point_moves_what_is_around(surface):
     assert (moved > 0).all()
     assert moved.argmax() == 0
     np.testing.assert_allclose(moved.sum(), 1, atol=SINGLE)
-
-
-def test_lambda_must_be_positive(surface):
-    with pytest.raises(ValueError, match="lambda_ is 0; expected a positive number"):
-        LargeSteps(surface.cage.laplacian(), 0)
 
 
 @pytest.mark.core
@@ -106,6 +96,8 @@ def test_where_regularizers_are_least(surface):
         np.testing.assert_allclose(moved, 0, atol=1e-12)
 
 
-def test_an_unknown_regularizer_is_refused(surface):
+def test_an_unknown_regularizer_and_a_lambda_of_zero_are_refused(surface):
     with pytest.raises(ValueError, match='regularizer "tension"; expected one of laplacian, bending, anchor'):
         Regularizer.named("tension", surface)
+    with pytest.raises(ValueError, match="lambda_ is 0; expected a positive number"):
+        LargeSteps(surface.cage.laplacian(), 0)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.fit import PointFit, to_mesh
+from reference.refined_cages import tagged
 
 # Of the size of the box around the points. With no noise, only the regularizer is in the way.
 FOUND = 1e-4
@@ -17,10 +18,9 @@ def target():
     return LimitSurface(torus(6, 5))
 
 
-def moved(cage, seed=3):
-    return cage.with_positions(
-        cage.positions + np.random.default_rng(seed).normal(scale=MOVED, size=cage.positions.shape)
-    )
+def moved(cage):
+    noise = np.random.default_rng(3).normal(scale=MOVED, size=cage.positions.shape)
+    return cage.with_positions(cage.positions + noise)
 
 
 def distance(surface, other):
@@ -42,13 +42,11 @@ def test_a_surface_is_found_from_its_points(target, with_normals):
 
 def test_a_refined_cage_comes_nearer():
     """Of points of another surface, which the coarse cage cannot have."""
-    box = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-    cube = ControlCage(box, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
-    directions = LimitSurface(cube).sample(400, 2).p
+    directions = LimitSurface(cube()).sample(400, 2).p
     points = directions * (1 + 0.3 * np.sin(5 * directions[:, :1]))
-    fit = PointFit(cube, points, refine=[4, 8]).run(12)
+    fit = PointFit(cube(), points, refine=[4, 8]).run(12)
     assert fit.refinements == 2
-    assert fit.cage.face_count == 16 * cube.face_count
+    assert fit.cage.face_count == 16 * 6
     assert fit.losses[11] < fit.losses[7] / 4 < fit.losses[3] / 16
 
 
@@ -70,16 +68,12 @@ def test_refining_moves_nothing(target):
     before = LimitSurface(fit.cage).tessellate(4).positions
     fit.refine()
     after = LimitSurface(fit.cage).tessellate(2)
-    near = LimitSurface(fit.cage).closest_point(before)
-    assert near.distance.max() < 1e-12
+    assert LimitSurface(fit.cage).closest_point(before).distance.max() < 1e-12
     assert len(after.positions) == len(before)
 
 
 def test_tags_stay():
-    creased = torus(6, 5)
-    creased = ControlCage.from_arrays(
-        creased.positions, creased.face_sizes, creased.face_vertices, creases=[(*creased.edges[0], 3.0)]
-    )
+    creased = tagged(torus(6, 5), creases=[(*torus(6, 5).edges[0], 3.0)])
     points = LimitSurface(creased).sample(300, 1).p
     found = PointFit(moved(creased), points, refine=[1]).run(2).cage
     assert found.tags.creases(found.topology)[:, 2].tolist() == [2.0, 2.0]
@@ -132,14 +126,10 @@ def test_malformed_points_are_refused(target, points, normals, message):
         PointFit(target.cage, points, normals)
 
 
-def test_normals_to_the_inside_are_told(target):
-    points = target.sample(50, 1)
+def test_malformed_meshes_and_normals_to_the_inside_are_refused(target):
+    points, positions = target.sample(50, 1), target.cage.positions
     with pytest.raises(ValueError, match="expected normals to the outside"):
         PointFit(target.cage, points.p, -points.n, both_ways=False).step()
-
-
-def test_malformed_meshes_are_refused(target):
-    positions = target.cage.positions
     with pytest.raises(ValueError, match=r"triangle 1 is \[0, 1, 30\]; expected vertices from 0 to 29"):
         to_mesh(target.cage, positions, [[0, 1, 2], [0, 1, 30]])
     with pytest.raises(ValueError, match="the mesh has no area"):

@@ -5,26 +5,21 @@ import pytest
 from mitsuba_subdivision.fit import Schedule
 
 
-def test_one_number_stays():
-    schedule = Schedule.of(0.5, "rate")
-    assert [schedule(step) for step in (0, 7)] == [0.5, 0.5]
-
-
 @pytest.mark.core
-def test_positive_numbers_lie_on_an_exponential():
-    """So that a rate falls by the same factor at every step."""
-    schedule = Schedule.of([(10, 1.0), (20, 1e-2)], "rate")
-    np.testing.assert_allclose([schedule(step) for step in (0, 10, 15, 20, 30)], [1, 1, 0.1, 1e-2, 1e-2])
-
-
-def test_numbers_with_zero_lie_on_a_line():
-    np.testing.assert_allclose(
-        [Schedule.of([(0, 1.0), (4, 0)], "weight")(step) for step in range(5)], [1, 0.75, 0.5, 0.25, 0]
-    )
-
-
-def test_a_function_is_asked():
-    assert Schedule.of(lambda step: step**2, "rate")(3) == 9
+@pytest.mark.parametrize(
+    ("given", "numbers"),
+    [
+        (0.5, {0: 0.5, 7: 0.5}),
+        # A rate falls by the same factor at every step.
+        ([(10, 1.0), (20, 1e-2)], {0: 1, 10: 1, 15: 0.1, 20: 1e-2, 30: 1e-2}),
+        # With zero, on a line.
+        ([(0, 1.0), (4, 0)], {0: 1, 1: 0.75, 2: 0.5, 3: 0.25, 4: 0}),
+        (lambda step: step**2, {3: 9}),
+    ],
+)
+def test_a_schedule_has_these_numbers(given, numbers):
+    found = [Schedule.of(given, "rate")(step) for step in numbers]
+    np.testing.assert_allclose(found, list(numbers.values()), rtol=1e-15)
 
 
 @pytest.mark.parametrize(

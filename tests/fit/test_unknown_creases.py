@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageError, ControlCage, LimitSurface
+from mitsuba_subdivision import CageError, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.fit.unknown_creases import UnknownCreases
 from patches.closed_cages import bumpy, mixed_torus, triangulated
+from reference.refined_cages import tagged
 
 HIGHEST = 3
 # Of points of the size of one.
@@ -26,9 +27,7 @@ def creases(name, method="uniform", count=6):
     make, scheme = CAGES[name]
     cage = make()
     known, *edges = cage.edges[:: max(1, len(cage.edges) // count)][: count + 1]
-    cage = ControlCage.from_arrays(
-        cage.positions, cage.face_sizes, cage.face_vertices, creases=[(*known, 1.5)], crease_method=method
-    )
+    cage = tagged(cage, creases=[(*known, 1.5)], crease_method=method)
     return UnknownCreases(cage, edges, np.arange(len(edges)) // 2, HIGHEST, scheme), scheme
 
 
@@ -79,9 +78,7 @@ def test_what_is_left_after_a_refinement_makes_the_same_points(name):
 
 def test_what_cannot_be_unknown_is_named():
     cube, one = named_cages.cube(), np.zeros(1, dtype=np.int64)
-    for edges, highest, message in (
-        ([(0, 7)], HIGHEST, "is no edge of a face"),
-        ([(0, 1)], 7, "highest_sharpness is 7; expected 1 to 6"),
-    ):
-        with pytest.raises(CageError, match=message):
-            UnknownCreases(cube, edges, one, highest, None)
+    with pytest.raises(CageError, match="is no edge of a face"):
+        UnknownCreases(cube, [(0, 7)], one, HIGHEST, None)
+    with pytest.raises(CageError, match="highest_sharpness is 7; expected 1 to 6"):
+        UnknownCreases(cube, [(0, 1)], one, 7, None)

@@ -5,8 +5,6 @@ python tests/fuzz --count 1000000 [--reader obj ply usd] [--seed 0] [--first 0] 
 What breaks this law is written to a folder. A number and the seed name a file: the same ones give the same file.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """Many damaged files, read by processes that a hang or a crash may take down."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import re

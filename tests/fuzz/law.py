@@ -1,7 +1,5 @@
 """What every file must keep to: it is a cage or a `CageError`, told in few words, and nothing stays behind."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Damage to files: of bytes, of numbers and words, of lines."""
 
-from __future__ import annotations
-
 import re
 import struct
 from functools import partial
@@ -32,15 +30,7 @@ _REACH = 100
 
 
 def mutated(content: bytes, words: tuple[bytes, ...], random: Random) -> bytes:
-    """``content`` with one to four pieces of damage.
-
-    Parameters
-    ----------
-    content : bytes
-    words : tuple of bytes
-        Words that mean something in files of the kind.
-    random : Random
-    """
+    """``content`` with one to four pieces of damage; ``words`` mean something in files of the kind."""
     kinds = (*_KINDS, *[partial(_word, words)] * 2)
     for _ in range(random.choice((1, 1, 2, 4))):
         # Anywhere, so that the beginning, which most damage makes useless, is as likely as any other place.

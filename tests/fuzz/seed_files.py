@@ -1,7 +1,5 @@
 """Small valid files of every kind, whose damage the readers must survive, and the words of each kind."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from functools import cache
@@ -10,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from mitsuba_subdivision.cage import Attribute, ControlCage
 from mitsuba_subdivision.cage.named_cages import cube
+from reference.refined_cages import tagged
 
 _OBJ = b"""# a sheet
 o sheet
@@ -165,34 +164,23 @@ def seed_files(reader: str) -> list[tuple[str, bytes]]:
 
 def _literal(reader: str) -> Iterator[tuple[str, bytes]]:
     if reader == "obj":
-        yield ".obj", _OBJ
-        yield ".obj", _OBJ.replace(b"\n", b"\r\n")
+        yield from ((".obj", _OBJ.replace(b"\n", end)) for end in (b"\n", b"\r\n"))
     elif reader == "ply":
-        yield ".ply", _PLY
-        yield ".ply", _PLY.replace(b"\n", b"\r\n")
-        yield ".ply", _PLY.replace(b"\n", b"\r")
+        yield from ((".ply", _PLY.replace(b"\n", end)) for end in (b"\n", b"\r\n", b"\r"))
     else:
         # The USD library trusts the sizes that its binary files announce.
-        yield ".usda", _USD
-        yield ".usda", _USD_ARCS
+        yield from ((".usda", text) for text in (_USD, _USD_ARCS))
 
 
 def _written(reader: str) -> Iterator[tuple[str, bytes]]:
     """What the package itself writes."""
-    box = cube()
-    uv = Attribute(np.arange(48.0).reshape(24, 2), "face_varying")
-    cages = [
-        box,
-        ControlCage.from_arrays(
-            box.positions,
-            box.face_sizes,
-            box.face_vertices,
-            creases=[(0, 1, 2.5), (1, 3, 10)] if reader != "ply" else (),
-            texcoords=uv if reader != "ply" else None,
-            attributes={"color": Attribute(box.positions * 0.5 + 0.5)} if reader != "obj" else {},
-        ),
-    ]
-    for cage in cages:
+    options = {}
+    if reader != "ply":
+        uv = Attribute(np.arange(48.0).reshape(24, 2), "face_varying")
+        options = {"creases": [(0, 1, 2.5), (1, 3, 10)], "texcoords": uv}
+    if reader != "obj":
+        options["attributes"] = {"color": Attribute(cube().positions * 0.5 + 0.5)}
+    for cage in (cube(), tagged(cube(), **options)):
         suffix = {"usd": ".usda"}.get(reader, f".{reader}")
         yield from _saved(cage.save, suffix)
         if reader == "ply":

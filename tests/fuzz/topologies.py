@@ -4,8 +4,6 @@ A topology is a list of faces, which are tuples of vertices. It is made of polyg
 and random changes; it may be doubled, its border closed by a copy of itself, which makes surfaces that collapse.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -110,13 +108,11 @@ def with_halved_edge(faces, rng):
     face = faces[rng.integers(len(faces))]
     a, b = edges_of(face)[rng.integers(len(face))]
     middle = 1 + max(v for face in faces for v in face)
-    halved = []
-    for face in faces:
-        corners = []
-        for v, w in edges_of(face):
-            corners += [v, middle] if {v, w} == {a, b} else [v]
-        halved.append(tuple(corners))
-    return halved
+
+    def halved(edge):
+        return (edge[0], middle) if {*edge} == {a, b} else edge[:1]
+
+    return [tuple(v for edge in edges_of(face) for v in halved(edge)) for face in faces]
 
 
 def with_diagonal(faces, rng):
@@ -163,15 +159,8 @@ def with_vertices_identified(faces, rng):
     return identified(faces, int(a), int(b))
 
 
-MOVES = (
-    poked,
-    with_halved_edge,
-    with_diagonal,
-    without_edge,
-    with_edge_collapsed,
-    without_face,
-    with_vertices_identified,
-)
+MOVES = [poked, with_halved_edge, with_diagonal, without_edge]
+MOVES += [with_edge_collapsed, without_face, with_vertices_identified]
 
 
 def doubled(faces):
@@ -243,11 +232,7 @@ def random_tags(faces, rng):
     share = rng.choice([0.1, 0.4, 1.0], p=[0.6, 0.3, 0.1])
     creases = [(*edge, sharpness()) for edge in edges if rng.random() < share]
     corners = [(v, sharpness()) for v in vertices if rng.random() < 0.1]
-    return {
-        **({"creases": creases} if creases else {}),
-        **({"corners": corners} if corners else {}),
-        "crease_method": "chaikin" if rng.random() < 0.3 else "uniform",
-    }
+    return {"creases": creases, "corners": corners, "crease_method": "chaikin" if rng.random() < 0.3 else "uniform"}
 
 
 def random_cage(rng):
@@ -362,14 +347,8 @@ def differences_to_refined(surface, rng, count=24):
         angle = np.linalg.norm(here.n - there.n, axis=1) / allowed
     both = unit.all(axis=0) & ~is_convention(surface, half_edge, here)
     unlike = (zero[0] != zero[1]) & (left > FADING) & ~is_convention(surface, half_edge, here)
-    return Differences(
-        np.abs(here.p - there.p).max(),
-        angle[both].max(initial=0),
-        int(zero.sum()),
-        int(unit.sum()),
-        2 * count,
-        int(unlike.sum()),
-    )
+    point, normal = np.abs(here.p - there.p).max(), angle[both].max(initial=0)
+    return Differences(point, normal, int(zero.sum()), int(unit.sum()), 2 * count, int(unlike.sum()))
 
 
 # Share of the cages whose whole surface is tessellated, too.
@@ -380,10 +359,7 @@ def tessellation_problem(surface):
     """What is wrong with the normals of a tessellation, in either precision, if anything."""
     table = surface.sampling(2)
     start, uv = table.locations()
-    normals = [
-        table.apply(surface.cage.positions)[1],
-        surface._evaluate_from(start, uv, "stabilized", np.float64).n,
-    ]
+    normals = [table.apply(surface.cage.positions)[1], surface._evaluate_from(start, uv, "stabilized", np.float64).n]
     lengths = np.linalg.norm(normals, axis=2)
     if not ((lengths == 0) | (np.abs(lengths - 1) < SINGLE_LENGTH)).all():
         return "normals of a tessellation neither unit nor zero"

@@ -1,7 +1,5 @@
 """Derivatives of a picture's mean as estimates with standard errors, from renders with several seeds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import drjit as dr
@@ -12,12 +10,7 @@ from mitsuba_subdivision.device_arrays import upload
 
 @dataclass(frozen=True)
 class Estimate:
-    """One value for each seed.
-
-    Attributes
-    ----------
-    values : (n,) float64
-    """
+    """One value for each seed."""
 
     values: np.ndarray
 

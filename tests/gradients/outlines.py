@@ -1,15 +1,11 @@
 """What triangles cover of a picture: areas of outlines by scan lines, without any renderer."""
 
-from __future__ import annotations
-
 import mitsuba as mi
 import numpy as np
 from gradients.scenes import EYE, FOV, TARGET, UP
-from gradients.surfaces import ring_of
+from gradients.surfaces import ALL
 from kernels.surfaces import CAGES
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import named_cages
-from patches.closed_cages import bumpy
 
 LINES = 8192
 # Segments per edge, and the step of differences of areas.
@@ -19,9 +15,7 @@ SURFACES = {
     "concave, catmull_clark": lambda: LimitSurface(ControlCage.from_file(STAR), "catmull_clark"),
     "concave, loop": lambda: LimitSurface(ControlCage.from_file(STAR), "loop"),
     "concave, doo_sabin": lambda: LimitSurface(ControlCage.from_file(STAR), "doo_sabin"),
-    "creased": lambda: LimitSurface(bumpy(ring_of(10.0))),
-    "semi-sharp": lambda: LimitSurface(bumpy(ring_of(2.5))),
-    "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5, closed=False), size=0.02)),
+    **{name: ALL[name] for name in ("creased", "semi-sharp", "open")},
 }
 
 
@@ -48,9 +42,8 @@ def covered(positions, triangles, eye, target, up, fov, lines=LINES):
     the midpoint rule, of second order as the widths of an outline of straight edges are continuous.
     """
     triangles = _projected(positions, eye, target, up, fov)[triangles]
-    low, middle, high = np.take_along_axis(triangles, np.argsort(triangles[..., 1], axis=1)[..., None], 1).swapaxes(
-        0, 1
-    )
+    upwards = np.argsort(triangles[..., 1], axis=1)
+    low, middle, high = np.take_along_axis(triangles, upwards[..., None], 1).swapaxes(0, 1)
     step = 2 / lines
     first, end = (np.ceil((corner[:, 1] + 1) / step - 0.5).astype(int) for corner in (low, high))
     counts = end - first

@@ -1,7 +1,5 @@
 """Scenes whose pictures are differentiated: inside an outline under a smooth sky, and outlines before a white one."""
 
-from __future__ import annotations
-
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import ControlCage
@@ -13,15 +11,9 @@ RESOLUTION = 16
 
 
 def film(resolution):
-    """One channel, and samples beyond the border, without which projective integrators warn."""
-    return {
-        "type": "hdrfilm",
-        "width": resolution,
-        "height": resolution,
-        "rfilter": {"type": "box"},
-        "sample_border": True,
-        "pixel_format": "rgb",
-    }
+    """With samples beyond the border, without which projective integrators warn."""
+    size = {"width": resolution, "height": resolution}
+    return {"type": "hdrfilm", **size, "rfilter": {"type": "box"}, "sample_border": True, "pixel_format": "rgb"}
 
 
 # Inside
@@ -66,16 +58,10 @@ def inside(material, light, shape):
     """A view of the middle of a shape."""
     # Of directions that the diffuse material chooses, the variance is far larger: they turn with the tangents.
     samples = {} if material == "rough" else {"bsdf_samples": 0}
-    to_world = mi.ScalarTransform4f().look_at([1, -4, 2], [0, 0, 0], [0, 0, 1])
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct", **samples},
-            "sensor": {"type": "perspective", "fov": 14, "to_world": to_world, "film": film(RESOLUTION)},
-            "sky": sky(light),
-            "shape": {**shape, "bsdf": materials()[material]},
-        }
-    )
+    integrator, to_world = {"type": "direct", **samples}, mi.ScalarTransform4f().look_at([1, -4, 2], TARGET, UP)
+    sensor = {"type": "perspective", "fov": 14, "to_world": to_world, "film": film(RESOLUTION)}
+    shape = {**shape, "bsdf": materials()[material]}
+    return mi.load_dict({"type": "scene", "i": integrator, "sensor": sensor, "sky": sky(light), "shape": shape})
 
 
 def tilt(positions):
@@ -96,14 +82,12 @@ def outline(shape, *, emits=False, resolution=32):
 
     The interior term is left out. It is zero, and so are shadows.
     """
+    integrator = {"type": "direct_projective", "sppi": 0, "sppc": 0}
     to_world = mi.ScalarTransform4f().look_at(EYE, TARGET, UP)
-    background = {} if emits else {"sky": {"type": "constant"}}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct_projective", "sppi": 0, "sppc": 0},
-            "sensor": {"type": "perspective", "fov": FOV, "to_world": to_world, "film": film(resolution)},
-            "shape": {**shape, "bsdf": BLACK, **({"emitter": LIGHT} if emits else {})},
-            **background,
-        }
-    )
+    sensor = {"type": "perspective", "fov": FOV, "to_world": to_world, "film": film(resolution)}
+    scene = {"type": "scene", "integrator": integrator, "sensor": sensor, "shape": {**shape, "bsdf": BLACK}}
+    if emits:
+        scene["shape"]["emitter"] = LIGHT
+    else:
+        scene["sky"] = {"type": "constant"}
+    return mi.load_dict(scene)

@@ -6,8 +6,6 @@ changes the integral of a function over its solid by the integral of the functio
 normal.
 """
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 from mitsuba_subdivision.kernels import VertexKernel

@@ -1,7 +1,5 @@
 """Surfaces whose gradients are tested: three schemes, sharp, semi-sharp and open ones, one that is refined first."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface

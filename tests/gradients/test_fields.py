@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from operator import attrgetter
 
 # Before Mitsuba, for an LLVM library that works.
 import mitsuba_subdivision as msub  # isort: skip
@@ -28,29 +29,17 @@ OF_ALL = ("control_points", "to_world", "cage_texcoords", "displacement_scale")
 # Forward mode by attributes that displace a surface ends in an error of Dr.Jit's under Doo-Sabin.
 BY = {"catmull_clark": (*OF_ALL, "cage_height"), "loop": (*OF_ALL, "cage_height"), "doo_sabin": OF_ALL}
 
-FIELDS = {
-    "t": lambda si: si.t,
-    "p": lambda si: si.p,
-    "n": lambda si: si.n,
-    "shading normal": lambda si: si.sh_frame.n,
-    "uv": lambda si: si.uv,
-    "dp_du": lambda si: si.dp_du,
-    "dp_dv": lambda si: si.dp_dv,
-    "dn_du": lambda si: si.dn_du,
-    "dn_dv": lambda si: si.dn_dv,
-}
+FIELDS = ("t", "p", "n", "sh_frame.n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv")
 
 
 def cage_of(scheme):
     """With texture coordinates on the surface, and heights."""
     cage = named_cages.extraordinary_triangles(5) if scheme == "loop" else named_cages.cube()
     x, y, z = cage.positions.T
-    return ControlCage(
-        cage.positions,
-        np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1]),
-        texcoords=Attribute(np.stack([0.3 * x + 0.11 * z, 0.3 * y + 0.23 * z], axis=1), "vertex"),
-        attributes={"height": Attribute((0.2 + 0.1 * x * y - 0.05 * z)[:, None])},
-    )
+    texcoords = np.stack([0.3 * x + 0.11 * z, 0.3 * y + 0.23 * z], axis=1)
+    height = Attribute((0.2 + 0.1 * x * y - 0.05 * z)[:, None])
+    given = cage.positions, cage.face_sizes, cage.face_vertices
+    return ControlCage.from_arrays(*given, texcoords=Attribute(texcoords, "vertex"), attributes={"height": height})
 
 
 def rays_at(cage, scheme):
@@ -81,7 +70,7 @@ def wrong_parts(scheme, by):
         parameters.update()
         si = scene.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, True)
         # Dr.Jit clears the derivatives of what others are computed from.
-        found = {name: dr.ravel(1 * field(si)) for name, field in FIELDS.items()}
+        found = {name: dr.ravel(1 * attrgetter(name)(si)) for name in FIELDS}
         dr.eval(found)
         return found
 

@@ -55,19 +55,14 @@ def expected_of(linear, shift, volume, first, second):
     growth, matrix = np.trace(linear), symmetric(second)
     change = linear @ matrix + np.outer(shift, first)
     change = change + change.T + growth * matrix
-    return np.concatenate(
-        [growth * volume, linear @ first + shift * volume + growth * first, [change[i, j] for i, j in solids.PAIRS]]
-    )
-
-
-def cross_matrix(axis):
-    return np.cross(np.eye(3), axis).T
+    of_first, of_second = linear @ first + shift * volume + growth * first, [change[i, j] for i, j in solids.PAIRS]
+    return np.concatenate([growth * volume, of_first, of_second])
 
 
 AFFINE = {
     "scaling": (np.eye(3), np.zeros(3)),
     "translation": (np.zeros((3, 3)), TURN),
-    "rotation": (cross_matrix(TURN), np.zeros(3)),
+    "rotation": (np.cross(np.eye(3), TURN).T, np.zeros(3)),
     "shear": (np.array([[0, 0.4, 0], [0, 0, -0.3], [0.2, 0, 0]]), TURN),
 }
 
@@ -94,11 +89,11 @@ def test_hadamards_formula_is_the_derivative_of_volume_and_moments(surface):
     positions = surface.cage.positions
     direction = motions(surface)["all"]
     (found,) = solids.derivatives_of_surface(surface, [direction])
-    differences = [
-        np.subtract(*(solids.joined(solids.of_surface(moved(surface, positions + s * direction))) for s in (h, -h)))
-        for h in STEPS
-    ]
-    expected = WEIGHTS @ differences / STEPS[0]
+
+    def integrals(step):
+        return solids.joined(solids.of_surface(moved(surface, positions + step * direction)))
+
+    expected = WEIGHTS @ [integrals(step) - integrals(-step) for step in STEPS] / STEPS[0]
     assert np.abs(found - expected).max() <= POLYNOMIAL * np.abs(expected).max()
 
 
@@ -149,13 +144,11 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     positions = cage.positions
     is_inner = ((positions > 0) & (positions < positions.max(axis=0)))[:, :2].all(axis=1)
     inner = is_inner[:, None] * np_rng.normal(size=positions.shape)
-    upwards = np.zeros_like(positions)
-    upwards[:, 2] = np_rng.normal(size=len(positions))
+    upwards = np_rng.normal(size=(len(positions), 1)) * [0, 0, 1]
     # Stretched along x, sheared, and its right side moved outwards.
     stretch, shear = positions * [1, 0, 0], positions[:, [1, 0, 2]] * [1, 0, 0]
     right = (positions[:, :1] == 4) * np.array([1.0, 0, 0])
-    fields = {"inner": (inner, 0), "upwards": (upwards, 0), "stretch": (stretch, 12), "shear": (shear, 0)}
-    fields["right"] = (right, 3)
+    fields = ((inner, 0), (upwards, 0), (stretch, 12), (shear, 0), (right, 3))
     exact = surface.stiffness(solids.STIFFNESS_ORDER) @ positions
     kernel, table = VertexKernel(surface.sampling(3), types.float), surface.sampling(3)
     points = types.floats(positions.ravel())
@@ -163,5 +156,5 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     dr.backward(solids.of_triangles(types, kernel(points)[0], table.triangles)["area"][0])
     found = np.array(dr.grad(points)).reshape(-1, 3)
     for gradient, tolerance in ((exact, AREA), (found, ROUNDING)):
-        for field, expected in fields.values():
+        for field, expected in fields:
             assert abs((gradient * field).sum() - expected) <= 12 * tolerance

@@ -24,16 +24,13 @@ LINES = 1e-3
 SUMS = 1e-5
 
 
-def scaled_to(direction, surface):
-    """So that no outline changes by more than its own size."""
-    return direction * np.abs(surface.cage.positions).max() / np.abs(direction).max()
-
-
 @pytest.mark.parametrize("name", SURFACES)
 def test_gradients_of_outlines_are_those_of_the_area_covered(name):
     surface = SURFACES[name]()
     found = gradients(outline(properties(surface)), POINTS, SAMPLES)
-    ways = {key: scaled_to(way, surface) for key, way in motions(surface).items()}
+    # No outline changes by more than its own size.
+    largest = np.abs(surface.cage.positions).max()
+    ways = {key: way * largest / np.abs(way).max() for key, way in motions(surface).items()}
     size = abs(change(surface, ways["scaling"]))
     for key, way in ways.items():
         # A black shape takes away from the sky.
@@ -45,9 +42,8 @@ def test_gradients_of_outlines_are_those_of_the_area_covered(name):
 
 def test_forward_derivatives_of_outlines_are_the_same():
     surface = SURFACES["concave, loop"]()
-    positions = surface.cage.positions
-    way = motions(surface)["bending"]
-    pictures = Pictures(outline(properties(surface)), {POINTS: positions}, {POINTS: way}, SAMPLES, 2)
+    start, way = {POINTS: surface.cage.positions}, {POINTS: motions(surface)["bending"]}
+    pictures = Pictures(outline(properties(surface)), start, way, SAMPLES, 2)
     forward, reverse = (pictures.derivatives(mode) for mode in ("forward", "reverse"))
     np.testing.assert_allclose(forward.values, reverse.values, rtol=1e-4)
 
@@ -101,10 +97,9 @@ def test_emitters_with_interpolated_normals_have_the_bias_that_the_triangles_hav
 @pytest.mark.skipif(bool(hook_problem()), reason=str(hook_problem()))
 def test_emitters_with_exact_shading_have_no_black_rims():
     surface = SURFACES["concave, loop"]()
-    image, flat, smooth = (
-        np.array(mi.render(outline(properties(surface, **more), emits=True), spp=16))
-        for more in ({"shading": "exact"}, {"face_normals": True}, {})
-    )
+    kinds = ({"shading": "exact"}, {"face_normals": True}, {})
+    scenes = (outline(properties(surface, **kind), emits=True) for kind in kinds)
+    image, flat, smooth = (np.array(mi.render(scene, spp=16)) for scene in scenes)
     np.testing.assert_array_equal(image, flat)
     # Rims are half a per cent of what shines.
     assert smooth.mean() < 0.997 * flat.mean()
@@ -121,10 +116,9 @@ def test_scan_lines_measure_what_they_should():
     """A square half hidden by another, and one of its size turned by 30 degrees."""
     square = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * 0.5
     quads = np.array([[0, 1, 2], [0, 2, 3]])
-    eye = (0, -1, 0)
-    view = {"target": (0, 0, 0), "up": (0, 0, 1), "fov": 90}
+    view = (0, -1, 0), (0, 0, 0), (0, 0, 1), 90
     turn = np.array([[np.sqrt(0.75), 0, -0.5], [0, 1, 0], [0.5, 0, np.sqrt(0.75)]])
     pair = np.concatenate([square, square + np.array([0.25, 0, 0])])
-    assert covered(square, quads, eye, **view) == pytest.approx(1 / 4, abs=1e-12)
-    assert covered(square @ turn, quads, eye, **view) == pytest.approx(1 / 4, abs=1e-7)
-    assert covered(pair, np.concatenate([quads, quads + 4]), eye, **view) == pytest.approx(1.25 / 4, abs=1e-12)
+    assert covered(square, quads, *view) == pytest.approx(1 / 4, abs=1e-12)
+    assert covered(square @ turn, quads, *view) == pytest.approx(1 / 4, abs=1e-7)
+    assert covered(pair, np.concatenate([quads, quads + 4]), *view) == pytest.approx(1.25 / 4, abs=1e-12)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gradients.estimates import Pictures
 from gradients.scenes import POINTS, inside, textured_cube, tilt
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -34,8 +34,8 @@ CASES = [
 def moving(material, shading, light, samples=SAMPLES):
     cage = textured_cube()
     shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "shading": shading}
-    positions = cage.positions
-    return Pictures(inside(material, light, shape), {POINTS: positions}, {POINTS: tilt(positions)}, samples)
+    start, along = {POINTS: cage.positions}, {POINTS: tilt(cage.positions)}
+    return Pictures(inside(material, light, shape), start, along, samples)
 
 
 @pytest.mark.parametrize(("material", "shading", "modes"), CASES)
@@ -57,20 +57,17 @@ def test_interpolated_normals_have_the_gradients_that_the_triangles_have_as_a_pl
     """Which leave out how triangles move the edges of their own shadows, as the differences show."""
     ours = moving("diffuse", "vertex", "around", SAMPLES_OF_SHADOWS)
     surface = LimitSurface(textured_cube())
-    made = surface.tessellate(RATE)
-    made.save(tmp_path / "same.ply")
-    ahead, behind = (
-        LimitSurface(ControlCage(p, surface.cage.face_vertices.reshape(-1, 4))).tessellate(RATE)
-        for p in (surface.cage.positions + side * STEP * tilt(surface.cage.positions) for side in (1, -1))
-    )
-    changes = ((a - b) / (2 * STEP) for a, b in ((ahead.positions, behind.positions), (ahead.normals, behind.normals)))
-    names = ("shape.vertex_positions", "shape.vertex_normals")
-    theirs = Pictures(
-        inside("diffuse", "around", {"type": "ply", "filename": str(tmp_path / "same.ply")}),
-        dict(zip(names, (made.positions, made.normals), strict=True)),
-        dict(zip(names, changes, strict=True)),
-        SAMPLES_OF_SHADOWS,
-    )
+    surface.tessellate(RATE).save(tmp_path / "same.ply")
+
+    def vertices(step):
+        moved = surface.cage.positions + step * tilt(surface.cage.positions)
+        made = LimitSurface(surface.cage.with_positions(moved)).tessellate(RATE)
+        return {"shape.vertex_positions": made.positions, "shape.vertex_normals": made.normals}
+
+    start, ahead, behind = (vertices(step) for step in (0, STEP, -STEP))
+    changes = {name: (ahead[name] - behind[name]) / (2 * STEP) for name in start}
+    ply = inside("diffuse", "around", {"type": "ply", "filename": str(tmp_path / "same.ply")})
+    theirs = Pictures(ply, start, changes, SAMPLES_OF_SHADOWS)
     own, other = (each.derivatives("reverse") for each in (ours, theirs))
     # The same samples of the same triangles.
     np.testing.assert_allclose(own.values, other.values, rtol=0, atol=SINGLE * abs(own.mean) * 10)

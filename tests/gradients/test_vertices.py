@@ -11,6 +11,8 @@ from mitsuba_subdivision.kernels.affine_map import placed
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.tessellation import Criterion, Measure
 
+pytestmark = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
+
 # Central differences of two steps, extrapolated: what is left goes with the fourth power of the step, and rounding
 # with one over it. Beside the largest derivative.
 STEP, DIFFERENCES = 2e-4, 1e-9
@@ -19,13 +21,6 @@ ROUNDING = 1e-13
 # Of adaptive tessellations, in sizes of the surface: rates differ from tile to tile.
 CHORD = 0.01
 MATRIX = np.array([[1.1, 0.2, -0.3, 4], [0.1, 0.9, 0.25, -5], [-0.2, 0.3, 1.2, 6], [0, 0, 0, 1]])
-
-
-@pytest.fixture(autouse=True)
-def _llvm():
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
 
 
 def table_of(surface, tessellation):

@@ -1,7 +1,5 @@
 """Surfaces that between them have every kind of piece, and locations on them."""
 
-from __future__ import annotations
-
 import warnings
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +16,7 @@ from reference.refined_cages import half_disc, sheet, spokes, tagged, upper_half
 CAGES = Path(__file__).parents[2] / "scenes/cages"
 INFINITE = 10.0
 RING = ((4, 5), (5, 7), (7, 6), (6, 4))
+UNEQUAL = [(a, b, s) for (a, b), s in zip(RING, (0.4, 1.3, 2.2, 4), strict=True)]
 
 
 def non_manifold():
@@ -49,15 +48,7 @@ SURFACES = {
     "semi-sharp ring": ("catmull_clark", lambda: tagged(cube(), creases=[(a, b, 4) for a, b in RING])),
     # Divided along the edge, and no vertex is extraordinary.
     "semi-sharp torus": ("catmull_clark", lambda: tagged(cage_of("catmull_clark", "torus"), creases=[(0, 1, 1.5)])),
-    "chaikin": (
-        "catmull_clark",
-        lambda: tagged(
-            cube(),
-            creases=[(a, b, s) for (a, b), s in zip(RING, (0.4, 1.3, 2.2, 4), strict=True)],
-            corners=[(0, 2.4)],
-            crease_method="chaikin",
-        ),
-    ),
+    "chaikin": ("catmull_clark", lambda: tagged(cube(), creases=UNEQUAL, corners=[(0, 2.4)], crease_method="chaikin")),
     "rook": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "rook.obj")),
     "propeller": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "propeller.obj")),
     "loop mixed torus": ("loop", lambda: triangulated(mixed_torus())),

@@ -1,7 +1,5 @@
 """Attributes and texture coordinates on a device are those that channels evaluate with NumPy."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import drjit as dr
@@ -13,9 +11,10 @@ from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.kernels.array_types import float_type_of
 from mitsuba_subdivision.kernels.channel_kernel import LinearChannelKernel, SubdividedChannelKernel, channel_kernel
-from mitsuba_subdivision.llvm import llvm_problem
 from patches.closed_cages import mixed_torus, triangulated
-from reference.refined_cages import sheet, spokes
+from reference.refined_cages import sheet, spokes, tagged
+
+pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
 # Of values below one: some tens of products. Single precision has 2^29 times the rounding.
@@ -30,13 +29,6 @@ BASES = {
     "loop": ("loop", lambda: triangulated(mixed_torus())),
     "doo_sabin": ("doo_sabin", mixed_torus),
 }
-
-
-@pytest.fixture(autouse=True)
-def _llvm():
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
 
 
 @pytest.fixture(params=BASES, scope="module")
@@ -56,19 +48,7 @@ def surface(request):
         }
     else:
         attributes["no seams 2"] = Attribute(rng.random((t.vertex_count, 2)), "face_varying", t.face_vertices)
-    options = {"creases": cage.tags.creases(t), "attributes": attributes}
-    return LimitSurface(ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options), scheme)
-
-
-def all_linear(surface):
-    """The same with face-varying values that are interpolated linearly."""
-    cage = surface.cage
-    return LimitSurface(
-        ControlCage.from_arrays(
-            cage.positions, cage.face_sizes, cage.face_vertices, attributes=cage.attributes, face_varying="all"
-        ),
-        surface.scheme.name,
-    )
+    return LimitSurface(tagged(cage, creases=cage.tags.creases(t), attributes=attributes), scheme)
 
 
 @lru_cache(maxsize=4)
@@ -85,12 +65,6 @@ def evaluated(surface, name, variant, element, uv, corner):
     return [np.array(each).astype(np.float64).reshape(-1, len(element)).T for each in found]
 
 
-def differences(surface, name, element, uv, corner):
-    for axis in np.eye(2):
-        ahead, behind = (surface.evaluate_attribute(name, element, uv + side * STEP * axis, corner) for side in (1, -1))
-        yield (ahead - behind) / (2 * STEP)
-
-
 @pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
 def test_values_are_the_channels(surface, variant, np_rng):
     locations = random_locations(surface, np_rng, 600)
@@ -105,11 +79,11 @@ def test_values_are_the_channels(surface, variant, np_rng):
 def test_values_by_linear_rules_are_the_channels(surface, np_rng):
     if surface.scheme.element == "vertex":
         pytest.skip("a scheme without linear interpolation")
-    surface = all_linear(surface)
-    locations = random_locations(surface, np_rng, 600)
-    for name, kind in (("varying 1", LinearChannelKernel), ("seams 2", LinearChannelKernel)):
-        kernel = surface.on_device(DOUBLE)
-        assert isinstance(channel_kernel(surface.channel(name), kernel.walk, kernel.types.float), kind)
+    attributes = surface.cage.attributes
+    surface = LimitSurface(tagged(surface.cage, attributes=attributes, face_varying="all"), surface.scheme.name)
+    kernel, locations = kernel_of(surface, DOUBLE), random_locations(surface, np_rng, 600)
+    for name in ("varying 1", "seams 2"):
+        assert isinstance(channel_kernel(surface.channel(name), kernel.walk, kernel.types.float), LinearChannelKernel)
         found, *_ = evaluated(surface, name, DOUBLE, *locations)
         np.testing.assert_allclose(found, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
 
@@ -119,11 +93,12 @@ def test_derivatives_are_differences(surface, np_rng):
     # Away from the sides of the domain and from lines on which pieces meet.
     domain = surface.scheme.domain
     kept = (domain.inside(uv) > 0.01) & (np.abs(uv % 0.25 - 0.125).max(axis=1) < 0.12)
-    locations = element[kept], uv[kept], corner[kept]
+    element, uv, corner = element[kept], uv[kept], corner[kept]
     for name in surface.attribute_names:
-        _, *found = evaluated(surface, name, DOUBLE, *locations)
-        for derivative, expected in zip(found, differences(surface, name, *locations), strict=True):
-            np.testing.assert_allclose(derivative, expected, rtol=0, atol=DIFFERENCES)
+        _, *found = evaluated(surface, name, DOUBLE, element, uv, corner)
+        for derivative, step in zip(found, STEP * np.eye(2), strict=True):
+            ahead, behind = (surface.evaluate_attribute(name, element, uv + each, corner) for each in (step, -step))
+            np.testing.assert_allclose(derivative, (ahead - behind) / (2 * STEP), rtol=0, atol=DIFFERENCES)
 
 
 @pytest.mark.core
@@ -133,20 +108,16 @@ def test_values_differ_across_seams_only(np_rng):
     t = cage.topology
     indices = t.face_vertices + t.vertex_count * (t.face % 2)
     values = np_rng.random((2 * t.vertex_count, 2))
-    surface = LimitSurface(
-        ControlCage.from_arrays(
-            cage.positions, cage.face_sizes, cage.face_vertices, texcoords=Attribute(values, "face_varying", indices)
-        )
-    )
+    surface = LimitSurface(tagged(cage, texcoords=Attribute(values, "face_varying", indices)))
     whole = surface.patches.is_whole[t.face]
     edge = np.flatnonzero(whole & whole[t.twin])
     along = np_rng.random(len(edge))
-    here, there = (
-        evaluated(surface, "texcoords", DOUBLE, t.face[h], np.stack([u, 0 * u], axis=1), h - t.face_offsets[t.face[h]])[
-            0
-        ]
-        for h, u in ((edge, along), (t.twin[edge], 1 - along))
-    )
+
+    def seen_from(h, u):
+        corner = h - t.face_offsets[t.face[h]]
+        return evaluated(surface, "texcoords", DOUBLE, t.face[h], np.stack([u, 0 * u], axis=1), corner)[0]
+
+    here, there = seen_from(edge, along), seen_from(t.twin[edge], 1 - along)
     differs = np.abs(here - there).max(axis=1)
     is_seam = surface.channel("texcoords").seam[edge]
     assert is_seam.any()
@@ -157,13 +128,8 @@ def test_values_differ_across_seams_only(np_rng):
 
 @pytest.mark.core
 def test_kinds_of_channels_have_kernels_of_their_own():
-    surface = LimitSurface(
-        ControlCage(
-            np.eye(3),
-            [[0, 1, 2]],
-            attributes={"a": Attribute(np.eye(3), "vertex"), "b": Attribute(np.eye(3), "varying")},
-        )
-    )
+    attributes = {"a": Attribute(np.eye(3), "vertex"), "b": Attribute(np.eye(3), "varying")}
+    surface = LimitSurface(ControlCage(np.eye(3), [[0, 1, 2]], attributes=attributes))
     walk = surface.on_device(DOUBLE).walk
     kinds = [type(channel_kernel(surface.channel(name), walk, float_type_of(DOUBLE))) for name in ("a", "b")]
     assert kinds == [SubdividedChannelKernel, LinearChannelKernel]

@@ -10,8 +10,6 @@ from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
 from scipy import sparse
 
-# Sums of some terms of order one.
-SINGLE, DOUBLE = 2e-6, 1e-13
 ROWS, COLUMNS = 40, 12
 
 
@@ -23,33 +21,29 @@ def weights(np_rng):
     return sparse.csr_array(dense / dense.sum(axis=1, keepdims=True))
 
 
-def rounding(float_type):
-    return DOUBLE if dr.type_v(float_type) == dr.VarType.Float64 else SINGLE
-
-
 @pytest.mark.core
 @pytest.mark.parametrize("size", [1, 2, 3, 4])
-def test_weighted_values_and_derivatives_are_products(float_type, weights, size, np_rng):
-    weighted, atol = WeightedValues(weights, float_type), rounding(float_type)
+def test_weighted_values_and_derivatives_are_products(float_type, rounding, weights, size, np_rng):
+    weighted = WeightedValues(weights, float_type)
     values, change = np_rng.random((2, COLUMNS, size))
     gradient = np_rng.random((ROWS, size))
     for is_forward in (False, True):
         flat = upload(float_type, values)
         dr.enable_grad(flat)
         found = weighted(flat, size)
-        np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=atol)
+        np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=rounding)
         if is_forward:
             dr.set_grad(flat, upload(float_type, change))
             dr.forward_to(found)
-            np.testing.assert_allclose(np.array(dr.grad(found)), (weights @ change).ravel(), rtol=0, atol=atol)
+            np.testing.assert_allclose(np.array(dr.grad(found)), (weights @ change).ravel(), rtol=0, atol=rounding)
         else:
             dr.backward(dr.sum(found * upload(float_type, gradient)))
             expected = (weights.T @ gradient).ravel()
-            np.testing.assert_allclose(np.array(dr.grad(flat)), expected, rtol=0, atol=10 * atol)
+            np.testing.assert_allclose(np.array(dr.grad(flat)), expected, rtol=0, atol=10 * rounding)
 
 
 @pytest.mark.parametrize("is_weighted", [False, True])
-def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights, is_weighted, np_rng):
+def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, rounding, weights, is_weighted, np_rng):
     types = ArrayTypes.of(float_type)
     first, second = np_rng.random((2, COLUMNS, 3))
     values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
@@ -62,14 +56,14 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, weights
     assert values.flat is flat
     expected = weights @ second if is_weighted else second
     found = values.fetch(types.index(5))
-    np.testing.assert_allclose(np.array(dr.detach(found)).ravel(), expected[5], rtol=0, atol=rounding(float_type))
+    np.testing.assert_allclose(np.array(dr.detach(found)).ravel(), expected[5], rtol=0, atol=rounding)
     dr.backward(found.x)
     of_row = weights.toarray()[5] if is_weighted else np.eye(COLUMNS)[5]
     found = np.array(dr.grad(given)).reshape(-1, 3)
-    np.testing.assert_allclose(found, of_row[:, None] * [1, 0, 0], rtol=0, atol=rounding(float_type))
+    np.testing.assert_allclose(found, of_row[:, None] * [1, 0, 0], rtol=0, atol=rounding)
 
 
-def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, weights, np_rng):
+def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, rounding, weights, np_rng):
     types, weighted = ArrayTypes.of(float_type), WeightedValues(weights, float_type)
     values = np_rng.random((COLUMNS, 3))
     make = partial(weighted, size=3)
@@ -81,4 +75,4 @@ def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, 
     assert len({each.flat.index for each in (first, other, apart)}) == 3
     first.set(upload(float_type, 2 * values))
     np.testing.assert_array_equal(second.flat, kept)
-    np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding(float_type))
+    np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding)

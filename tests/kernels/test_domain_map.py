@@ -1,12 +1,9 @@
 """Copies of a domain: how often parameters are doubled, and that each copy has its parameters."""
 
-import sys
-
 import numpy as np
 import pytest
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.kernels.domain_map import doublings, in_child
-from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 
 MOST = 30
@@ -14,12 +11,9 @@ MOST = 30
 ROUNDED = 2.0**-24
 
 
-@pytest.fixture(params=["Float", "Float64"])
-def types(request):
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
-    return ArrayTypes.of(getattr(sys.modules["drjit.llvm.ad"], request.param))
+@pytest.fixture
+def types(float_type):
+    return ArrayTypes.of(float_type)
 
 
 def on_device(function, types, *numbers):

@@ -1,14 +1,13 @@
 """Nearest and random points on a device: those that NumPy finds, with derivatives that follow them."""
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, on_device, surface_named, vectors
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.patches import PieceTable
+from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
+
+pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
 # Of distances, in sizes of the surface. Measured: 2e-15 and 2e-7.
@@ -25,27 +24,10 @@ ROUNDED = 1e-15
 
 # One for each kind of piece and of border: the searches ask for points and derivatives only, which
 # test_surface_kernel compares on all surfaces.
-KINDS = (
-    *(
-        "torus",
-        "valence 50",
-        "smooth triangles",
-        "half disc of 6",
-        "non-manifold",
-        "corner",
-        "semi-sharp ring",
-        "chaikin",
-    ),
-    *("propeller", "loop mixed torus", "loop sheet", "loop corner", "doo_sabin mixed torus", "doo_sabin sheet"),
-)
+KINDS = ["torus", "valence 50", "smooth triangles", "half disc of 6", "non-manifold", "corner", "semi-sharp ring"]
+KINDS += ["chaikin", "propeller", "loop mixed torus", "loop sheet", "loop corner", "doo_sabin mixed torus"]
+KINDS += ["doo_sabin sheet"]
 EVERY_KIND = pytest.mark.parametrize("name", KINDS)
-
-
-@pytest.fixture(autouse=True)
-def _llvm():
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
 
 
 def points_near(surface, count, np_rng, away=0.03):
@@ -54,8 +36,10 @@ def points_near(surface, count, np_rng, away=0.03):
     return size, samples.p + away * size * np_rng.normal(size=(count, 1)) * samples.n
 
 
-def device_points(types, points):
-    return upload(types.vector3, points)
+def closest(kernel, points, *start):
+    found = kernel.closest(upload(kernel.types.vector3, points), *on_device(kernel.types, *start))
+    dr.eval(found)
+    return found
 
 
 @EVERY_KIND
@@ -67,11 +51,7 @@ def test_nearest_points_are_minima_from_places_beside_them(name, np_rng):
     uv = np.where(expected.uv > 0.45, expected.uv, uv)
     # Both against one search, which takes longer than they do.
     for variant, bar in BARS.items():
-        kernel = kernel_named(name, variant)
-        found = kernel.closest(
-            device_points(kernel.types, points), *on_device(kernel.types, expected.element, uv, expected.corner)
-        )
-        dr.eval(found)
+        found = closest(kernel_named(name, variant), points, expected.element, uv, expected.corner)
         distance = np.array(found.distance, dtype=np.float64)
         assert (distance >= expected.distance - bar * size).all(), variant
         assert (distance <= expected.distance + bar * size).mean() >= SAME, variant
@@ -83,7 +63,7 @@ def test_locations_of_results_start_the_next_call(np_rng):
     surface, kernel = surface_named("torus"), kernel_named("torus", DOUBLE)
     _, points = points_near(surface, 40, np_rng)
     near = surface.closest_point(points)
-    points, place = device_points(kernel.types, points), on_device(kernel.types, near.element, near.uv, near.corner)
+    points, place = upload(kernel.types.vector3, points), on_device(kernel.types, near.element, near.uv, near.corner)
     found = kernel.closest(points, *place)
     again = kernel.closest(points, found.location)
     there = kernel.evaluate(found.location)
@@ -98,15 +78,11 @@ def test_locations_of_results_start_the_next_call(np_rng):
 @pytest.mark.parametrize("name", ["sheet", "half disc of 6", "loop sheet", "holes", "crease"])
 def test_minima_on_borders_are_found(name, np_rng):
     """From inside an element, for points that lie beyond a border."""
-    surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
+    surface = surface_named(name)
     size, points = points_near(surface, 150, np_rng, 0.3)
     points += np_rng.normal(size=points.shape) * 0.3 * size
-    expected = surface.closest_point(points)
-    middle = np.full((150, 2), 1 / 3)
-    found = kernel.closest(
-        device_points(kernel.types, points), *on_device(kernel.types, expected.element, middle, expected.corner)
-    )
-    dr.eval(found)
+    expected, middle = surface.closest_point(points), np.full((150, 2), 1 / 3)
+    found = closest(kernel_named(name, DOUBLE), points, expected.element, middle, expected.corner)
     distance = np.array(found.distance)
     assert (distance >= expected.distance - BARS[DOUBLE] * size).all()
     # Others are minima of their own: the surfaces bend.
@@ -121,23 +97,21 @@ def test_derivatives_follow_nearest_points(name, np_rng):
     types, count = kernel.types, 30
     _, points = points_near(surface, count, np_rng, 0.1)
     expected = surface.closest_point(points)
-    locations = on_device(types, expected.element, expected.uv, expected.corner)
+    locations = expected.element, expected.uv, expected.corner
     moves, ways = np_rng.normal(size=positions.shape), np_rng.normal(size=points.shape)
 
     def found_at(step):
         kernel.set_control_points(types.floats((positions + step * moves).ravel()))
-        found = kernel.closest(device_points(types, points + step * ways), *locations)
-        # In one kernel.
-        dr.eval(found)
+        found = closest(kernel, points + step * ways, *locations)
         return [vectors(found.p), vectors(found.n), np.array(found.distance)]
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(found_at(STEP), found_at(-STEP), strict=True)]
-    control_points, targets = types.floats(positions.ravel()), device_points(types, points)
+    control_points, targets = types.floats(positions.ravel()), upload(types.vector3, points)
     dr.enable_grad(control_points, targets)
     dr.set_grad(control_points, types.floats(moves.ravel()))
-    dr.set_grad(targets, device_points(types, ways))
+    dr.set_grad(targets, upload(types.vector3, ways))
     kernel.set_control_points(control_points)
-    found = kernel.closest(targets, *locations)
+    found = kernel.closest(targets, *on_device(types, *locations))
     # Derivatives are taken off what is on the way to others.
     p, n, distance = dr.forward_to([found.p * 1, found.n * 1, found.distance * 1])
     dr.eval(p, n, distance)
@@ -146,9 +120,8 @@ def test_derivatives_follow_nearest_points(name, np_rng):
 
 
 def drawn_points(kernel, count, np_rng):
-    types = kernel.types
-    numbers = np_rng.random((3, count))
-    found = kernel.sample(types.floats(numbers[0]), types.vector2(*map(types.floats, numbers[1:])))
+    one, *pair = map(kernel.types.floats, np_rng.random((3, count)))
+    found = kernel.sample(one, kernel.types.vector2(*pair))
     dr.eval(found)
     return found
 
@@ -194,10 +167,6 @@ def test_densities_are_those_of_the_moved_surface(np_rng):
 
 
 def test_a_kernel_without_cells_draws_none():
-    from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
-
-    surface = surface_named("torus")
-    table: PieceTable = surface.pieces()
-    kernel = SurfaceKernel(table, dr.llvm.ad.Float)
+    kernel = SurfaceKernel(surface_named("torus").pieces(), dr.llvm.ad.Float)
     with pytest.raises(ValueError, match="the kernel was made without cells to draw from"):
         kernel.sample(0.5, dr.llvm.ad.Array2f(0.5, 0.5))

@@ -1,7 +1,5 @@
 """Laws of searches and of points, one by one, in double precision."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import drjit as dr
@@ -46,10 +44,8 @@ def test_rays_from_far_away_hit_as_exactly_as_from_nearby():
     uv = np.array([0.25, 0.375])
     target = np.round(surface.evaluate([5], uv[None]).p[0] * 1024) / 1024
     d = np.array([1.0, -1.0, 1.0])
-    near, far = (
-        kernel.intersect(SimpleNamespace(o=vector(target - t * d), d=vector(d)), *place(5, uv + 0.03, 0))
-        for t in (1.0, 2.0**33)
-    )
+    rays = (SimpleNamespace(o=vector(target - t * d), d=vector(d)) for t in (1.0, 2.0**33))
+    near, far = (kernel.intersect(ray, *place(5, uv + 0.03, 0)) for ray in rays)
     assert np.isfinite(numbers(near.t)).all()
     np.testing.assert_allclose(numbers(far.p), numbers(near.p), rtol=0, atol=1e-9)
 
@@ -103,19 +99,16 @@ def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
     matrix = np.eye(4)
     matrix[:3] = np_rng.normal(size=(3, 4))
     to_world = AffineMap.of(dr.llvm.ad.Matrix4f64(matrix.tolist()))
-    np.testing.assert_allclose(
-        numbers(to_world.inverse_point(to_world.point(vector((1, 2, 3))))), (1, 2, 3), rtol=0, atol=10 * ROUNDING
-    )
+    there_and_back = numbers(to_world.inverse_point(to_world.point(vector((1, 2, 3)))))
+    np.testing.assert_allclose(there_and_back, (1, 2, 3), rtol=0, atol=10 * ROUNDING)
 
     def at(u, v):
         return kernel.evaluate(*place(3, (u, v), 0), derivatives=2).placed(to_world)
 
     found = at(0.3, 0.2)
-    for turn, ahead, behind in (
-        (found.dn_du, at(0.3 + STEP, 0.2), at(0.3 - STEP, 0.2)),
-        (found.dn_dv, at(0.3, 0.2 + STEP), at(0.3, 0.2 - STEP)),
-    ):
-        difference = (numbers(ahead.n) - numbers(behind.n)) / (2 * STEP)
+    for turn, du, dv in ((found.dn_du, STEP, 0), (found.dn_dv, 0, STEP)):
+        ahead, behind = (numbers(at(0.3 + side * du, 0.2 + side * dv).n) for side in (1, -1))
+        difference = (ahead - behind) / (2 * STEP)
         np.testing.assert_allclose(numbers(turn), difference, rtol=0, atol=DIFFERENCES * np.abs(difference).max())
 
 

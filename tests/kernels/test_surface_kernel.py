@@ -4,8 +4,6 @@
 equations over eigen-coordinates, where the kernel has a table of polynomials over control points.
 """
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import drjit as dr
@@ -19,11 +17,12 @@ from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS
 from mitsuba_subdivision.kernels.line_intersection import ON_NORMAL
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
-from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import bumpy
 from reference.refined_cages import half_disc, refine_first
+
+pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
 # Of cages of a size of about 3. Points are sums of some tens of products; normals and derivatives relative to their
@@ -51,13 +50,6 @@ THIRD = 1e-5
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 
 
-@pytest.fixture(autouse=True)
-def _llvm():
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
-
-
 def computed(found):
     """Samples or hits, computed by one kernel."""
     dr.eval(found)
@@ -65,7 +57,15 @@ def computed(found):
 
 
 def evaluated(kernel, *locations, derivatives=1):
-    return computed(kernel.evaluate(*locations, derivatives=derivatives))
+    return computed(kernel.evaluate(*on_device(kernel.types, *locations), derivatives=derivatives))
+
+
+def hit(kernel, o, d, *start):
+    return computed(kernel.intersect(rays_of(kernel.types, o, d), *on_device(kernel.types, *start)))
+
+
+def rays_of(types, o, d):
+    return SimpleNamespace(o=upload(types.vector3, o), d=upload(types.vector3, d))
 
 
 def unequal(found, expected):
@@ -79,17 +79,8 @@ def sine(samples):
     return np.linalg.norm(np.cross(u, v), axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
 
 
-@pytest.mark.core
-@EVERY_SURFACE
-@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
-def test_points_tangents_and_normals_are_the_surfaces(name, variant, np_rng):
-    surface, kernel, bars = surface_named(name), kernel_named(name, variant), BARS[variant]
-    element, uv, corner = random_locations(surface, np_rng, 1500)
-    uv[:100] = 0
-    found, expected = (
-        evaluated(kernel, *on_device(kernel.types, element, uv, corner)),
-        surface.evaluate(element, uv, corner),
-    )
+def assert_same(found, expected, bars):
+    """Points, normals and tangents of a kernel are those of the surface."""
     np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
     # At extraordinary points, tangents have arbitrary length.
     has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
@@ -101,11 +92,21 @@ def test_points_tangents_and_normals_are_the_surfaces(name, variant, np_rng):
 
 
 @pytest.mark.core
+@EVERY_SURFACE
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_points_tangents_and_normals_are_the_surfaces(name, variant, np_rng):
+    surface = surface_named(name)
+    locations = random_locations(surface, np_rng, 1500)
+    locations[1][:100] = 0
+    assert_same(evaluated(kernel_named(name, variant), *locations), surface.evaluate(*locations), BARS[variant])
+
+
+@pytest.mark.core
 @pytest.mark.parametrize("shape", [(0, 0, 0), (1, 0, 0)], ids=["a point", "a curve"])
 def test_normals_of_a_collapsed_surface_do_not_turn(shape, np_rng):
     kernel = LimitSurface(cube().with_positions(cube().positions * shape)).on_device(SINGLE)
     locations = random_locations(surface_named("cube"), np_rng, 20, deepest=1)
-    found = evaluated(kernel, *on_device(kernel.types, *locations), derivatives=2)
+    found = evaluated(kernel, *locations, derivatives=2)
     for derivative in (found.dn_du, found.dn_dv):
         np.testing.assert_array_equal(vectors(derivative), 0)
 
@@ -117,12 +118,12 @@ BORDERS = ["sheet without corners", "half disc of 6", "dart", "crease", "corner"
 @pytest.mark.parametrize("name", BORDERS)
 def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(name, np_rng):
     """Where the derivatives become parallel, level by level."""
-    surface, kernel = surface_named(name), kernel_named(name, SINGLE)
+    surface = surface_named(name)
     elements, cut = surface.patches.elements, surface.patches.topology
     element, uv, corner = random_locations(surface, np_rng, 4000, deepest=22)
     beside = cut.is_border_vertex[cut.face_vertices[elements.face_offsets[element] + corner]] & (uv.max(axis=1) < 0.1)
     locations = element[beside], uv[beside], corner[beside]
-    found, expected = evaluated(kernel, *on_device(kernel.types, *locations)), surface.evaluate(*locations)
+    found, expected = evaluated(kernel_named(name, SINGLE), *locations), surface.evaluate(*locations)
     assert expected.level.max() > 18
     np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BORDER_NORMAL)
 
@@ -133,10 +134,10 @@ def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
 
     Kernels have the corner's own normal where the point is the corner in single precision, and only there.
     """
-    surface, kernel = surface_named(name), kernel_named(name, SINGLE)
+    surface = surface_named(name)
     element, uv, corner = random_locations(surface, np_rng, 8000)
     uv = (uv * 2.0 ** -np_rng.uniform(0, 100, (8000, 1))).astype(np.float32).astype(float)
-    found = evaluated(kernel, *on_device(kernel.types, element, uv, corner))
+    found = evaluated(kernel_named(name, SINGLE), element, uv, corner)
     expected, at_corner = surface.evaluate(element, uv, corner), surface.evaluate(element, 0 * uv, corner)
     differs = np.linalg.norm(vectors(found.n) - expected.n, axis=1) > BARS[SINGLE]["normal"]
     assert differs.any()
@@ -149,9 +150,9 @@ def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
 @pytest.mark.core
 @pytest.mark.parametrize("name", ["hexagon", "valence 50", "sheet", "loop corner", "doo_sabin mixed torus"])
 def test_derivatives_of_normals_are_those_of_the_surface(name, np_rng):
-    surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
+    surface = surface_named(name)
     locations = random_locations(surface, np_rng, 500, deepest=4)
-    found = evaluated(kernel, *on_device(kernel.types, *locations), derivatives=2)
+    found = evaluated(kernel_named(name, DOUBLE), *locations, derivatives=2)
     s = surface.evaluate(*locations, derivatives=2)
     area = np.linalg.norm(np.cross(s.dp_du, s.dp_dv), axis=1)[:, None]
     for derivative, of_u, of_v in ((found.dn_du, s.d2p_duu, s.d2p_duv), (found.dn_dv, s.d2p_duv, s.d2p_dvv)):
@@ -166,31 +167,25 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     refine_first(monkeypatch)
     refined = LimitSurface(surface.cage)
     assert refined.patches.refined is not None
-    element, uv, corner = random_locations(surface, np_rng, 500)
+    locations = random_locations(surface, np_rng, 500)
     # On the lines between quarters, too.
-    uv[:20, 0] = 0.5
-    kernel, expected = refined.on_device(DOUBLE), surface.evaluate(element, uv, corner)
-    found = evaluated(kernel, *on_device(kernel.types, element, uv, corner))
-    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[DOUBLE]["point"])
+    locations[1][:20, 0] = 0.5
+    found, expected = evaluated(refined.on_device(DOUBLE), *locations), surface.evaluate(*locations)
+    assert_same(found, expected, BARS[DOUBLE])
     np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BARS[DOUBLE]["normal"])
-    assert unequal(found.dp_du, expected.dp_du).max() <= BARS[DOUBLE]["derivative"]
 
 
 @pytest.mark.parametrize("levels", range(PIECE_LEVELS))
 @pytest.mark.parametrize("name", ["valence 50", "corner", "chaikin", "loop half disc of 6", "doo_sabin mixed torus"])
 def test_levels_of_tips_are_the_same_surface_as_pieces_and_as_sums(name, levels, np_rng):
-    surface, bars = surface_named(name), BARS[DOUBLE]
+    surface = surface_named(name)
     locations = random_locations(surface, np_rng, 600)
     locations[1][:60] = 0
     rows = surface.cage.cut_mesh.vertex, surface.cage.vertex_count
     float_type = kernel_named(name, DOUBLE).types.float
     kernel = SurfaceKernel(PieceTable.build(surface.patches, *rows, levels), float_type)
     kernel.set_control_points(upload(float_type, surface.cage.positions))
-    found, expected = evaluated(kernel, *on_device(kernel.types, *locations)), surface.evaluate(*locations)
-    has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
-    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
-    lost = np.linalg.norm(vectors(found.n) - expected.n, axis=1) * np.where(has_derivatives, sine(expected), 1)
-    assert lost.max() <= bars["normal"]
+    assert_same(evaluated(kernel, *locations), surface.evaluate(*locations), BARS[DOUBLE])
 
 
 class OfAUser(CatmullClark):
@@ -200,11 +195,10 @@ class OfAUser(CatmullClark):
 
 
 def test_a_scheme_of_a_user_is_evaluated(np_rng):
-    surface = LimitSurface(surface_named("hexagon").cage, OfAUser())
-    locations = random_locations(surface, np_rng, 200)
-    kernel, expected = surface.on_device(DOUBLE), surface_named("hexagon").evaluate(*locations)
-    found = evaluated(kernel, *on_device(kernel.types, *locations))
-    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[DOUBLE]["point"])
+    known = surface_named("hexagon")
+    locations = random_locations(known, np_rng, 200)
+    found = evaluated(LimitSurface(known.cage, OfAUser()).on_device(DOUBLE), *locations)
+    assert_same(found, known.evaluate(*locations), BARS[DOUBLE])
 
 
 # Stam's form
@@ -215,8 +209,7 @@ def test_stams_form_is_the_same_but_for_rounding(np_rng):
     locations = random_locations(surface, np_rng, 500, deepest=5)
     expected = surface.evaluate(*locations)
     for variant, bar in ((DOUBLE, FIRST_TERM), (SINGLE, 1e-4)):
-        kernel = kernel_named("valence 3", variant, "stam")
-        found = evaluated(kernel, *on_device(kernel.types, *locations))
+        found = evaluated(kernel_named("valence 3", variant, "stam"), *locations)
         np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=bar)
 
 
@@ -226,8 +219,7 @@ def test_stams_form_loses_the_normal_in_single_precision_and_the_stabilised_does
     element = np.zeros(200, dtype=int)
     expected, lost = surface.evaluate(element, uv), {}
     for evaluator in ("stam", "stabilized"):
-        kernel = kernel_named("valence 3", SINGLE, evaluator)
-        found = evaluated(kernel, *on_device(kernel.types, element, uv, 0 * element))
+        found = evaluated(kernel_named("valence 3", SINGLE, evaluator), element, uv, 0 * element)
         lost[evaluator] = np.linalg.norm(vectors(found.n) - expected.n, axis=1)
     assert np.median(lost["stam"]) > 1e-3
     assert lost["stabilized"].max() < 1e-6
@@ -334,7 +326,7 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
     def outputs():
         kernel.set_control_points(points)
         found = kernel.evaluate(*on_device(kernel.types, *locations))
-        return [found.p, found.n, found.dp_du]
+        return found.p, found.n, found.dp_du
 
     change = kernel.types.floats(direction.ravel())
     forwards = forward(outputs(), [points], [change])
@@ -347,36 +339,20 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
 
 
 @pytest.mark.parametrize("name", ["polygons", "triangles"])
-def test_derivatives_by_parameters_are_the_tangents_and_those_of_the_normal(name, np_rng):
-    surface = small_surface(name)
-    kernel = surface.on_device(DOUBLE)
-    element, uv, corner = on_device(kernel.types, *random_locations(surface, np_rng, 200, deepest=6))
-    for axis in (0, 1):
-        own = kernel.types.vector2(uv)
-        dr.enable_grad(own)
-        found = kernel.evaluate(element, own, corner, derivatives=2)
-        changes = forward([found.p, found.n], [own], [kernel.types.vector2(1 - axis, axis)])
-        by_axis = (found.dp_du, found.dn_du) if axis == 0 else (found.dp_dv, found.dn_dv)
-        for change, derivative in zip(changes, map(vectors, by_axis), strict=True):
-            scale = np.linalg.norm(derivative, axis=1).max()
-            np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
-
-
-@pytest.mark.parametrize("name", ["polygons", "triangles"])
-def test_derivatives_of_tangents_by_parameters_are_second_derivatives(name, np_rng):
-    """At the deeper levels of tips, too, where those by hits leave them out."""
+def test_derivatives_by_parameters_are_tangents_and_those_of_tangents_and_normals(name, np_rng):
+    """At the deeper levels of tips, too, where those by hits leave second derivatives out."""
     surface = small_surface(name)
     kernel = surface.on_device(DOUBLE)
     location = random_locations(surface, np_rng, 200, deepest=6)
     element, uv, corner = on_device(kernel.types, *location)
     expected = surface.evaluate(*location, derivatives=2)
-    second = ((expected.d2p_duu, expected.d2p_duv), (expected.d2p_duv, expected.d2p_dvv))
-    for axis, by_axis in enumerate(second):
+    for axis, second in enumerate(((expected.d2p_duu, expected.d2p_duv), (expected.d2p_duv, expected.d2p_dvv))):
         own = kernel.types.vector2(uv)
         dr.enable_grad(own)
-        found = kernel.evaluate(element, own, corner)
-        changes = forward([found.dp_du, found.dp_dv], [own], [kernel.types.vector2(1 - axis, axis)])
-        for change, derivative in zip(changes, by_axis, strict=True):
+        one, two = (kernel.evaluate(element, own, corner, derivatives=order) for order in (1, 2))
+        changes = forward([two.p, two.n, one.dp_du, one.dp_dv], [own], [kernel.types.vector2(1 - axis, axis)])
+        first = (two.dp_du, two.dn_du) if axis == 0 else (two.dp_dv, two.dn_dv)
+        for change, derivative in zip(changes, (*map(vectors, first), *second), strict=True):
             scale = np.linalg.norm(derivative, axis=1).max()
             np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
 
@@ -396,18 +372,8 @@ def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
     start += np.maximum(-start, 0)
     beyond = np.maximum(domain.extent(start) - 1, 0)[:, None]
     start = np.clip(start - beyond, 0, 1)
-    distance = rng.uniform(0.5, 3, (count, 1))
-    lengths = rng.uniform(0.5, 2, (count, 1))
-    return (
-        target.p[kept],
-        (target.p - distance * d)[kept],
-        (lengths * d)[kept],
-        [each[kept] for each in (element, start, corner)],
-    )
-
-
-def rays_of(types, o, d):
-    return SimpleNamespace(o=upload(types.vector3, o), d=upload(types.vector3, d))
+    o, d = target.p - rng.uniform(0.5, 3, (count, 1)) * d, rng.uniform(0.5, 2, (count, 1)) * d
+    return target.p[kept], o[kept], d[kept], [each[kept] for each in (element, start, corner)]
 
 
 HIT = ["mixed torus", "sheet", "corner", "chaikin", "loop corner", "doo_sabin mixed torus"]
@@ -423,14 +389,11 @@ ON_RAY = {DOUBLE: 2e-6, SINGLE: 5e-6}
 def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
     surface, kernel = surface_named(name), kernel_named(name, variant)
     target, o, d, start = aimed(surface, np_rng, 1000)
-    found = computed(kernel.intersect(rays_of(kernel.types, o, d), *on_device(kernel.types, *start)))
+    found = hit(kernel, o, d, *start)
     t, p = np.array(found.t).astype(float), vectors(found.p)
     met = np.isfinite(t)
     assert met.mean() > 0.99
-    distance = np.linalg.norm(
-        o + t[met, None] * d[met] - p[met] if met.all() else (o + t[:, None] * d - p)[met], axis=1
-    )
-    assert distance.max() <= ON_RAY[variant]
+    assert np.linalg.norm(o + t[:, None] * d - p, axis=1)[met].max() <= ON_RAY[variant]
     # A few rays meet another part of the surface that is as near.
     assert (np.linalg.norm(p - target, axis=1)[met] <= 10 * ON_RAY[variant]).mean() > 0.99
     # The location that is found is where the point lies.
@@ -483,9 +446,8 @@ def test_lines_find_the_same_place_of_a_border_seen_from_any_corner(beyond):
     for turns in (1, 2, 3):
         _, met = met_past_a_border(kernel, surface, beyond, turns)
         np.testing.assert_array_equal(np.array(met.location.half_edge), np.array(expected.location.half_edge))
-        np.testing.assert_allclose(
-            vectors(met.values.value), vectors(expected.values.value), rtol=0, atol=ON_RAY[DOUBLE]
-        )
+        found, there = vectors(met.values.value), vectors(expected.values.value)
+        np.testing.assert_allclose(found, there, rtol=0, atol=ON_RAY[DOUBLE])
 
 
 @pytest.mark.parametrize("depth", [8, 11, 14])
@@ -498,8 +460,7 @@ def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(depth, 
     target = surface.evaluate(element, uv, corner)
     start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
     d = -target.n + np_rng.uniform(-0.5, 0.5, (300, 3))
-    rays = rays_of(kernel.types, target.p - 2 * d, d)
-    found = computed(kernel.intersect(rays, *on_device(kernel.types, element, start, corner)))
+    found = hit(kernel, target.p - 2 * d, d, element, start, corner)
     met = np.isfinite(np.array(found.t))
     # A few wander between pieces until they are given up.
     assert met.mean() > 0.97
@@ -517,16 +478,12 @@ def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):
     d = along[:, 0] * s.dp_du + along[:, 1] * s.dp_dv
     d /= np.linalg.norm(d, axis=1)[:, None]
     for height, are_met in ((0.05, False), (-0.05, True)):
-        rays = rays_of(kernel.types, s.p + height * s.n - 2 * d, d)
-        found = computed(kernel.intersect(rays, *on_device(kernel.types, element, uv, corner)))
+        found = hit(kernel, s.p + height * s.n - 2 * d, d, element, uv, corner)
         met = np.isfinite(np.array(found.t))
         assert np.isfinite(vectors(found.p)).all()
         assert np.isfinite(vectors(found.n)).all()
-        if are_met:
-            # Grazing rays may be given up.
-            assert met.mean() > 0.9
-        else:
-            assert not met.any()
+        # Grazing rays may be given up.
+        assert met.mean() > 0.9 if are_met else not met.any()
 
 
 @pytest.mark.parametrize("name", ["polygons", "border", "triangles"])
@@ -537,7 +494,7 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
     types, vector3 = kernel.types, kernel.types.vector3
     _, o, d, start = aimed(surface, np_rng, 80, near=0.02)
     # From where they meet the surface: then nothing but rounding is left after three more steps.
-    found = computed(kernel.intersect(rays_of(types, o, d), *on_device(types, *start)).location)
+    found = hit(kernel, o, d, *start).location
     half_edge, first = np.array(found.half_edge), surface.patches.elements.face_offsets
     element = np.searchsorted(first, half_edge, side="right") - 1
     locations = on_device(types, element, np.array([found.u, found.v]).T, half_edge - first[element])
@@ -547,8 +504,7 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
     def met(step):
         points, *ray = (each + step * direction for each, direction in zip(values, directions, strict=True))
         kernel.set_control_points(types.floats(points.ravel()))
-        rays = rays_of(types, *ray)
-        found = computed(kernel.intersect(rays, *locations))
+        found = computed(kernel.intersect(rays_of(types, *ray), *locations))
         return vectors(found.p), vectors(found.n), np.array(found.t)
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(met(STEP), met(-STEP), strict=True)]
@@ -586,8 +542,7 @@ def test_rays_beside_an_extraordinary_vertex_meet_the_surface_there(cage, scheme
     for level in (6, 10, 14):
         uv = np_rng.random((500, 2)) * 2.0 ** -(level + 1)
         target = surface.evaluate(element, uv, corner)
-        rays = rays_of(kernel.types, target.p + 0.1 * target.n, -target.n)
-        found = computed(kernel.intersect(rays, *on_device(kernel.types, element, uv, corner)))
+        found = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
         assert np.isfinite(np.array(found.t)).mean() > 0.98
 
 
@@ -595,14 +550,10 @@ def test_rays_beside_an_extraordinary_vertex_meet_the_surface_there(cage, scheme
 
 
 def test_control_points_can_be_others_but_not_more():
-    surface = LimitSurface(cube())
-    kernel = surface.on_device(SINGLE)
-    moved = bumpy(cube())
+    kernel, moved = LimitSurface(cube()).on_device(SINGLE), bumpy(cube())
     kernel.set_control_points(kernel.types.floats(moved.positions.ravel()))
-    uv = np.array([[0.3, 0.4]])
-    found = evaluated(kernel, *on_device(kernel.types, np.array([1]), uv, np.array([2])))
-    expected = LimitSurface(moved).evaluate(1, uv, 2)
-    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[SINGLE]["point"])
+    place = np.array([1]), np.array([[0.3, 0.4]]), np.array([2])
+    assert_same(evaluated(kernel, *place), LimitSurface(moved).evaluate(*place), BARS[SINGLE])
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel.set_control_points(dr.zeros(kernel.types.float, 21))
 
@@ -619,11 +570,14 @@ def test_control_points_and_places_have_any_natural_form():
         np.testing.assert_allclose(found, expected, rtol=0, atol=BARS[SINGLE]["point"])
 
 
+ARRAYS_ONLY = "expected one of Mitsuba's for arrays, which begin with llvm or cuda"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("opencl_rgb",), 'variant "opencl_rgb"; expected one of Mitsuba\'s for arrays, which begin with llvm or cuda'),
-        (("scalar_rgb",), 'variant "scalar_rgb"; expected one of Mitsuba\'s for arrays, which begin with llvm or cuda'),
+        (("opencl_rgb",), f'variant "opencl_rgb"; {ARRAYS_ONLY}'),
+        (("scalar_rgb",), f'variant "scalar_rgb"; {ARRAYS_ONLY}'),
         ((SINGLE, "power"), 'evaluator "power"; expected "stabilized" or "stam" on a device'),
     ],
 )

@@ -1,15 +1,12 @@
 """From triangles of a tessellation back to the surface: their corners are its vertices, and inside nothing jumps."""
 
-from __future__ import annotations
-
 import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, surface_named, vectors
 from mitsuba_subdivision.kernels.triangle_locations import UniformLocations
-from mitsuba_subdivision.llvm import llvm_problem
 
-pytestmark = pytest.mark.core
+pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
 SURFACES = ["torus", "hexagon", "holes", "loop corner", "doo_sabin mixed torus"]
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
@@ -18,13 +15,6 @@ EVERY_RATE = pytest.mark.parametrize("rate", [1, 2, 3, 4])
 # Of a size of about 3; where parameters are rounded, points move along by some units of that.
 POINT = 1e-13
 CHANGED = 1e-12
-
-
-@pytest.fixture(autouse=True)
-def _llvm():
-    problem = llvm_problem()
-    if problem:
-        pytest.skip(problem)
 
 
 def made(name, rate):

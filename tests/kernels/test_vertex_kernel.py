@@ -11,37 +11,28 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import VertexKernel
 from patches.closed_cages import bumpy
+from reference.refined_cages import tagged
 
-# Float32 sums of up to some tens of terms of order one.
-SINGLE = 2e-6
-DOUBLE = 1e-13
-
-
-def tolerance(float_type):
-    return DOUBLE if dr.type_v(float_type) == dr.VarType.Float64 else SINGLE
-
-
-CASES = ["cube", "valence 5", "mixed", "large valence", "torus", "doo_sabin"]
+MIXED = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4]]
+CASES = {
+    "cube": lambda: LimitSurface(named_cages.cube()),
+    "valence 5": lambda: LimitSurface(named_cages.extraordinary(5, closed=False)),
+    "mixed": lambda: LimitSurface(ControlCage(named_cages.cube().positions, MIXED)),
+    "large valence": lambda: LimitSurface(named_cages.extraordinary(12, closed=False)),
+    # Regular patches only.
+    "torus": lambda: LimitSurface(bumpy(named_cages.torus(5, 4))),
+    "doo_sabin": lambda: LimitSurface(bumpy(named_cages.torus(5, 4)), "doo_sabin"),
+}
 
 
 @pytest.fixture(params=CASES)
 def surface(request):
-    if request.param == "mixed":
-        faces = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4]]
-        return LimitSurface(ControlCage(named_cages.cube().positions, faces))
-    if request.param in ("torus", "doo_sabin"):
-        # Regular patches only.
-        return LimitSurface(bumpy(named_cages.torus(5, 4)), "doo_sabin" if request.param == "doo_sabin" else None)
-    if request.param == "cube":
-        return LimitSurface(named_cages.cube())
-    return LimitSurface(named_cages.extraordinary({"valence 5": 5, "large valence": 12}[request.param], closed=False))
+    return CASES[request.param]()
 
 
 @pytest.mark.core
-def test_both_sides_of_a_crease_have_the_same_positions(float_type):
-    cube = named_cages.cube()
-    faces = cube.face_vertices.reshape(-1, 4)
-    cage = ControlCage(cube.positions, faces, creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
+def test_both_sides_of_a_crease_have_the_same_positions(float_type, rounding):
+    cage = tagged(named_cages.cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
     table = LimitSurface(cage).sampling(4)
     copies = np.flatnonzero(table.weld_target != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
@@ -49,42 +40,34 @@ def test_both_sides_of_a_crease_have_the_same_positions(float_type):
     positions, normals = (vectors(v) for v in VertexKernel(table, float_type)(upload(float_type, cage.positions)))
     assert np.array_equal(positions[copies], positions[table.weld_target[copies]])
     assert ((normals[copies] * normals[table.weld_target[copies]]).sum(axis=1) < 0.9).all()
-    assert np.abs(positions - table.apply(cage.positions)[0]).max() <= tolerance(float_type)
+    assert np.abs(positions - table.apply(cage.positions)[0]).max() <= rounding
 
 
 def vectors(flat):
     return np.array(flat).reshape(-1, 3)
 
 
-def forward_derivatives(kernel, float_type, positions, direction):
-    points = upload(float_type, positions)
-    dr.enable_grad(points)
-    dr.set_grad(points, upload(float_type, direction))
-    outputs = kernel(points)
-    dr.enqueue(dr.ADMode.Forward, points)
-    dr.traverse(dr.ADMode.Forward)
-    return [vectors(dr.grad(output)) for output in outputs]
-
-
 @pytest.mark.core
 @pytest.mark.parametrize("rate", [1, 5])
-def test_equals_sampling_table(surface, rate, float_type):
+def test_equals_sampling_table(surface, rate, float_type, rounding):
     table = surface.sampling(rate)
     positions, normals = VertexKernel(table, float_type)(upload(float_type, surface.cage.positions))
     expected = table.apply(surface.cage.positions)
-    np.testing.assert_allclose(vectors(positions), expected[0], atol=tolerance(float_type))
+    np.testing.assert_allclose(vectors(positions), expected[0], atol=rounding)
     # Normals lose the digits that cancel in the cross product of two nearly parallel tangents.
-    np.testing.assert_allclose(vectors(normals), expected[1], atol=50 * tolerance(float_type))
+    np.testing.assert_allclose(vectors(normals), expected[1], atol=50 * rounding)
 
 
-def test_far_from_the_origin_loses_only_the_rounding_of_points(surface, float_type):
-    kernel = VertexKernel(surface.sampling(4), float_type)
+def test_normals_depend_on_neither_the_origin_nor_the_scale(surface, float_type, rounding):
+    def normals(rate, points):
+        return vectors(VertexKernel(surface.sampling(rate), float_type)(upload(float_type, points))[1])
+
     # Exact in float32, like the control points rounded to 2**-10.
     points = np.round(surface.cage.positions * 1024) / 1024
-    shift = np.array([1024.0, -2048.0, 512.0])
-    near = vectors(kernel(upload(float_type, points))[1])
-    far = vectors(kernel(upload(float_type, points + shift))[1])
-    np.testing.assert_array_equal(near, far)
+    np.testing.assert_array_equal(normals(4, points), normals(4, points + np.array([1024.0, -2048.0, 512.0])))
+    for scale in (1e-12, 1e12):
+        scaled = normals(3, scale * surface.cage.positions)
+        np.testing.assert_allclose(scaled, normals(3, surface.cage.positions), atol=50 * rounding)
 
 
 def launched(kernel, points):
@@ -113,48 +96,39 @@ def test_kernels_do_not_depend_on_where_arrays_lie(surface, float_type):
     assert len(found) == 1
 
 
-def test_values_are_the_same_with_and_without_derivatives(surface, float_type):
-    kernel = VertexKernel(surface.sampling(3), float_type)
-    points = upload(float_type, surface.cage.positions)
+@pytest.mark.core
+def test_derivatives_are_differences_and_the_same_both_ways_and_values_those_without(
+    surface, float_type, rounding, np_rng
+):
+    table = surface.sampling(3)
+    kernel, start = VertexKernel(table, float_type), surface.cage.positions
+    direction, step = np_rng.normal(size=start.shape), 1e-5
+    ahead, behind = (table.apply(start + side * step * direction) for side in (1, -1))
+    points = upload(float_type, start)
     without = kernel(points)
     dr.enable_grad(points)
-    for one, other in zip(without, kernel(points), strict=True):
-        np.testing.assert_allclose(np.array(one), np.array(dr.detach(other)), rtol=0, atol=tolerance(float_type))
-
-
-def test_forward_and_backward_derivatives_agree(surface, float_type, np_rng):
-    kernel = VertexKernel(surface.sampling(3), float_type)
-    flat = surface.cage.positions.ravel()
-    direction = np_rng.normal(size=flat.size)
-    forward = forward_derivatives(kernel, float_type, surface.cage.positions, direction)
-    seeds = [np_rng.normal(size=f.shape) for f in forward]
-
-    points = upload(float_type, flat)
-    dr.enable_grad(points)
-    positions, normals = kernel(points)
-    dr.backward(dr.dot(positions, upload(float_type, seeds[0])) + dr.dot(normals, upload(float_type, seeds[1])))
-    backward = np.array(dr.grad(points))
-
-    expected = sum((f * s).sum() for f, s in zip(forward, seeds, strict=True))
-    scale = sum(np.abs(f * s).sum() for f, s in zip(forward, seeds, strict=True))
-    assert abs(backward @ direction - expected) < 20 * tolerance(float_type) * scale
-
-
-@pytest.mark.core
-def test_derivatives_equal_finite_differences(surface, float_type, np_rng):
-    table = surface.sampling(3)
-    direction = np_rng.normal(size=surface.cage.positions.shape)
-    step = 1e-5
-    ahead, behind = (table.apply(surface.cage.positions + side * step * direction) for side in (1, -1))
-
-    found = forward_derivatives(VertexKernel(table, float_type), float_type, surface.cage.positions, direction)
-    for derivative, a, b in zip(found, ahead, behind, strict=True):
+    dr.set_grad(points, upload(float_type, direction))
+    outputs = kernel(points)
+    dr.enqueue(dr.ADMode.Forward, points)
+    dr.traverse(dr.ADMode.Forward)
+    forward = [vectors(dr.grad(output)) for output in outputs]
+    for one, other in zip(without, outputs, strict=True):
+        np.testing.assert_allclose(np.array(one), np.array(dr.detach(other)), rtol=0, atol=rounding)
+    for derivative, a, b in zip(forward, ahead, behind, strict=True):
         expected = (a - b) / (2 * step)
         # Central differences in float64: truncation of order step**2, rounding of order 1e-16 / step.
         np.testing.assert_allclose(derivative, expected, atol=1e-4 * np.abs(expected).max())
 
+    seeds = [np_rng.normal(size=f.shape) for f in forward]
+    points = upload(float_type, start)
+    dr.enable_grad(points)
+    dr.backward(sum(dr.dot(out, upload(float_type, seed)) for out, seed in zip(kernel(points), seeds, strict=True)))
+    products = np.concatenate([(f * s).ravel() for f, s in zip(forward, seeds, strict=True)])
+    off = np.array(dr.grad(points)) @ direction.ravel() - products.sum()
+    assert abs(off) < 20 * rounding * np.abs(products).sum()
 
-def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
+
+def test_collapsed_patches_have_zero_normals_and_finite_derivatives_and_missing_points_are_an_error(float_type):
     cage = named_cages.cube()
     kernel, points = VertexKernel(LimitSurface(cage).sampling(2), float_type), dr.zeros(float_type, 24)
     dr.enable_grad(points)
@@ -162,18 +136,6 @@ def test_collapsed_patches_have_zero_normals_and_finite_derivatives(float_type):
     dr.backward(dr.sum(positions) + dr.sum(normals))
     assert np.all(np.array(normals) == 0)
     assert np.isfinite(np.array(dr.grad(points))).all()
-
-
-@pytest.mark.parametrize("scale", [1e-12, 1e12])
-def test_normals_do_not_depend_on_scale(surface, float_type, scale):
-    kernel = VertexKernel(surface.sampling(3), float_type)
-    normals = vectors(kernel(upload(float_type, surface.cage.positions))[1])
-    scaled = vectors(kernel(upload(float_type, scale * surface.cage.positions))[1])
-    np.testing.assert_allclose(scaled, normals, atol=50 * tolerance(float_type))
-
-
-def test_wrong_number_of_control_points_is_an_error(float_type):
-    kernel = VertexKernel(LimitSurface(named_cages.cube()).sampling(2), float_type)
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel(dr.zeros(float_type, 21))
 

@@ -1,7 +1,5 @@
 """Cages with every feature that OpenSubdiv has, alone and together, small enough to be refined deeply."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -14,20 +12,6 @@ INFINITE = 10.0
 # What OpenSubdiv keeps of a sharpness is a single-precision number: these are what it makes of 0.3, 1.7 and so on.
 LADDER = [float(np.float32(s)) for s in (0.3, 0.5, 1, 1.75, 2.5, 4, 10, np.inf)]
 MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all")
-
-
-def features(cage: PeerCage) -> set[str]:
-    """What a program must know of to make this cage's surface, beyond infinitely sharp creases and corners."""
-    sharpness = [*(crease[2] for crease in cage.creases), *(corner[1] for corner in cage.corners)]
-    found = {
-        "semi-sharp": any(0 < s < INFINITE for s in sharpness),
-        "chaikin": cage.creasing == "chaikin",
-        "boundary none": cage.boundary == "none",
-        "holes": bool(cage.holes),
-        "smooth triangles": cage.triangles == "smooth",
-        "face-varying": cage.fvar is not None,
-    }
-    return {name for name, is_there in found.items() if is_there}
 
 
 def bumpy(cage: PeerCage, seed: int = 1) -> PeerCage:
@@ -67,6 +51,11 @@ def fan(valence: int, triangles: bool = False, **options) -> PeerCage:
     between = 0.7 * (spokes + np.roll(spokes, -1, axis=0))
     faces = np.stack([0 * k, 1 + k, 1 + valence + k, 1 + (k + 1) % valence], axis=1)
     return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes, between]), faces.tolist(), **options))
+
+
+def spoked(valence: int, sharpness: dict[int, float], **options) -> PeerCage:
+    """A fan with creases along some of its spokes."""
+    return fan(valence, creases=[(0, spoke, s) for spoke, s in sharpness.items()], **options)
 
 
 def bipyramid(sides: int, **options) -> PeerCage:
@@ -134,31 +123,28 @@ def with_islands(cage: PeerCage, seams: Iterable[Edge], mode: str) -> PeerCage:
 
 
 def _catmull_clark() -> dict[str, PeerCage]:
+    around = [*((i, i + 1, INFINITE) for i in range(4)), (4, 9, INFINITE), (5, 10, 2.5)]
+    halves = grid(3, 3, triangles=True, creases=[(5, 6, 1.75), (6, 10, INFINITE)])
     found = {
         "cube": cube(),
         "piece": lathe(),
         "sheet": grid(3, 3),
         "sheet without corners": grid(3, 2, boundary="edge_only"),
         "sheet, nothing interpolated": grid(4, 4, boundary="none"),
-        "sheet, creases interpolated": grid(
-            4, 4, boundary="none", creases=[(i, i + 1, INFINITE) for i in range(4)] + [(4, 9, INFINITE), (5, 10, 2.5)]
-        ),
+        "sheet, creases interpolated": grid(4, 4, boundary="none", creases=around),
         "one quad": grid(1, 1),
         "one quad without corners": grid(1, 1, boundary="edge_only"),
         "strip": grid(3, 1),
         "triangles": replace(bipyramid(5), scheme="catmark"),
         "smooth triangles": bipyramid(5, triangles="smooth"),
-        "smooth triangles, open and creased": replace(
-            grid(3, 3, triangles=True), triangles="smooth", creases=[(5, 6, 1.75), (6, 10, INFINITE)]
-        ),
+        "smooth triangles, open and creased": replace(halves, triangles="smooth"),
     }
     for valence in (3, 4, 5, 6):
         found[f"fan {valence}"] = fan(valence)
         half = valence // 2
         for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
             for s in (1.75, 4, INFINITE) if valence > 3 else (2.5, INFINITE):
-                creases = [(0, spoke, _single(s)) for spoke in spokes]
-                found[f"{name} of {s:g} at valence {valence}"] = fan(valence, creases=creases)
+                found[f"{name} of {s:g} at valence {valence}"] = spoked(valence, dict.fromkeys(spokes, s))
     for s in LADDER:
         found[f"cube, rim {s:.1f}"] = cube(creases=[(a, b, s) for a, b in TOP])
         found[f"cube, edge {s:.1f}"] = cube(creases=[(4, 5, s)])
@@ -168,22 +154,18 @@ def _catmull_clark() -> dict[str, PeerCage]:
         found[f"sheet, border corner {s:.1f}"] = grid(3, 3, corners=[(1, s), (0, s)], boundary="edge_only")
     found |= {
         "piece, rings and rims": lathe([(0, 2.5), (1, INFINITE), (2, 0.5), (4, INFINITE)]),
-        "three semi-sharp edges": fan(5, creases=[(0, 1, 0.5), (0, 2, 1.5), (0, 4, 2.5)]),
-        "five semi-sharp edges": fan(5, creases=[(0, k + 1, 0.5 * k + 0.25) for k in range(5)]),
+        "three semi-sharp edges": spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}),
+        "five semi-sharp edges": spoked(5, {k + 1: 0.5 * k + 0.25 for k in range(5)}),
         "all edges semi-sharp": cube(creases=[(a, b, 1.25 + 0.5 * (a % 3)) for a, b in _edges(cube())]),
-        "crease, semi-sharp on one side": fan(6, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5)]),
-        "crease, semi-sharp on both sides": fan(
-            6, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5), (0, 3, 2.25), (0, 6, 0.75)]
-        ),
-        "dart with semi-sharp edges": fan(5, creases=[(0, 1, INFINITE), (0, 3, 2.5)]),
-        "dart with a semi-sharp pair": fan(6, creases=[(0, 1, INFINITE), (0, 3, 2.5), (0, 5, 1.25)]),
-        "corner of creases, one semi-sharp": fan(
-            6, creases=[(0, 1, INFINITE), (0, 3, INFINITE), (0, 5, INFINITE), (0, 2, 1.5)]
-        ),
-        "semi-sharp corner on a crease": fan(6, creases=[(0, 1, INFINITE), (0, 4, INFINITE)], corners=[(0, 1.5)]),
-        "semi-sharp corner on a semi-sharp crease": fan(6, creases=[(0, 1, 2.5), (0, 4, 2.5)], corners=[(0, 1.5)]),
-        "corner on a semi-sharp crease": fan(6, creases=[(0, 1, 2.5), (0, 4, 2.5)], corners=[(0, INFINITE)]),
-        "corner at the end of a dart": fan(5, creases=[(0, 1, INFINITE)], corners=[(0, INFINITE)]),
+        "crease, semi-sharp on one side": spoked(6, {1: INFINITE, 4: INFINITE, 2: 1.5}),
+        "crease, semi-sharp on both sides": spoked(6, {1: INFINITE, 4: INFINITE, 2: 1.5, 3: 2.25, 6: 0.75}),
+        "dart with semi-sharp edges": spoked(5, {1: INFINITE, 3: 2.5}),
+        "dart with a semi-sharp pair": spoked(6, {1: INFINITE, 3: 2.5, 5: 1.25}),
+        "corner of creases, one semi-sharp": spoked(6, {1: INFINITE, 3: INFINITE, 5: INFINITE, 2: 1.5}),
+        "semi-sharp corner on a crease": spoked(6, {1: INFINITE, 4: INFINITE}, corners=[(0, 1.5)]),
+        "semi-sharp corner on a semi-sharp crease": spoked(6, {1: 2.5, 4: 2.5}, corners=[(0, 1.5)]),
+        "corner on a semi-sharp crease": spoked(6, {1: 2.5, 4: 2.5}, corners=[(0, INFINITE)]),
+        "corner at the end of a dart": spoked(5, {1: INFINITE}, corners=[(0, INFINITE)]),
         "semi-sharp crease to the border": grid(3, 3, creases=[(1, 5, 1.5), (5, 9, 1.5), (9, 13, 1.5)]),
         "crease to the border": grid(3, 3, creases=[(1, 5, INFINITE), (5, 9, INFINITE)]),
         "semi-sharp edge to a border corner": grid(3, 3, creases=[(1, 5, 2.5)], boundary="edge_only"),
@@ -206,9 +188,9 @@ def _chaikin() -> dict[str, PeerCage]:
         "unequal chain": grid(4, 2, creases=chain),
         "chain with an end inside": grid(4, 2, creases=chain[:2]),
         "chain with an infinite part": grid(4, 2, creases=[*chain[:2], (7, 8, INFINITE), chain[3]]),
-        "three edges": fan(5, creases=[(0, 1, 0.5), (0, 2, 1.5), (0, 4, 2.5)]),
-        "two pairs": fan(6, creases=[(0, 1, 2.0), (0, 4, 1.0), (0, 2, 0.5), (0, 5, 3.0)]),
-        "semi-sharp beside a crease": fan(6, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5)]),
+        "three edges": spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}),
+        "two pairs": spoked(6, {1: 2.0, 4: 1.0, 2: 0.5, 5: 3.0}),
+        "semi-sharp beside a crease": spoked(6, {1: INFINITE, 4: INFINITE, 2: 1.5}),
         "semi-sharp corner": replace(lathe(corners=[(6, 1.5)]), creases=ring),
         "to the border": grid(3, 3, creases=[(1, 5, 1.5), (5, 9, 3.0)]),
     }
@@ -219,6 +201,7 @@ def _loop() -> dict[str, PeerCage]:
     def sheet(**options):
         return grid(3, 3, triangles=True, scheme="loop", **options)
 
+    rising = [(4, 5, 1.5), (5, 6, 2.5), (6, 7, INFINITE)]
     found = {
         "sheet": sheet(),
         "sheet without corners": sheet(boundary="edge_only"),
@@ -226,9 +209,7 @@ def _loop() -> dict[str, PeerCage]:
         "hole": sheet(holes=[8]),
         "one triangle": PeerCage([[0, 0, 0], [1, 0, 0.2], [0, 1, 0.5]], [[0, 1, 2]], scheme="loop"),
         "semi-sharp crease to the border": sheet(creases=[(1, 5, 1.5), (5, 9, 2.5)]),
-        "semi-sharp crease and corner": sheet(
-            creases=[(4, 5, 1.5), (5, 6, 2.5), (6, 7, INFINITE)], corners=[(5, 1.25)]
-        ),
+        "semi-sharp crease and corner": sheet(creases=rising, corners=[(5, 1.25)]),
         "Chaikin": sheet(creases=[(4, 5, 0.5), (5, 6, 2.5), (6, 7, 1.0)], creasing="chaikin"),
     }
     for sides in (3, 4, 5, 6, 7):
@@ -242,14 +223,11 @@ def _loop() -> dict[str, PeerCage]:
         half = valence // 2
         for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
             for s in (1.75, INFINITE):
-                creases = [(0, spoke, s) for spoke in spokes]
-                found[f"{name} of {s:g} at valence {valence}"] = fan(valence, triangles=True, creases=creases)
-    found |= {
-        "semi-sharp beside a crease": fan(
-            6, triangles=True, creases=[(0, 1, INFINITE), (0, 4, INFINITE), (0, 2, 1.5), (0, 5, 0.75)]
-        ),
-        "three semi-sharp edges": fan(5, triangles=True, creases=[(0, 1, 0.5), (0, 2, 1.5), (0, 4, 2.5)]),
-    }
+                sharpness = dict.fromkeys(spokes, s)
+                found[f"{name} of {s:g} at valence {valence}"] = spoked(valence, sharpness, triangles=True)
+    beside = {1: INFINITE, 4: INFINITE, 2: 1.5, 5: 0.75}
+    found["semi-sharp beside a crease"] = spoked(6, beside, triangles=True)
+    found["three semi-sharp edges"] = spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}, triangles=True)
     return {f"Loop, {name}": cage for name, cage in found.items()}
 
 
@@ -331,9 +309,7 @@ def _non_manifold() -> dict[str, PeerCage]:
         "book, hole": book(3, holes=[1]),
         "quads that touch in a vertex": joined(grid(2, 2), grid(1, 1), {0: 8}),
         "cones that touch in their tips": joined(fan(4), fan(5), {0: 0}),
-        "cones that touch, creased": joined(
-            fan(5), fan(6), {0: 0}, creases=[(0, 1, INFINITE), (0, 3, INFINITE), (0, 12, 1.5)]
-        ),
+        "cones that touch, creased": joined(fan(5), fan(6), {0: 0}, creases=[(0, 1, 10), (0, 3, 10), (0, 12, 1.5)]),
         "cone on a border": joined(grid(2, 2), fan(5), {0: 1}),
         "cubes that share an edge": joined(cube(), cube(), {0: 7, 1: 6}),
         "cubes that share a face": joined(cube(), cube(), {0: 4, 1: 5, 2: 6, 3: 7}),
@@ -378,11 +354,7 @@ def _non_manifold_islands() -> dict[str, PeerCage]:
         "Moebius strip": (strip(1), [(2, 0), (2, 3)]),
         "Loop, book": (book(3, triangles=True), [(0, 0)]),
     }
-    return {
-        f"no manifold, {name}, {mode}": with_random_values(*cage, mode)
-        for name, cage in plain.items()
-        for mode in MODES
-    }
+    return {f"no manifold, {name}, {mode}": with_random_values(*plain[name], mode) for name in plain for mode in MODES}
 
 
 def _face_varying() -> dict[str, PeerCage]:
@@ -401,12 +373,9 @@ def _face_varying() -> dict[str, PeerCage]:
         **{f"{n} seams at valence 5": (five, [(0, 1 + k) for k in (0, 1, 3)[:n]]) for n in (1, 2, 3)},
         "crease along the seam": (grid(3, 3, creases=[(1, 5, INFINITE), (5, 9, INFINITE)]), [(1, 5), (5, 9), (9, 13)]),
         "crease across the seam": (grid(3, 3, creases=[(4, 5, 2.5), (5, 6, 2.5)]), [(1, 5), (5, 9), (9, 13)]),
-        "crease without a seam": (fan(5, creases=[(0, 1, INFINITE), (0, 3, INFINITE)]), []),
+        "crease without a seam": (spoked(5, {1: INFINITE, 3: INFINITE}), []),
         "semi-sharp crease without a seam": (cube(creases=[(a, b, 1.5) for a, b in TOP]), []),
-        "semi-sharp crease, seam beside it": (
-            fan(6, creases=[(0, 1, 1.5), (0, 4, 1.5), (0, 2, 0.5)]),
-            [(0, 2), (0, 5)],
-        ),
+        "semi-sharp crease, seam beside it": (spoked(6, {1: 1.5, 4: 1.5, 2: 0.5}), [(0, 2), (0, 5)]),
         "corner in an island": (grid(3, 3, corners=[(5, INFINITE), (10, 1.5)]), [(1, 5), (5, 9), (9, 13)]),
         "border without corners": (grid(3, 3, boundary="edge_only"), [(1, 5), (5, 9)]),
         "triangles": (bipyramid(5), [(0, 2), (2, 1), (0, 4)]),
@@ -421,10 +390,6 @@ def _face_varying() -> dict[str, PeerCage]:
 def _edges(cage: PeerCage) -> list[Edge]:
     edges = {tuple(sorted(edge)) for face in cage.faces for edge in zip(face, [*face[1:], face[0]], strict=True)}
     return sorted(edges)
-
-
-def _single(sharpness: float) -> float:
-    return float(np.float32(sharpness))
 
 
 SURFACES: dict[str, PeerCage] = {**_catmull_clark(), **_chaikin(), **_loop(), **_non_manifold()}

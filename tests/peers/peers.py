@@ -4,8 +4,6 @@
 a hash of everything they are made from.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import hashlib

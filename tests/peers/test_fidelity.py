@@ -26,28 +26,13 @@ the limit (13), OpenSubdiv's a product of two edges. At corners with more than o
 the direction from which the corner is approached.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 
-from .fidelity_cages import (
-    ISLANDS,
-    SURFACES,
-    bipyramid,
-    book,
-    cube,
-    fan,
-    features,
-    grid,
-    joined,
-    lattice,
-    scattered,
-    strip,
-)
+from .fidelity_cages import ISLANDS, SURFACES, bipyramid, book, cube, fan, grid, joined, lattice, scattered, strip
 from .peers import PeerCage, evaluate, find
 
 pytestmark = [
@@ -55,9 +40,6 @@ pytestmark = [
     # Cages that are no manifold.
     pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
 ]
-
-# What `ControlCage` knows of, besides infinitely sharp creases and corners; see `features`.
-SUPPORTED: set[str] = {"semi-sharp", "chaikin", "boundary none", "holes", "smooth triangles", "face-varying"}
 
 # Relative to the cage's box; measured 7e-15.
 POINT = 1e-12
@@ -89,9 +71,7 @@ REGULAR_VALENCE = {"catmark": 4, "loop": 6}
 
 def surface_of(cage: PeerCage) -> msub.LimitSurface:
     """This project's surface of a peer's cage."""
-    options = {}
-    if cage.creasing != "uniform":
-        options["crease_method"] = cage.creasing
+    options = {"crease_method": cage.creasing} if cage.creasing != "uniform" else {}
     if cage.triangles != "catmark":
         options["triangle_rule"] = cage.triangles
     if cage.holes:
@@ -105,18 +85,8 @@ def surface_of(cage: PeerCage) -> msub.LimitSurface:
     return msub.LimitSurface(msub.ControlCage(cage.positions, cage.faces, **tags, **options), scheme)
 
 
-def parameters(cages):
-    """Test parameters, of which those that need a feature that is not `SUPPORTED` are skipped."""
-    found = []
-    for name, cage in cages.items():
-        missing = sorted(features(cage) - SUPPORTED)
-        skip = [pytest.mark.skip(reason=f"not supported: {', '.join(missing)}")] if missing else []
-        found.append(pytest.param(cage, id=name, marks=skip))
-    return found
-
-
-EVERY_SURFACE = pytest.mark.parametrize("cage", parameters(SURFACES))
-EVERY_ISLAND = pytest.mark.parametrize("cage", parameters(ISLANDS))
+EVERY_SURFACE = pytest.mark.parametrize("cage", SURFACES.values(), ids=SURFACES)
+EVERY_ISLAND = pytest.mark.parametrize("cage", ISLANDS.values(), ids=ISLANDS)
 
 
 def at(cage, sampling, count):
@@ -195,24 +165,23 @@ def test_points_derivatives_and_normals_between_vertices(cage):
     ours = surface_of(cage).evaluate(element, uv, corner)
     theirs = evaluate(cage, element, uv, corner)
     assert distance(ours.p, theirs.p).max() <= POINT * rounding(cage) * box(cage)
-    assert distance(ours.dp_du, theirs.du).max() <= DERIVATIVE * rounding(cage) * box(cage)
-    assert distance(ours.dp_dv, theirs.dv).max() <= DERIVATIVE * rounding(cage) * box(cage)
+    for derivative, their_own in ((ours.dp_du, theirs.du), (ours.dp_dv, theirs.dv)):
+        assert distance(derivative, their_own).max() <= DERIVATIVE * rounding(cage) * box(cage)
     assert turned(ours, theirs).max() <= NORMAL * rounding(cage)
     single = evaluate(cage, element, uv, corner, real="float")
     assert distance(ours.p, single.p).max() <= POINT_SINGLE * box(cage)
 
 
-@pytest.mark.parametrize(
-    "cage",
-    [
-        cube(creases=[(4, 5, 10)]),
-        fan(5, creases=[(0, 1, 10)]),
-        fan(6, triangles=True, creases=[(0, 1, 10)]),
-        bipyramid(5, scheme="loop", creases=[(0, 2, 10)]),
-        grid(3, 3, creases=[(1, 5, 10), (5, 9, 10)]),
-    ],
-    ids=["cube", "valence 5", "Loop, valence 6", "Loop, valence 5", "sheet"],
-)
+DARTS = {
+    "cube": cube(creases=[(4, 5, 10)]),
+    "valence 5": fan(5, creases=[(0, 1, 10)]),
+    "Loop, valence 6": fan(6, triangles=True, creases=[(0, 1, 10)]),
+    "Loop, valence 5": bipyramid(5, scheme="loop", creases=[(0, 2, 10)]),
+    "sheet": grid(3, 3, creases=[(1, 5, 10), (5, 9, 10)]),
+}
+
+
+@pytest.mark.parametrize("cage", DARTS.values(), ids=DARTS)
 def test_refinement_approaches_the_surface_at_darts(cage):
     element, uv, corner = lattice(cage, 1)
     ours = surface_of(cage).evaluate(element, uv, corner).p

@@ -1,11 +1,9 @@
 """The peers' programs answer what their names say: laws that hold without this project's surfaces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from .fidelity_cages import fan, lathe, scattered
+from .fidelity_cages import fan, lathe, lattice, scattered
 from .peers import PeerCage, PeerError, evaluate, find
 
 # Rounding of a dozen sums, relative to cages of size 2.
@@ -26,18 +24,6 @@ def needs(*peers):
 
 needs_osd = needs("osd")
 needs_both = needs("osd", "embree")
-
-
-def grid(count, **options):
-    positions = [[i, j, 0.3 * i * (j - i)] for j in range(count + 1) for i in range(count + 1)]
-    first = [j * (count + 1) + i for j in range(count) for i in range(count)]
-    return PeerCage(positions, [[a, a + 1, a + count + 2, a + count + 1] for a in first], **options)
-
-
-def lattice(elements, rate):
-    """Every element with all (i, j) / rate."""
-    j, i = np.divmod(np.arange((rate + 1) ** 2), rate + 1)
-    return np.repeat(np.arange(elements), len(i)), np.tile(np.stack([i, j], axis=1) / rate, (elements, 1))
 
 
 @needs_both
@@ -69,10 +55,9 @@ def test_corners_turn_parameters_and_derivatives(method, corner):
 @pytest.mark.parametrize("method", ["far", "bfr", "embree"])
 def test_sub_faces_begin_at_their_corner(method):
     pentagon = PeerCage([[np.cos(a), np.sin(a), 0] for a in 2 * np.pi * np.arange(5) / 5], [list(range(5))])
-    found = evaluate(pentagon, 0, [[0.0, 0.0]] * 5, np.arange(5), method=method).p
-    across = evaluate(pentagon, 0, [[1.0, 1.0]] * 5, np.arange(5), method=method).p
-    ahead = evaluate(pentagon, 0, [[1.0, 0.0]] * 5, np.arange(5), method=method).p
-    before = evaluate(pentagon, 0, [[0.0, 1.0]] * 5, np.arange(5), method=method).p
+    found, across, ahead, before = (
+        evaluate(pentagon, 0, [uv] * 5, np.arange(5), method=method).p for uv in ([0.0, 0], [1, 1], [1, 0], [0, 1])
+    )
     assert np.abs(found - pentagon.positions).max() <= SINGLE
     assert np.abs(across).max() <= SINGLE
     assert np.abs(ahead - np.roll(before, -1, axis=0)).max() <= SINGLE
@@ -90,15 +75,11 @@ def test_embree_and_opensubdiv_agree_on_infinite_sharpness(cage):
 
 
 @needs_osd
-def test_single_precision_is_single_and_times_are_measured():
-    element, uv = lattice(6, 8)
+def test_single_precision_is_single_times_are_measured_and_failures_say_why():
+    element, uv, _ = lattice(CUBE, 8)
     double, single = (evaluate(CUBE, element, uv, real=real, repetitions=3, threads=2) for real in ("double", "float"))
     assert 1e-9 < np.abs(double.p - single.p).max() <= SINGLE
     assert double.times["setup_ms"] > 0
     assert double.times["evaluation_ms"] > 0
-
-
-@needs_osd
-def test_a_failing_peer_says_why():
     with pytest.raises(PeerError, match="unknown --boundary smooth"):
         evaluate(PeerCage(CUBE.positions, CUBE.faces, boundary="smooth"), 0, [[0.0, 0.0]])

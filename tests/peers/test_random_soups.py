@@ -1,7 +1,5 @@
 """Faces thrown together at random, which share edges and vertices in every way, against OpenSubdiv (3.5.0)."""
 
-from __future__ import annotations
-
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest

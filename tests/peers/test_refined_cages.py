@@ -1,7 +1,5 @@
 """OpenSubdiv makes the same surface of a refined cage, tags and seams included, as of the cage before."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -6,8 +6,6 @@ Conventions are those of plugin/ARCHITECTURE.md. Results are `Decimal`; arithmet
 rounded by the caller's decimal context (28 digits unless set). ``numpy.array(sample.p, dtype=float)`` rounds once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, getcontext

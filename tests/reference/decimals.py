@@ -1,7 +1,5 @@
 """Decimal arithmetic on short vectors, with the few functions the references need."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from contextlib import contextmanager
 from decimal import Decimal, getcontext, localcontext

@@ -1,7 +1,5 @@
 """Samples towards one isolated extraordinary point of each scheme and valence, with their exact values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import lru_cache

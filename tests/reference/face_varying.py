@@ -4,8 +4,6 @@ Nothing of `mitsuba_subdivision` is used. A mesh is a list of faces (tuples of v
 tuples of the same lengths and a dict of values by (vertex, index): the same index at two vertices is two values.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import cos, pi
 

@@ -4,8 +4,6 @@ Nothing of `mitsuba_subdivision` is used. A mesh is a list of faces (tuples of v
 face by face, as the corners at which they begin.
 """
 
-from __future__ import annotations
-
 
 class NonManifoldParts:
     """Non-manifold edges, vertices and creases of a mesh, as sets; see `mitsuba_subdivision.mesh.manifold`.

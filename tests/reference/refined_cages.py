@@ -1,7 +1,5 @@
 """Cages and their refinements for tests of borders and creases."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

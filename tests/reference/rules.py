@@ -5,8 +5,6 @@ from a key to its point. A key names what the new vertex comes from. Only the ke
 neighbourhood may be asked for.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
 from decimal import Decimal

@@ -1,7 +1,5 @@
 """Bases of regular patches, exactly: uniform B-splines and the quartic box spline, with derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from decimal import Decimal
 

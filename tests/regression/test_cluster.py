@@ -28,20 +28,16 @@ def test_two_workers_give_the_bits_of_one_machine(variant_llvm_ad_rgb, address):
     loaded = load()
     alone = merge_passes([render_pass(loaded, SAMPLING, i + 1, PASSES, with_probe=True) for i in range(PASSES)])
     together = render_on_cluster(address, load, variant_llvm_ad_rgb, SAMPLING, PASSES, with_probe=True)
-    assert np.array_equal(together.pixels, alone.pixels)
-    assert np.array_equal(together.estimate.variance, alone.estimate.variance)
-    assert np.array_equal(together.paired, alone.paired)
-    assert np.array_equal(together.probe.position, alone.probe.position)
+    found, expected = (
+        (each.pixels, each.estimate.variance, each.paired, each.probe.position) for each in (together, alone)
+    )
+    assert all(map(np.array_equal, found, expected))
 
 
 def test_no_cluster_is_said():
     pytest.importorskip("distributed")
     with pytest.raises(RegressionError, match="no Dask scheduler"):
         render_on_cluster("nonsense://", load_scene, "llvm_ad_rgb", SAMPLING, 0)
-
-
-def pixels(path):
-    return np.array(mi.Bitmap(str(path)))
 
 
 def frame_after_a_death(frame, marker, command, number):
@@ -67,15 +63,14 @@ def test_frames_and_passes_of_a_model_have_the_bits_of_one_machine_although_a_wo
     )
     monkeypatch.chdir(tmp_path)
     common = ["render", "model.usda", "--size", "16x12", "--spp", "4", "--filter", "box", "-m", "scalar_rgb"]
-    on_cluster = ["--dask", address]
     monkeypatch.setattr(pictures, "_frame", partial(frame_after_a_death, pictures._frame, tmp_path / "died"))
-    assert main([*common, "--frames", "1:3", "-o", "together.exr", *on_cluster]) == 0
-    assert capsys.readouterr().err.count("SpatialAudio") == 1
-    assert main([*common, "--frames", "1:3", "-o", "alone.exr"]) == 0
-    assert main([*common, "--passes", "2", "-o", "together_0004.exr", *on_cluster]) == 0
-    assert main([*common, "--passes", "2", "-o", "alone_0004.exr"]) == 0
+    told = {}
+    for name, where in (("together", ["--dask", address]), ("alone", [])):
+        assert main([*common, "--frames", "1:3", "-o", f"{name}.exr", *where]) == 0
+        told[name] = capsys.readouterr().err
+        assert main([*common, "--passes", "2", "-o", f"{name}_0004.exr", *where]) == 0
+    assert told["together"].count("SpatialAudio") == 1
     assert (tmp_path / "died").is_file()
-    frames = [[(tmp_path / f"{name}_000{i}.exr") for i in range(1, 5)] for name in ("together", "alone")]
-    for together, alone in zip(*frames, strict=True):
-        assert np.array_equal(pixels(together), pixels(alone))
-    assert not np.array_equal(*map(pixels, frames[0][::2]))
+    frames = [[np.array(mi.Bitmap(f"{name}_000{i}.exr")) for i in range(1, 5)] for name in ("together", "alone")]
+    assert all(map(np.array_equal, *frames))
+    assert not np.array_equal(*frames[0][::2])

@@ -33,6 +33,10 @@ def compare(folder, *words):
     return main(["compare", *(str(folder / word) if word.endswith(".exr") else word for word in words)])
 
 
+def merge(output, *paths):
+    return main(["merge", *map(str, paths), "-o", str(output)])
+
+
 def test_a_scene_against_its_reference(folder, capsys):
     assert compare(folder, "reference.exr", SCENE, "--spp", "64") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -104,19 +108,10 @@ def test_unusable_input_is_status_3(folder, capsys, words, message):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["compare"],
-        ["merge"],
-        ["merge", "a", "-z"],
-        ["compare", "a", "b", "--tolerance", "x"],
-        ["compare", "a", "b", "-z"],
-    ],
-)
+@pytest.mark.parametrize("words", ["compare", "merge", "merge a -z", "compare a b --tolerance x", "compare a b -z"])
 def test_unusable_options_are_status_3(words, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(words)
+        main(words.split())
     assert stop.value.code == 3
     assert "usage:" in capsys.readouterr().err
 
@@ -125,11 +120,9 @@ def test_passes_and_merge_give_what_one_command_gives(tmp_path):
     common = [SCENE, *SMALL, "--spp", "64", "--batch", "8", "--filter", "box"]
     for i in (2, 1, 3):
         assert main(["render", *common, "-o", str(tmp_path / f"{i}.exr"), "--pass", f"{i}/3"]) == 0
-    parts = [str(tmp_path / f"{i}.exr") for i in (3, 1, 2)]
-    assert main(["merge", *parts, "-o", str(tmp_path / "merged.exr")]) == 0
+    assert merge(tmp_path / "merged.exr", *(tmp_path / f"{i}.exr" for i in (3, 1, 2))) == 0
     assert main(["render", *common, "-o", str(tmp_path / "whole.exr"), "--passes", "3"]) == 0
     assert (tmp_path / "merged.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
-    assert main(["merge", parts[0], parts[0], "-o", str(tmp_path / "twice.exr")]) == 3
 
 
 @pytest.mark.parametrize(
@@ -153,25 +146,19 @@ def test_contradicting_options_are_said(words, message, capsys, tmp_path, monkey
 def passes(tmp_path_factory):
     """Passes 1 to 3 of 3, and ones that do not belong to them."""
     path = tmp_path_factory.mktemp("passes")
-    common = ["--batch", "8", "--filter", "box", "--variant", "scalar_rgb"]
-    size = ["-D", "resolution=8"]
-    for name, scene, words in (
-        ("1", SCENE, ["--pass", "1/3", "--spp", "64", *size]),
-        ("2", SCENE, ["--pass", "2/3", "--spp", "64", *size]),
-        ("3", SCENE, ["--pass", "3/3", "--spp", "64", *size]),
-        ("of_two", SCENE, ["--pass", "2/2", "--spp", "64", *size]),
-        ("of_16", SCENE, ["--pass", "2/3", "--spp", "64", *size, "--batch", "16"]),
-        ("seed", SCENE, ["--pass", "2/3", "--spp", "64", *size, "--seed", "1"]),
-        ("larger", SCENE, ["--pass", "2/3", "--spp", "64", "-D", "resolution=9"]),
-        ("scene", str(SCENES / "valence5.xml"), ["--pass", "2/3", "--spp", "64", *size]),
-        ("tent", SCENE, ["--pass", "2/3", "--spp", "64", *size, "--filter", "tent"]),
-    ):
-        assert main(["render", scene, "-o", str(path / f"{name}.exr"), *common, *words]) == 0
+    common = "--spp 64 --batch 8 --filter box --variant scalar_rgb -D resolution=8"
+    for name, words in {
+        **{number: f"--pass {number}/3" for number in "123"},
+        "of_two": "--pass 2/2",
+        "of_16": "--pass 2/3 --batch 16",
+        "seed": "--pass 2/3 --seed 1",
+        "larger": "--pass 2/3 -D resolution=9",
+        "scene": "--pass 2/3",
+        "tent": "--pass 2/3 --filter tent",
+    }.items():
+        scene = str(SCENES / "valence5.xml") if name == "scene" else SCENE
+        assert main(["render", scene, "-o", str(path / f"{name}.exr"), *f"{common} {words}".split()]) == 0
     return path
-
-
-def merge(folder, *words):
-    return main(["merge", *(str(folder / f"{word}.exr") for word in words), "-o", str(folder / "merged.exr")])
 
 
 @pytest.mark.core
@@ -189,7 +176,7 @@ def merge(folder, *words):
     ],
 )
 def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
-    assert merge(passes, *words) == 3
+    assert merge(passes / "merged.exr", *(passes / f"{word}.exr" for word in words)) == 3
     told = capsys.readouterr().err
     assert message in told
     assert told.count("\n") == 1
@@ -197,11 +184,10 @@ def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
 
 
 def test_a_missing_pass_is_told(passes, capsys, tmp_path):
-    output = str(tmp_path / "merged.exr")
-    assert main(["merge", str(passes / "1.exr"), str(passes / "3.exr"), "-o", output]) == 0
-    assert capsys.readouterr().err == "mitsuba-subdivision: warning: of 3 passes, these are missing: 2\n"
-    assert main(["merge", str(passes / "2.exr"), "-o", output]) == 0
-    assert capsys.readouterr().err == "mitsuba-subdivision: warning: of 3 passes, these are missing: 1, 3\n"
+    for there, missing in (("13", "2"), ("2", "1, 3")):
+        assert merge(tmp_path / "merged.exr", *(passes / f"{number}.exr" for number in there)) == 0
+        told = f"mitsuba-subdivision: warning: of 3 passes, these are missing: {missing}\n"
+        assert capsys.readouterr().err == told
 
 
 def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeypatch):
@@ -214,23 +200,20 @@ def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeyp
 
 
 def test_each_seed_has_other_samples(folder, tmp_path):
-    samples = []
+    report, samples = tmp_path / "found.json", []
+    words = ["reference.exr", SCENE, "--spp", "16", "--tiers", "tile", "--json", str(report)]
     for seed in ([], ["--seed", "0"], ["--seed", "1"]):
-        report = str(tmp_path / "found.json")
-        assert compare(folder, "reference.exr", SCENE, "--spp", "16", "--tiers", "tile", "--json", report, *seed) == 0
-        samples.append(json.loads((tmp_path / "found.json").read_text())["relmse"])
+        assert compare(folder, *words, *seed) == 0
+        samples.append(json.loads(report.read_text())["relmse"])
     assert samples[0] == samples[1] != samples[2]
 
 
-def test_merged_passes_need_room_for_their_variance(passes, capsys, tmp_path):
-    assert main(["merge", str(passes / "1.exr"), "-o", str(tmp_path / "merged.png")]) == 3
+def test_merged_passes_need_room_for_their_variance_and_a_file_of_their_own(passes, capsys, tmp_path):
+    before = (passes / "1.exr").read_bytes()
+    assert merge(tmp_path / "merged.png", passes / "1.exr") == 3
     assert 'merged.png"; expected a name ending in .exr' in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_pass_is_no_output(passes, capsys):
-    before = (passes / "1.exr").read_bytes()
-    assert main(["merge", str(passes / "1.exr"), str(passes / "2.exr"), "-o", str(passes / "1.exr")]) == 3
+    assert merge(passes / "1.exr", passes / "1.exr", passes / "2.exr") == 3
     assert "is an input as well; expected another file" in capsys.readouterr().err
     assert (passes / "1.exr").read_bytes() == before
 
@@ -252,7 +235,11 @@ def with_metadata(**changes):
     return lambda channels, metadata: (channels, {**metadata, **changes})
 
 
-SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
+def with_sampling(**changes):
+    return with_metadata(sampling={"seed": 0, "batch": 8, "batches": [[2, 5]], **changes})
+
+
+RANGES = "expected a seed, the samples of a batch, and ranges"
 
 
 @pytest.mark.parametrize(
@@ -268,15 +255,9 @@ SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
         (with_pixel("N", 0), "has pixels without samples"),
         (lambda c, m: ({**c, "N": c["N"] + np.float32(0.5)}, m), "channel N of image .* has numbers of type float32"),
         (with_metadata(sampling=[1]), r"sampling is \[1\]; expected a seed"),
-        (with_metadata(sampling={**SAMPLING, "batch": 0}), "expected a seed, the samples of a batch, and ranges"),
-        (with_metadata(sampling={**SAMPLING, "batches": [[5, 2]]}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "batches": []}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "batches": 3}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "batches": [1, 2]}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "batches": [[2, 5], [6]]}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "seed": "0"}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "total": 4}), "expected a seed, the samples of a batch"),
-        (with_metadata(sampling={**SAMPLING, "total": 8, "passes": 9}), "expected a seed, the samples of a batch"),
+        *((with_sampling(batches=wrong), RANGES) for wrong in ([[5, 2]], [], 3, [1, 2], [[2, 5], [6]])),
+        *((with_sampling(**wrong), RANGES) for wrong in ({"batch": 0}, {"seed": "0"}, {"total": 4})),
+        (with_sampling(total=8, passes=9), RANGES),
         (with_metadata(paired={"seed": 0}), "expected a seed and samples per pixel"),
         (with_metadata(paired={"spp": 4}), "expected a seed and samples per pixel"),
         (with_metadata(files=[1]), r"files is \[1\]; expected checksums by name"),
@@ -287,7 +268,7 @@ SAMPLING = {"seed": 0, "batch": 8, "batches": [[2, 5]]}
 def test_damaged_passes_are_status_3(passes, capsys, tmp_path, change, message):
     path = tmp_path / "damaged.exr"
     write_channels(path, *change(*read_channels(passes / "2.exr")))
-    assert main(["merge", str(passes / "1.exr"), str(path), "-o", str(tmp_path / "merged.exr")]) == 3
+    assert merge(tmp_path / "merged.exr", passes / "1.exr", path) == 3
     (told,) = capsys.readouterr().err.splitlines()
     assert re.search(message, told)
     assert not (tmp_path / "merged.exr").exists()
@@ -295,8 +276,7 @@ def test_damaged_passes_are_status_3(passes, capsys, tmp_path, change, message):
 
 def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rng, capfd):
     whole, path = (passes / "2.exr").read_bytes(), tmp_path / "damaged.exr"
-    bitmap = mi.Bitmap(np.zeros((8, 8, 3), dtype=np.uint8))
-    bitmap.write(str(tmp_path / "a.png"))
+    mi.Bitmap(np.zeros((8, 8, 3), dtype=np.uint8)).write(str(tmp_path / "a.png"))
     damaged = [b"", b"no image", (tmp_path / "a.png").read_bytes()]
     damaged += [whole[:length] for length in (1, 4, 100, len(whole) // 2, len(whole) - 1)]
     for data in damaged:
@@ -317,5 +297,5 @@ def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rn
         flipped = np.frombuffer(whole, dtype=np.uint8).copy()
         flipped[np_rng.integers(0, len(whole), 4)] = np_rng.integers(0, 256, 4)
         path.write_bytes(flipped.tobytes())
-        assert main(["merge", str(path), "-o", str(tmp_path / "merged.exr")]) in (0, 3)
+        assert merge(tmp_path / "merged.exr", path) in (0, 3)
         assert "Traceback" not in capfd.readouterr().err

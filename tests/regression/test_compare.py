@@ -17,6 +17,7 @@ from mitsuba_subdivision.regression.tiers import Status, Tolerances
 from regression.random_images import METADATA, SIZE, dome, random_image, truth
 
 LIMITS = Tolerances()
+NOTHING = np.uint32(2**32 - 1)
 # Of a mean of 3,072 squares, and of the variance that few batches measure: five standard deviations and more.
 NOISE = 0.25
 
@@ -30,6 +31,24 @@ def statuses(found):
     return {tier.name: tier.status.value for tier in found.tiers}
 
 
+def dome_with(name, part, value):
+    """A field of the dome's probe, changed in a part of the picture."""
+    values = getattr(dome(), name).copy()
+    values[part] = value
+    return {name: values}
+
+
+def rotated(degrees):
+    normal = dome().normal.astype(float)
+    a, part = math.radians(degrees), np.s_[12:20, 12:20]
+    normal[part] = normal[part] @ np.array([[1, 0, 0], [0, math.cos(a), math.sin(a)], [0, -math.sin(a), math.cos(a)]])
+    return normal.astype(np.float32)
+
+
+def with_probe(rng, **changes):
+    return random_image(rng, probe=replace(dome(), **changes))
+
+
 @pytest.mark.parametrize(("first", "second"), [(4, 4), (4, 16), (400, 4)])
 def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
     """Whatever the numbers of samples: the variance of a difference is the sum of both."""
@@ -39,18 +58,12 @@ def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
     assert abs(measured / expected - 1) < NOISE
 
 
-def test_equal_images_have_no_worst_pixel(reference):
-    assert compare(reference, reference).worst is None
-
-
 def test_the_worst_pixel_is_none_that_only_one_image_hits(reference, np_rng):
     """A pixel of the outline is missing, and a normal in the middle is turned."""
-    probe = dome()
-    y, x = np.argwhere(probe.hit)[0]
-    shape, normal = probe.shape.copy(), probe.normal.copy()
-    shape[y, x] = 2**32 - 1
+    y, x = np.argwhere(dome().hit)[0]
+    normal = dome().normal.copy()
     normal[y, x], normal[16, 12] = 0, -normal[16, 12]
-    found = compare(reference, random_image(np_rng, probe=replace(probe, shape=shape, normal=normal)))
+    found = compare(reference, with_probe(np_rng, **dome_with("shape", (y, x), NOTHING), normal=normal))
     assert statuses(found)["probe"] == "fail"
     assert (found.worst.x, found.worst.y) == (12, 16)
 
@@ -69,6 +82,7 @@ def test_unchanged_images_pass(reference, np_rng):
     found = compare(reference, random_image(np_rng, 4, "test"))
     assert statuses(found) == {"probe": "pass", "paired": "pass", "tile": "pass"}
     assert found.exit_status == 0
+    assert compare(reference, reference).worst is None
 
 
 def test_false_alarms_are_as_rare_as_alpha_says(reference):
@@ -108,12 +122,8 @@ def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference
     found = compare(reference, test)
     assert statuses(found) == {"probe": "pass", "paired": "pass", "tile": "pass"}
     assert "same bits" in found.tier("tile").lines[0]
-    probe = replace(test.probe, normal=-test.probe.normal)
-    assert statuses(compare(reference, replace(test, probe=probe))) == {
-        "probe": "fail",
-        "paired": "pass",
-        "tile": "fail",
-    }
+    turned = replace(test, probe=replace(test.probe, normal=-test.probe.normal))
+    assert statuses(compare(reference, turned)) == {"probe": "fail", "paired": "pass", "tile": "fail"}
     assert statuses(compare(reference, test, ["paired", "tile"]))["tile"] == "fail"
 
 
@@ -121,9 +131,7 @@ def test_one_batch_has_no_variance(reference, np_rng):
     assert "the test has one batch" in compare(reference, random_image(np_rng, 1)).tier("tile").lines[0]
 
 
-@pytest.mark.parametrize(
-    ("side", "factor"), [(4, 1.4), (8, 1.2), (16, 1.08), (SIZE, 1.03)], ids=["4", "8", "16", "whole"]
-)
+@pytest.mark.parametrize(("side", "factor"), [(4, 1.4), (8, 1.2), (16, 1.08), (SIZE, 1.03)])
 def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
     mean = truth()
     mean[8 : 8 + side, 8 : 8 + side] *= factor
@@ -154,12 +162,6 @@ def test_what_is_below_black_does_not_choose_exposures():
     assert flip_exposures(pixels) == flip_exposures(np.maximum(pixels, 0))
 
 
-def test_the_map_of_evidence_holds_the_smallest_probability(reference, np_rng):
-    found = compare(reference, random_image(np_rng, 4), ["tile"]).tier("tile")
-    smallest = min(scale["smallest_p"] for name, scale in found.numbers["scales"].items() if name != "whole")
-    np.testing.assert_allclose(found.maps["evidence"].max(), -np.log10(smallest), rtol=1e-9)
-
-
 @pytest.mark.parametrize("degrees", [1e-6, 30, 179])
 def test_angles_between_normals_are_those_of_a_turn(degrees):
     turned = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0])
@@ -167,9 +169,7 @@ def test_angles_between_normals_are_those_of_a_turn(degrees):
 
 
 def test_probes_that_hit_nothing_are_alike(reference, np_rng):
-    nothing = np.uint32(2**32 - 1)
-    sky = dome()
-    sky = replace(sky, **{name: np.full_like(sky.shape, nothing) for name in ("shape", "triangle", "element")})
+    sky = replace(dome(), **{name: np.full_like(dome().shape, NOTHING) for name in ("shape", "triangle", "element")})
     found = compare(replace(reference, probe=sky), random_image(np_rng, 4, probe=sky), ["probe"])
     assert found.status is Status.PASS
 
@@ -198,43 +198,16 @@ def test_a_reference_needs_16_times_the_samples(reference, np_rng, batches, is_t
     assert any("the reference has less than 16 times the samples" in line for line in lines) == is_told
 
 
-BAD = {"nan": np.nan, "infinite": np.inf}
-
-
-@pytest.mark.parametrize("value", BAD.values(), ids=BAD)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("role", ["test", "reference"])
 def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, role):
     pixels = reference.pixels.copy()
     pixels[3, 5, 1] = value
     broken = replace(reference, pixels=pixels)
-    pair = (broken, random_image(np_rng)) if role == "reference" else (reference, broken)
-    found = compare(*pair)
+    found = compare(broken, random_image(np_rng)) if role == "reference" else compare(reference, broken)
     assert statuses(found) == {"finite": "fail"}
     assert found.tier("finite").lines == [f"the {role} is not: G = {value} at x = 5, y = 3"]
     assert (found.worst.x, found.worst.y) == (5, 3)
-
-
-def changed_probe(**changes):
-    return replace(dome(), **changes)
-
-
-def rotated(degrees):
-    normal = dome().normal.astype(float)
-    a, part = math.radians(degrees), np.s_[12:20, 12:20]
-    normal[part] = normal[part] @ np.array([[1, 0, 0], [0, math.cos(a), math.sin(a)], [0, -math.sin(a), math.cos(a)]])
-    return normal.astype(np.float32)
-
-
-def lost_pixels():
-    shape = dome().shape.copy()
-    shape[14:17, 14:17] = 2**32 - 1
-    return shape
-
-
-def other_elements():
-    element = dome().element.copy()
-    element[10:14, 10:14] = 7
-    return element
 
 
 PROBES = {
@@ -242,8 +215,8 @@ PROBES = {
     "normals turned by 0.001 degrees": (lambda: {"normal": rotated(0.001)}, "pass", "within"),
     "points moved by 1e-3": (lambda: {"position": dome().position + np.float32(1e-3)}, "fail", "hit points"),
     "points moved by 1e-6": (lambda: {"position": dome().position + np.float32(1e-6)}, "pass", "within"),
-    "a hole": (lambda: {"shape": lost_pixels()}, "fail", "another shape"),
-    "other elements": (lambda: {"element": other_elements()}, "fail", "another element"),
+    "a hole": (lambda: dome_with("shape", np.s_[14:17, 14:17], NOTHING), "fail", "another shape"),
+    "other elements": (lambda: dome_with("element", np.s_[10:14, 10:14], 7), "fail", "another element"),
     "other parameters": (lambda: {"uv": dome().uv + np.float32(0.01)}, "fail", "surface parameters"),
     "other triangles": (lambda: {"triangle": dome().triangle + np.uint32(1)}, "warn", "another triangle"),
 }
@@ -252,28 +225,28 @@ PROBES = {
 @pytest.mark.core
 @pytest.mark.parametrize(("changes", "status", "word"), PROBES.values(), ids=PROBES)
 def test_probe(reference, np_rng, changes, status, word):
-    found = compare(reference, random_image(np_rng, probe=changed_probe(**changes())), ["probe"])
-    assert found.tier("probe").status.value == status
-    assert word in found.tier("probe").lines[0]
+    found = compare(reference, with_probe(np_rng, **changes()), ["probe"]).tier("probe")
+    assert found.status.value == status
+    assert word in found.lines[0]
 
 
 def test_silhouettes_do_not_count(reference, np_rng):
     """A pixel's normal at the rim of the dome may be any."""
-    normal, shape = dome().normal.copy(), dome().shape
+    shape = dome().shape
     rim = np.zeros(shape.shape, dtype=bool)
     rim[:, 1:] |= shape[:, 1:] != shape[:, :-1]
-    normal[rim & (shape == 0)] = (0, 0, 1)
-    assert compare(reference, random_image(np_rng, probe=changed_probe(normal=normal)), ["probe"]).exit_status == 0
+    changed = with_probe(np_rng, **dome_with("normal", rim & (shape == 0), (0, 0, 1)))
+    assert compare(reference, changed, ["probe"]).exit_status == 0
 
 
 def test_normals_count_from_the_third_pixel_beside_one_of_another_shape(reference, np_rng):
     """It and the four pixels beside it are a silhouette, and the eight neighbours of these do not count either."""
     silhouette = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]
     for y, x in np.argwhere(np.ones((7, 7))) - 3:
-        normal, shape = dome().normal.copy(), dome().shape.copy()
-        shape[16, 16] = 2**32 - 1
+        normal = dome().normal.copy()
         normal[16 + y, 16 + x] *= -1
-        found = compare(reference, random_image(np_rng, probe=changed_probe(normal=normal, shape=shape)), ["probe"])
+        changed = with_probe(np_rng, normal=normal, **dome_with("shape", (16, 16), NOTHING))
+        found = compare(reference, changed, ["probe"])
         is_near = any(max(abs(y - b), abs(x - a)) <= 1 for b, a in silhouette)
         assert found.tier("probe").status is (Status.PASS if is_near else Status.FAIL), (y, x)
 
@@ -281,11 +254,9 @@ def test_normals_count_from_the_third_pixel_beside_one_of_another_shape(referenc
 @pytest.mark.parametrize(("other", "what"), [("angle_p999", "maximum"), ("angle_max", "99.9th percentile")])
 def test_the_worst_normal_is_none_at_a_silhouette(reference, np_rng, other, what):
     """Its own is turned more than those of some pixels in the middle."""
-    probe = changed_probe(normal=rotated(20))
-    y, x = np.argwhere(probe.hit)[0]
-    probe.normal[y, x] *= -1
-    loose = LIMITS.with_values({other: 180})
-    found = compare(reference, random_image(np_rng, probe=probe), ["probe"], loose)
+    normal = rotated(20)
+    normal[tuple(np.argwhere(dome().hit)[0])] *= -1
+    found = compare(reference, with_probe(np_rng, normal=normal), ["probe"], LIMITS.with_values({other: 180}))
     assert f"degrees between normals, {what}" in found.tier("probe").lines[0]
     assert 12 <= found.worst.x < 20
     assert 12 <= found.worst.y < 20
@@ -295,9 +266,9 @@ def test_one_pixel_in_a_thousand_may_hit_another_triangle(reference, np_rng):
     for count, status in ((1, Status.PASS), (2, Status.WARN)):
         triangle = dome().triangle.copy()
         triangle[16, 16 : 16 + count] += 1
-        found = compare(reference, random_image(np_rng, probe=changed_probe(triangle=triangle)), ["probe"])
-        assert found.tier("probe").status is status
-        assert found.tier("probe").numbers["triangle_fraction"] == count / SIZE**2
+        found = compare(reference, with_probe(np_rng, triangle=triangle), ["probe"]).tier("probe")
+        assert found.status is status
+        assert found.numbers["triangle_fraction"] == count / SIZE**2
 
 
 def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np_rng):
@@ -315,7 +286,7 @@ def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np
 
 
 def test_the_worst_pixel_names_both_values_and_the_surface(reference, np_rng):
-    found = compare(reference, random_image(np_rng, probe=changed_probe(normal=rotated(1.0))))
+    found = compare(reference, with_probe(np_rng, normal=rotated(1.0)))
     assert found.worst.shown_by == "probe"
     assert 12 <= found.worst.x < 20
     element = dome().element[found.worst.y, found.worst.x]
@@ -350,18 +321,16 @@ def test_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
 
 def test_another_environment_downgrades_to_the_tile_tier(reference, np_rng):
     other = {**METADATA, "environment": {"llvm": "19", "processor": "a"}}
-    found = compare(reference, random_image(np_rng, paired=1.001 * reference.paired, metadata=other), ["paired"])
+    changed = {"paired": 1.001 * reference.paired, "metadata": other}
+    found = compare(reference, random_image(np_rng, **changed), ["paired"])
     assert statuses(found) == {"paired": "warn", "tile": "pass"}
     assert found.exit_status == 1
     assert "llvm 19 here, 23 in the reference" in str(found)
     same = compare(reference, random_image(np_rng, metadata=other), ["paired"])
     assert statuses(same) == {"paired": "pass"}
-
-
-def test_without_a_variance_to_fall_back_on_other_pixels_fail(reference, np_rng):
-    other = {**METADATA, "environment": {}}
-    test = random_image(np_rng, paired=1.001 * reference.paired, metadata=other, estimate=None)
-    assert compare(reference, test, ["paired", "probe"]).exit_status == 2
+    # Without a variance, there is none to fall back on.
+    lacking = {**changed, "metadata": {**METADATA, "environment": {}}, "estimate": None}
+    assert compare(reference, random_image(np_rng, **lacking), ["paired", "probe"]).exit_status == 2
 
 
 @pytest.mark.parametrize(
@@ -375,10 +344,8 @@ def test_other_samples_downgrade_to_the_tile_tier(reference, np_rng, change, sai
 
 
 def test_two_plain_images_are_left_to_flip():
-    pixels = truth()
-    found = compare(Image("a", pixels), Image("b", pixels))
-    assert statuses(found)["flip"] == "pass"
-    assert compare(Image("a", pixels), Image("b", 1.05 * pixels)).exit_status == 2
+    assert statuses(compare(Image("a", truth()), Image("b", truth())))["flip"] == "pass"
+    assert compare(Image("a", truth()), Image("b", 1.05 * truth())).exit_status == 2
 
 
 def test_a_changed_file_is_named(reference, np_rng):
@@ -405,26 +372,18 @@ def test_what_cannot_be_compared_is_said(reference, message, run):
         run(reference)
 
 
-def flip(reference, test, limits=LIMITS):
-    return compare_flip(Image("reference", reference), Image("test", test), limits)
+def test_flip_tells_changes_apart_and_refuses_what_it_does_not_see():
+    def flip(test, limits=LIMITS):
+        return compare_flip(Image("reference", truth()), Image("test", test), limits)
 
-
-def test_flip_tells_changes_apart():
-    scores = [flip(truth(), factor * truth()).numbers for factor in (1, 1.0001, 1.05)]
+    scores = [flip(factor * truth()).numbers for factor in (1, 1.0001, 1.05)]
     assert [score["flip_mean"] < LIMITS.flip_mean for score in scores] == [True, True, False]
     assert all(score["exposures"] == list(flip_exposures(truth())) for score in scores)
-
-
-def test_no_difference_is_too_large_for_flip():
-    limits = LIMITS.with_values({"flip_mean": 0, "flip_p95": 0})
-    assert flip(truth(), truth(), limits).status is Status.PASS
-
-
-def test_flip_refuses_what_it_does_not_see():
+    assert flip(truth(), LIMITS.with_values({"flip_mean": 0, "flip_p95": 0})).status is Status.PASS
     broken = truth()
     broken[0, 0] = np.nan
     with pytest.raises(ImageError, match="not finite"):
-        flip(truth(), broken)
+        flip(broken)
 
 
 def test_a_black_reference_does_not_end_the_process():

@@ -24,16 +24,11 @@ processor\t: 1
 """
 
 
-def test_processors_of_one_name_are_told_apart():
+def test_processors_of_one_name_are_told_apart_and_those_without_have_numbers():
     assert scene._first_of(EPYC.format(family=26, model=2)) == "AMD EPYC, cpu family 26, model 2"
     assert scene._first_of(EPYC.format(family=25, model=1)) == "AMD EPYC, cpu family 25, model 1"
-
-
-def test_processors_without_a_name_have_numbers():
     assert scene._first_of(ARM) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
-
-
-def test_a_list_of_another_form_gives_nothing():
+    # A list of another form gives nothing.
     assert scene._first_of("") == ""
     assert scene._first_of("no colon\n") == ""
 

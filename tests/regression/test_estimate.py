@@ -34,14 +34,11 @@ def test_samples_weigh_alike_in_batches_of_any_size(np_rng):
     assert np.allclose(found, expected, rtol=1e-14)
 
 
-def test_variance_is_that_of_a_sample(np_rng):
+def test_variance_is_that_of_a_sample_and_one_batch_tells_none(np_rng):
     found = estimate(np_rng, 400).variance / (SPREAD * truth()) ** 2
     # 399 degrees of freedom: 7 % a pixel; 3072 of them.
     assert found.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / 399 / found.size))
     assert BATCH > 1
-
-
-def test_one_batch_tells_no_variance(np_rng):
     assert not combine(batches(np_rng, 1)).variance.any()
 
 

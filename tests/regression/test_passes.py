@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.regression import RegressionError
-from mitsuba_subdivision.regression.image import load_image, save_image
+from mitsuba_subdivision.regression.image import load_image, save_image, write_exr
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
@@ -45,8 +45,7 @@ def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
     for i in (3, 1, 2):
         save_image(tmp_path / f"{i}.exr", render_pass(loaded, SAMPLING, i, 3))
         passes.append(load_image(tmp_path / f"{i}.exr"))
-    merged = merge_passes(passes)
-    whole = render_pass(loaded, SAMPLING)
+    merged, whole = merge_passes(passes), render_pass(loaded, SAMPLING)
     assert np.allclose(merged.pixels, whole.pixels, rtol=1e-6)
     assert np.allclose(merged.estimate.variance, whole.estimate.variance, rtol=1e-5)
     assert (merged.estimate.count == SAMPLING.spp).all()
@@ -57,17 +56,12 @@ def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
     assert np.array_equal(direct.estimate.variance, merged.estimate.variance)
 
 
-def test_merging_by_steps_counts_all_batches(loaded):
-    first = merge_passes([render_pass(loaded, SAMPLING, i, 4) for i in (1, 2)])
-    merged = merge_passes([render_pass(loaded, SAMPLING, i, 4) for i in (4, 3)] + [first])
+def test_merging_by_steps_counts_all_batches_and_keeps_what_only_the_first_pass_has(loaded):
+    passes = [render_pass(loaded, SAMPLING, i, 4, with_probe=True) for i in (1, 2, 3, 4)]
+    assert [image.probe is not None for image in passes] == [True, False, False, False]
+    merged = merge_passes([*passes[:1:-1], merge_passes(passes[:2])])
     assert merged.estimate.batches == 12
     assert merged.metadata["sampling"]["batches"] == [[0, 12]]
-
-
-def test_only_the_first_pass_has_what_a_reference_has(loaded):
-    passes = [render_pass(loaded, SAMPLING, i, 3, with_probe=True) for i in (1, 2, 3)]
-    assert [image.probe is not None for image in passes] == [True, False, False]
-    merged = merge_passes(passes[::-1])
     assert np.array_equal(merged.paired, passes[0].paired)
     assert merged.metadata["paired"] == {"seed": 5, "spp": 8}
 
@@ -84,8 +78,6 @@ def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
             merge_passes([first, wrong])
     with pytest.raises(RegressionError, match="no passes"):
         merge_passes([])
-    from mitsuba_subdivision.regression.image import write_exr
-
     write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
     with pytest.raises(RegressionError, match="is no pass"):
         merge_passes([first, load_image(tmp_path / "a.exr")])
@@ -131,17 +123,11 @@ def test_scenes_that_cannot_be_rendered_are_refused(variant, tmp_path):  # noqa:
 
 @pytest.mark.core
 def test_lights_keep_the_order_of_the_scene(variant_llvm_ad_rgb):  # noqa: ARG001
-    import mitsuba as mi
-
-    def light(x):
-        place = mi.ScalarTransform4f().translate([x, 0, 0])
-        return {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
-
-    kept = []
+    places = [mi.ScalarTransform4f().translate([x, 0, 0]) for x in range(4)]
+    lights = [{"type": "rectangle", "to_world": place, "emitter": {"type": "area"}} for place in places]
+    camera, kept = {"type": "perspective"}, []
     for count in range(12):
         # Other objects in memory, which must not matter.
         kept = [mi.load_dict({"type": "area"}) for _ in range(count)] + kept[::2]
-        lights = {name: light(x) for x, name in enumerate("abcd")}
-        scene = load_scene({"type": "scene", "camera": {"type": "perspective"}, **lights}).scene
-        places = [emitter.get_shape().bbox().center().x for emitter in scene.emitters()]
-        assert places == [0, 1, 2, 3]
+        scene = load_scene({"type": "scene", "camera": camera, **dict(zip("abcd", lights, strict=True))}).scene
+        assert [emitter.get_shape().bbox().center().x for emitter in scene.emitters()] == [0, 1, 2, 3]

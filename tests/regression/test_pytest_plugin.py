@@ -42,10 +42,15 @@ def project(pytester):
     pytester.makefile(".xml", ball=SCENE)
     pytester.makepyfile(TEST)
     # Hypothesis would be imported again, and its asserts rewritten, in every run.
-    pytester.makeini(
-        "[pytest]\nrender_references = references\nrender_results = failures\naddopts = -p no:hypothesispytest\n"
-    )
+    folders = "render_references = references\nrender_results = failures"
+    pytester.makeini(f"[pytest]\n{folders}\naddopts = -p no:hypothesispytest\n")
     return pytester
+
+
+def failing(project, *options):
+    result = project.runpytest(*options)
+    result.assert_outcomes(failed=1)
+    return result
 
 
 @pytest.fixture
@@ -63,11 +68,10 @@ def reference(project):
 
 
 def test_a_missing_reference_fails_and_says_how_to_make_it(project):
-    result = project.runpytest()
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["there is no reference*ball.exr*make it with: pytest *::test_ball --render-update"])
+    told = "there is no reference*ball.exr*make it with: pytest *::test_ball --render-update"
+    failing(project).stdout.fnmatch_lines([told])
     assert not reference(project).exists()
-    project.runpytest("--render-update").assert_outcomes(failed=1)
+    failing(project, "--render-update")
     project.runpytest().assert_outcomes(passed=1)
 
 
@@ -79,32 +83,28 @@ def test_the_command_of_a_reference_gives_the_same_bytes(with_reference):
     assert reference(with_reference).read_bytes() == written
 
 
-def truncate(path):
-    path.write_bytes(path.read_bytes()[:-100])
-
-
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
-        (lambda project: truncate(reference(project)), "*ball.exr* is truncated, or damaged; make it with: pytest *"),
-        (lambda project: project.makefile(".xml", ball=SCENE.replace('"16"', '"12"')), "*12 x 12 pixels*16 x 16;*"),
+        ("truncated", "*ball.exr* is truncated, or damaged; make it with: pytest *"),
+        ("of another size", "*12 x 12 pixels*16 x 16;*"),
     ],
-    ids=["truncated", "size"],
 )
 def test_update_writes_references_that_cannot_be_used(with_reference, damage, problem):
-    damage(with_reference)
-    result = with_reference.runpytest()
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines([problem])
-    with_reference.runpytest("--render-update").assert_outcomes(failed=1)
+    path = reference(with_reference)
+    if damage == "truncated":
+        path.write_bytes(path.read_bytes()[:-100])
+    else:
+        with_reference.makefile(".xml", ball=SCENE.replace('"16"', '"12"'))
+    failing(with_reference).stdout.fnmatch_lines([problem])
+    failing(with_reference, "--render-update")
     with_reference.runpytest().assert_outcomes(passed=1)
 
 
 def test_a_failure_is_printed_once_and_a_folder_that_is_protected_does_not_hide_it(with_reference):
     make_brighter(with_reference)
     (with_reference.path / "failures").write_text("a file")
-    result = with_reference.runpytest()
-    result.assert_outcomes(failed=1)
+    result = failing(with_reference)
     result.stdout.fnmatch_lines(["*no report: *failures*"])
     # Where the variable CI is set, pytest repeats the message in its summary.
     lines = [line for line in result.outlines if "same samples, but" in line and not line.startswith("FAILED")]
@@ -112,10 +112,7 @@ def test_a_failure_is_printed_once_and_a_folder_that_is_protected_does_not_hide_
 
 
 def test_values_that_are_not_finite_are_one_line(with_reference):
-    with_reference.makepyfile(
-        TEST.replace(
-            "(render_regression):",
-            """(render_regression, monkeypatch):
+    broken = """(render_regression, monkeypatch):
     from mitsuba_subdivision.regression import passes
     render = passes.render_pixels
 
@@ -125,48 +122,35 @@ def test_values_that_are_not_finite_are_one_line(with_reference):
         pixels[4, 6, 1] = float("inf")
         return pixels
 
-    monkeypatch.setattr(passes, "render_pixels", broken)""",
-        )
-    )
-    result = with_reference.runpytest("-W", "error")
-    result.assert_outcomes(failed=1)
+    monkeypatch.setattr(passes, "render_pixels", broken)"""
+    with_reference.makepyfile(TEST.replace("(render_regression):", broken))
+    result = failing(with_reference, "-W", "error")
     (line,) = {line for line in result.outlines if " finite " in line}
-    assert line.split("the test is not: ")[1].startswith(
-        "R = nan at x = 5, y = 3 and at 2 more pixels; channels R, G, B, "
-    )
+    told = line.split("the test is not: ")[1]
+    assert told.startswith("R = nan at x = 5, y = 3 and at 2 more pixels; channels R, G, B, ")
 
 
 def test_each_seed_has_other_samples(with_reference):
-    with_reference.makepyfile(
-        TEST.replace("render_regression(", "found = [render_regression(")
-        .replace("\n\n", "")
-        .replace('"scalar_rgb")', '"scalar_rgb", seed=seed) for seed in (0, 0, 1)]\n')
-        + "    a, b, c = (each.numbers['relmse'] for each in found)\n    assert a == b != c\n"
-    )
+    call = TEST.partition("    ")[2].strip()
+    several = f"a, b, c = ({call[:-1]}, seed=seed).numbers['relmse'] for seed in (0, 0, 1))"
+    with_reference.makepyfile(TEST.replace(call, f"{several}\n    assert a == b != c"))
     with_reference.runpytest().assert_outcomes(passed=1)
 
 
-def test_update_writes_what_differs_and_fails(with_reference):
+def test_a_difference_fails_and_leaves_a_report_and_update_writes_only_what_differs(with_reference):
     before = reference(with_reference).read_bytes()
     with_reference.runpytest("--render-update").assert_outcomes(passed=1)
     assert reference(with_reference).read_bytes() == before
     make_brighter(with_reference)
-    result = with_reference.runpytest("--render-update")
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*wrote the reference*again*"])
-    with_reference.runpytest().assert_outcomes(passed=1)
-
-
-def test_a_difference_fails_and_leaves_a_report(with_reference):
-    make_brighter(with_reference)
-    result = with_reference.runpytest()
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*paired fail*same samples*", "*changed since the reference was made: ball.xml*"])
-    result.stdout.fnmatch_lines(["*worst pixel*of shape 0*", "*report: *index.html*"])
+    told = failing(with_reference).stdout
+    told.fnmatch_lines(["*paired fail*same samples*", "*changed since the reference was made: ball.xml*"])
+    told.fnmatch_lines(["*worst pixel*of shape 0*", "*report: *index.html*"])
     (folder,) = [path for path in (with_reference.path / "failures").iterdir() if path.is_dir()]
     assert {path.name for path in folder.iterdir()} == {"index.html", "comparison.json", "maps.exr", "test.exr"}
     assert json.loads((folder / "comparison.json").read_text())["status"] == "fail"
     assert folder.name in (with_reference.path / "failures" / "index.html").read_text()
+    failing(with_reference, "--render-update").stdout.fnmatch_lines(["*wrote the reference*again*"])
+    with_reference.runpytest().assert_outcomes(passed=1)
 
 
 def test_results_and_reports_go_where_and_when_they_are_wanted(with_reference):
@@ -175,23 +159,18 @@ def test_results_and_reports_go_where_and_when_they_are_wanted(with_reference):
     with_reference.runpytest("--render-results=elsewhere", "--render-report=all").assert_outcomes(passed=1)
     assert (with_reference.path / "elsewhere" / "index.html").exists()
     make_brighter(with_reference)
-    with_reference.runpytest("--render-report=none").assert_outcomes(failed=1)
+    failing(with_reference, "--render-report=none")
     assert not (with_reference.path / "failures").exists()
 
 
-def test_samples_are_scaled(with_reference):
+def test_samples_are_scaled_and_other_parameters_than_the_reference_are_an_error(with_reference):
     with_reference.runpytest("--render-spp-scale=4", "--render-report=all").assert_outcomes(passed=1)
     (path,) = with_reference.path.glob("failures/*/comparison.json")
     assert json.loads(path.read_text())["tiers"]["tile"]["samples"] == 4 * 32
-    result = with_reference.runpytest_subprocess("--render-spp-scale=0")
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
-
-
-def test_other_parameters_than_the_reference_are_an_error(with_reference):
+    assert with_reference.runpytest_subprocess("--render-spp-scale=0").ret == pytest.ExitCode.USAGE_ERROR
     with_reference.makepyfile(TEST.replace("spp=32", "spp=32, parameters={'albedo': 0.6}"))
-    result = with_reference.runpytest()
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*was made with the scene parameters {}; this test has {'albedo': '0.6'}*"])
+    told = "*was made with the scene parameters {}; this test has {'albedo': '0.6'}*"
+    failing(with_reference).stdout.fnmatch_lines([told])
 
 
 def test_scenes_of_any_kind_and_wrong_ones(project):
