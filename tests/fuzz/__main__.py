@@ -31,7 +31,6 @@ def main(arguments=None):
     for reader in options.reader:
         findings, start = Findings(options.output), time.monotonic()
         done = run(reader, options.first, options.count, options.seed, options.processes, findings)
-        sys.stderr.write("\r\x1b[K" if sys.stderr.isatty() else "")
         total = sum(findings.counts.values())
         print(f"{reader}: {done} files, {total} findings, {time.monotonic() - start:.0f} s", flush=True)
         for problem, count in sorted(findings.counts.items(), key=lambda item: -item[1]):

@@ -75,21 +75,21 @@ def test_what_breaks_the_law_is_found(tmp_path, monkeypatch, read, finding):
 
 
 def test_hangs_and_crashes_are_found_and_the_rest_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign, "PATIENCE", 1.0)
-    monkeypatch.setattr(campaign, "read_all", _hang_and_crash)
+    monkeypatch.setattr(campaign, "PATIENCE_ON_CLOCK", 3.0)
     findings = Findings(tmp_path)
-    assert run("obj", 0, 6, 0, 1, findings) == 6
+    assert run("obj", 0, 6, 0, 1, findings, _hang_and_crash) == 6
     assert findings.counts == {"hang of more than .. s": 1, "crash, exit code ..": 1, "odd": 1}
     assert len(list(tmp_path.glob("obj_0_[124].obj"))) == 3
 
 
-def _hang_and_crash(queue, _folder, _reader, _seed, indices, place, first):
-    for number in range(first, len(indices)):
-        place.value = number
-        while number == 1:
-            pass
-        if number == 2:
-            os._exit(3)
-        if number == 4:
-            queue.put((indices[number], "odd"))
-    place.value = len(indices)
+def _hang_and_crash(_folder, _reader, _seed, index):
+    while index == 1:
+        pass
+    if index == 2:
+        os._exit(3)
+    return "odd" if index == 4 else None
+
+
+def test_files_that_take_long_are_found(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "PATIENCE", -1.0)
+    assert campaign.read_one(str(tmp_path), "obj", 0, 0) == "0 s of computing"
