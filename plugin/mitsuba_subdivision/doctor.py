@@ -21,7 +21,7 @@ VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 DISTRIBUTION = "mitsuba-subdivision"
 # Extras for developers of this package.
-_FOR_DEVELOPERS = ("dev", "docs", "test")
+_FOR_DEVELOPERS = ("dev", "test")
 # Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more.
 SECONDS = 120
 # Height of the limit surface of a cube with corners at -1 and 1, above the middle of its face: the limit mask there,

@@ -1,4 +1,4 @@
-"""The documentation is built. `.ci/run` runs this file: it takes long, and needs the extra `docs`."""
+"""The documentation is built. `.ci/run` runs this file: it takes long, and needs the extra `dev`."""
 
 import subprocess
 import sys

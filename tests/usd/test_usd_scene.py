@@ -1089,7 +1089,7 @@ def test_the_library_prints_nothing_itself(scene, tmp_path, capfd, monkeypatch):
     _, (message,) = told(scene, mesh("seen", CUBE) + documents)
     assert "3 references to MaterialX documents left out" in message
     assert "(0.mtlx, 1.mtlx)" in message
-    assert 'pip install "mitsuba-subdivision[usd]"' in message
+    assert 'pip install "mitsuba-subdivision[files]"' in message
     assert capfd.readouterr() == ("", "")
 
 

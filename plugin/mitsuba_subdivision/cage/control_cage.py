@@ -224,7 +224,7 @@ class ControlCage:
     ) -> ControlCage:
         """Read a cage from an ``.obj``, ``.ply``, ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
 
-        OBJ files may have OpenSubdiv's tags. PLY and USD files need the extras ``ply`` and ``usd`` of this package.
+        OBJ files may have OpenSubdiv's tags. PLY and USD files need the extra ``files`` of this package.
 
         Points of USD files are transformed to world space, but not for the file's units and up axis. A USD file opens
         the files that it refers to, and a damaged one can crash the USD library.

@@ -86,7 +86,7 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
         from plyfile import PlyData
     except ImportError:
         raise CageError(
-            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[ply]"'
+            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[files]"'
         ) from None
     with warnings.catch_warnings():
         # For elements without rows NumPy warns, and plyfile then raises an error.

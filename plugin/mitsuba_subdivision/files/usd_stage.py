@@ -30,7 +30,7 @@ def require_usd(name: str) -> None:
         import pxr  # noqa: F401 - only to find out whether it is missing
     except ImportError:
         raise CageError(
-            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[usd]"'
+            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[files]"'
         ) from None
 
 
@@ -65,7 +65,7 @@ def _warn_of_missing(name: str, errors: list[str]) -> None:
         warn(
             f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "
             "another material have their display colours (the package materialx reads documents; pip install "
-            '"mitsuba-subdivision[usd]")'
+            '"mitsuba-subdivision[files]")'
         )
     others = [error for error in errors if not _MATERIALX.search(error)]
     if others:

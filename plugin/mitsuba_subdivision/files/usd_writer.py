@@ -89,7 +89,7 @@ def _new_mesh(
     except ImportError:
         raise CageError(
             f'"{path}": the package usd-core, which writes USD files, is missing; '
-            'pip install "mitsuba-subdivision[usd]"'
+            'pip install "mitsuba-subdivision[files]"'
         ) from None
     with whole_file(Path(path)) as beside:
         try:

@@ -242,7 +242,7 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
     try:
         import flip_evaluator
     except ImportError:
-        raise ImageError("FLIP is not installed: pip install 'mitsuba-subdivision[metrics]'") from None
+        raise ImageError("FLIP is not installed: pip install 'mitsuba-subdivision[figures]'") from None
     if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
         raise ImageError("FLIP does not see pixels that are not finite; expected finite images")
     start, stop, count = flip_exposures(reference.pixels)

@@ -93,7 +93,7 @@ def _panels(comparison: Comparison) -> bytes:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ImageError("reports need matplotlib: pip install 'mitsuba-subdivision[metrics]'") from None
+        raise ImageError("reports need matplotlib: pip install 'mitsuba-subdivision[figures]'") from None
     a, b = comparison.reference.pixels, comparison.test.pixels
     finite = bool(np.isfinite(a).all() and np.isfinite(b).all())
     maps = {"relative": relative_difference(a, b), **_maps(comparison)} if finite else {}

@@ -127,7 +127,7 @@ def _suffix_for(name: str, contents: CageContents) -> str:
     if not importlib.util.find_spec("pxr"):
         raise CageError(
             f'"{first}" of "{name}" cannot be written to an OBJ file; expected the package usd-core, to save '
-            'it as USD: pip install "mitsuba-subdivision[usd]"'
+            'it as USD: pip install "mitsuba-subdivision[files]"'
         )
     for key in contents.attributes:
         if not usd_values.is_possible(key) or key in usd_values.TEXCOORDS:
