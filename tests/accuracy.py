@@ -8,8 +8,6 @@ with 1 if a bar does not hold. ``--high`` does valences 200 to 1000 instead, whi
 reach a few levels only, beside the limit point and normal by closed form.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -46,18 +44,14 @@ def build_time(surface: LimitSurface) -> float:
     signature = signature_at(surface.cage.topology, int(half_edge), surface.scheme.element)
     times = []
     for _ in range(3):
-        _forget_classes()
+        for module in (one_ring, divided_element, element, irregular_patch, patch_pieces, refined_rings):
+            for function in vars(module).values():
+                if hasattr(function, "cache_clear"):
+                    function.cache_clear()
         begin = time.perf_counter()
         element.element_stencils(surface.scheme, signature, np.array([[0.1, 0.1]]))
         times.append(1e3 * (time.perf_counter() - begin))
     return min(times)
-
-
-def _forget_classes() -> None:
-    for module in (one_ring, divided_element, element, irregular_patch, patch_pieces, refined_rings):
-        for function in vars(module).values():
-            if hasattr(function, "cache_clear"):
-                function.cache_clear()
 
 
 def errors(exact: ExactSamples, surface: LimitSurface) -> dict[str, float]:
@@ -69,11 +63,9 @@ def errors(exact: ExactSamples, surface: LimitSurface) -> dict[str, float]:
     first, second = (exact.derivative_scale(found.level, order)[:, None] * exact.size for order in (1, 2))
     near = found.level <= bars.CURVATURE_LEVELS
     curvature = np.stack([found.gaussian_curvature, found.mean_curvature])
-    points = [(found.p, exact.p), (limit.p, exact.limit_p)]
-    single_points = [(single.p, exact.p), (single_limit.p, exact.limit_p)]
     result = {
-        "point": max(np.abs(a - b).max() for a, b in points) / exact.size,
-        "point f32": max(np.abs(a - b).max() for a, b in single_points) / exact.size,
+        name: max(np.abs(samples.p - exact.p).max(), np.abs(at_limit.p - exact.limit_p).max()) / exact.size
+        for name, samples, at_limit in (("point", found, limit), ("point f32", single, single_limit))
     }
     if exact.valence == 2:
         # The normal turns to and fro with the levels, and has no limit.
@@ -108,11 +100,11 @@ def main() -> int:
                     worst[name] = max(worst.get(name, 0.0), float(np.nan_to_num(error, nan=np.inf)))
             cells = (f"{row[name]:12.1f}" if name == "build ms" else _number(row.get(name)) for name in COLUMNS)
             print(f"{scheme:14}{valence:6}" + "".join(cells), flush=True)
-    print(f"{'largest':20}" + "".join(_number(worst.get(name)) for name in COLUMNS if name != "build ms"))
-    print(f"{'bar':20}" + "".join(_number(bar) for name, bar in COLUMNS.items() if name != "build ms"))
-    judged = [name for name, bar in COLUMNS.items() if bar is not None and name in worst]
-    failed = [name for name in judged if not worst[name] <= COLUMNS[name]]
-    held = [name for name in judged if name not in failed]
+    bars_of = {name: bar for name, bar in COLUMNS.items() if bar is not None}
+    print(f"{'largest':20}" + "".join(_number(worst.get(name)) for name in bars_of))
+    print(f"{'bar':20}" + "".join(map(_number, bars_of.values())))
+    failed = [name for name, bar in bars_of.items() if name in worst and not worst[name] <= bar]
+    held = [name for name in bars_of if name in worst and name not in failed]
     print(f"(above valence {bars.NORMAL_FLOAT32_VALENCES} normal f32 is not judged)")
     print(f"bars that hold: {', '.join(held) or 'none'}; bars that do not: {', '.join(failed) or 'none'}")
     return 1 if failed else 0

@@ -14,6 +14,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,9 @@ PIXEL_SUCCESS_RATE, LEAST_VARIANCE, ALPHA = 0.9975, 1e-4, 0.01
 XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
 IDIFF = ["idiff", "-q", "-fail", "0.05", "-failpercent", "1"]
 
+PATHS = {"type": "path", "max_depth": 8}
+GLASS = {"type": "dielectric"}
+
 Scene = dict[str, Any]
 
 
@@ -57,101 +61,80 @@ def light(radiance: float) -> Scene:
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
 
 
+def lamp(center: list[float], radius: float, radiance: float) -> Scene:
+    return {"type": "sphere", "center": center, "radius": radius, "emitter": light(radiance)}
+
+
 def transform() -> Any:
     return mi.ScalarTransform4f()
 
 
-def scene(integrator: Scene, origin: list[float], target: list[float], shift: float, **shapes: Scene) -> Scene:
+def empty(integrator: Scene, origin: list[float], target: list[float], shift: float) -> Scene:
     """A scene whose camera is turned to the right by a part of a pixel."""
-    view = np.subtract(target, origin)
-    right = np.cross(view, [0, 0, 1])
-    target = np.add(target, right / np.linalg.norm(right) * np.linalg.norm(view) * shift * PIXEL).tolist()
+    ahead = np.subtract(target, origin)
+    right = np.cross(ahead, [0, 0, 1])
+    target = np.add(target, right / np.linalg.norm(right) * np.linalg.norm(ahead) * shift * PIXEL).tolist()
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
     camera = {"type": "perspective", "fov": FIELD_OF_VIEW, "film": film}
     camera["to_world"] = transform().look_at(origin, target, [0, 0, 1])
-    return {"type": "scene", "integrator": integrator, "camera": camera, **shapes}
+    return {"type": "scene", "integrator": integrator, "camera": camera}
 
 
 def balls(albedo: float = 1.0, shift: float = 0.0) -> Scene:
     """A glass ball, a rough copper ball and a cube on a checkerboard, under a small lamp."""
     board = {"type": "checkerboard", "to_uv": transform().scale(8.0), "color0": 0.2, "color1": 0.6 * albedo}
-    return scene(
-        {"type": "path", "max_depth": 8},
-        [0, -7, 3.5],
-        [0, 0, 0.5],
-        shift,
-        floor=placed("rectangle", {"type": "diffuse", "reflectance": board}, [0, 0, 0], 5.0),
-        glass=placed("sphere", {"type": "dielectric"}, [-1.2, 0, 1], 1.0),
-        copper=placed("sphere", {"type": "roughconductor", "material": "Cu", "alpha": 0.1}, [1.3, 0.5, 0.8], 0.8),
-        cube=placed("cube", diffuse(0.6 * albedo, 0.3 * albedo, 0.2 * albedo), [0.2, -1.6, 0.35], 0.35),
-        lamp={"type": "sphere", "center": [1.5, -1.5, 5], "radius": 0.15, "emitter": light(400.0)},
-        sky={"type": "constant", "radiance": 0.05},
-    )
+    return empty(PATHS, [0, -7, 3.5], [0, 0, 0.5], shift) | {
+        "floor": placed("rectangle", {"type": "diffuse", "reflectance": board}, [0, 0, 0], 5.0),
+        "glass": placed("sphere", GLASS, [-1.2, 0, 1], 1.0),
+        "copper": placed("sphere", {"type": "roughconductor", "material": "Cu", "alpha": 0.1}, [1.3, 0.5, 0.8], 0.8),
+        "cube": placed("cube", diffuse(0.6 * albedo, 0.3 * albedo, 0.2 * albedo), [0.2, -1.6, 0.35], 0.35),
+        "lamp": lamp([1.5, -1.5, 5], 0.15, 400.0),
+        "sky": {"type": "constant", "radiance": 0.05},
+    }
 
 
 def caustics(albedo: float = 1.0, shift: float = 0.0) -> Scene:
     """Light that reaches the floor through a glass ball and off a mirror, from a lamp that is hard to hit."""
-    return scene(
-        {"type": "path", "max_depth": 8},
-        [0, -6, 4],
-        [0, 0, 0.3],
-        shift,
-        floor=placed("rectangle", diffuse(*[0.5 * albedo] * 3), [0, 0, 0], 4.0),
-        glass=placed("sphere", {"type": "dielectric"}, [-0.9, 0, 0.9], 0.8),
-        mirror=placed("sphere", {"type": "conductor"}, [1.1, 0.3, 0.7], 0.7),
-        lamp={"type": "sphere", "center": [-2, 1, 4], "radius": 0.1, "emitter": light(500.0)},
-    )
+    return empty(PATHS, [0, -6, 4], [0, 0, 0.3], shift) | {
+        "floor": placed("rectangle", diffuse(*[0.5 * albedo] * 3), [0, 0, 0], 4.0),
+        "glass": placed("sphere", GLASS, [-0.9, 0, 0.9], 0.8),
+        "mirror": placed("sphere", {"type": "conductor"}, [1.1, 0.3, 0.7], 0.7),
+        "lamp": lamp([-2, 1, 4], 0.1, 500.0),
+    }
 
 
 def room(albedo: float = 1.0, shift: float = 0.0) -> Scene:
     """A dark room that light enters from a bright sky, through a small window, past a glossy box."""
-    wall = diffuse(*[0.6 * albedo] * 3)
-    turned = {
-        "floor": ([0, 0, -1], [1, 0, 0], 0),
-        "ceiling": ([0, 0, 1], [1, 0, 0], 180),
-        "back": ([0, 1, 0], [1, 0, 0], 90),
-        "left": ([-1, 0, 0], [0, 1, 0], 90),
+    wall, at = diffuse(*[0.6 * albedo] * 3), transform().translate
+    places = {
+        "floor": at([0, 0, -1]).rotate([1, 0, 0], 0),
+        "ceiling": at([0, 0, 1]).rotate([1, 0, 0], 180),
+        "back": at([0, 1, 0]).rotate([1, 0, 0], 90),
+        "left": at([-1, 0, 0]).rotate([0, 1, 0], 90),
+        # The right wall is two halves with a gap between them.
+        "below": at([1, 0, -0.57]).rotate([0, 1, 0], -90).scale([0.43, 1, 1]),
+        "above": at([1, 0, 0.57]).rotate([0, 1, 0], -90).scale([0.43, 1, 1]),
+        "front": at([0, -1, 0]).rotate([1, 0, 0], -90),
     }
-    walls: dict[str, Scene] = {
-        name: {"type": "rectangle", "bsdf": wall, "to_world": transform().translate(p).rotate(axis, angle)}
-        for name, (p, axis, angle) in turned.items()
+    window = at([2, 0, 0.3]).rotate([0, 1, 0], -90).scale(0.3)
+    return empty(PATHS, [-0.1, -0.98, 0.1], [-0.1, 1, -0.3], shift) | {
+        **{name: {"type": "rectangle", "bsdf": wall, "to_world": place} for name, place in places.items()},
+        "box": placed("cube", {"type": "roughconductor", "alpha": 0.15}, [0.2, 0.3, -0.7], 0.3),
+        "window": {"type": "rectangle", "to_world": window, "emitter": light(60.0)},
     }
-    # The right wall is two halves with a gap between them.
-    for name, z in (("below", -0.57), ("above", 0.57)):
-        to_world = transform().translate([1, 0, z]).rotate([0, 1, 0], -90).scale([0.43, 1, 1])
-        walls[name] = {"type": "rectangle", "bsdf": wall, "to_world": to_world}
-    to_world = transform().translate([0, -1, 0]).rotate([1, 0, 0], -90)
-    walls["front"] = {"type": "rectangle", "bsdf": wall, "to_world": to_world}
-    return scene(
-        {"type": "path", "max_depth": 8},
-        [-0.1, -0.98, 0.1],
-        [-0.1, 1, -0.3],
-        shift,
-        **walls,
-        box=placed("cube", {"type": "roughconductor", "alpha": 0.15}, [0.2, 0.3, -0.7], 0.3),
-        window={
-            "type": "rectangle",
-            "to_world": transform().translate([2, 0, 0.3]).rotate([0, 1, 0], -90).scale(0.3),
-            "emitter": light(60.0),
-        },
-    )
 
 
 def fog(albedo: float = 1.0, shift: float = 0.0) -> Scene:
     """Two balls in fog, lit by a small lamp within it."""
     medium = {"type": "homogeneous", "albedo": 0.9, "sigma_t": 0.25, "phase": {"type": "hg", "g": 0.6}}
     ball = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": 0.5 * albedo}}
-    return scene(
-        {"type": "volpathmis", "max_depth": 8},
-        [0, -5, 1.5],
-        [0, 0, 0.5],
-        shift,
-        bounds=placed("sphere", {"type": "null"}, [0, 0, 0], 9.0, interior=medium),
-        floor=placed("rectangle", diffuse(*[0.4 * albedo] * 3), [0, 0, -0.5], 4.0),
-        one=placed("sphere", ball, [-0.9, 0, 0.3], 0.8),
-        two=placed("sphere", {"type": "dielectric"}, [0.9, 0, 0.3], 0.7),
-        lamp={"type": "sphere", "center": [0.4, 1.2, 2.2], "radius": 0.1, "emitter": light(150.0)},
-    )
+    return empty({"type": "volpathmis", "max_depth": 8}, [0, -5, 1.5], [0, 0, 0.5], shift) | {
+        "bounds": placed("sphere", {"type": "null"}, [0, 0, 0], 9.0, interior=medium),
+        "floor": placed("rectangle", diffuse(*[0.4 * albedo] * 3), [0, 0, -0.5], 4.0),
+        "one": placed("sphere", ball, [-0.9, 0, 0.3], 0.8),
+        "two": placed("sphere", GLASS, [0.9, 0, 0.3], 0.7),
+        "lamp": lamp([0.4, 1.2, 2.2], 0.1, 150.0),
+    }
 
 
 def valence5(albedo: float = 1.0, shift: float = 0.0) -> mi.Scene:
@@ -162,27 +145,17 @@ def valence5(albedo: float = 1.0, shift: float = 0.0) -> mi.Scene:
     parameters[name] *= albedo
     parameters.update()
     camera = mi.traverse(loaded.sensors()[0])
-    camera["to_world"] = camera["to_world"] @ mi.Transform4f().rotate(
-        [0, 1, 0], -shift * float(np.ravel(camera["x_fov"])[0]) / SIZE
-    )
+    degrees = -shift * float(np.ravel(camera["x_fov"])[0]) / SIZE
+    camera["to_world"] = camera["to_world"] @ mi.Transform4f().rotate([0, 1, 0], degrees)
     camera.update()
     return loaded
 
 
 SCENES: dict[str, Callable[..., Any]] = {f.__name__: f for f in (balls, caustics, room, fog, valence5)}
-CHANGES: dict[str, dict[str, float]] = {
-    "unchanged": {},
-    "albedo + 0.1 %": {"albedo": 1.001},
-    "albedo + 1 %": {"albedo": 1.01},
-    "albedo + 4 %": {"albedo": 1.04},
-    "camera 0.05 px": {"shift": 0.05},
-    "camera 0.5 px": {"shift": 0.5},
-}
+CHANGES: dict[str, dict[str, float]] = {"unchanged": {}}
+CHANGES |= {f"albedo + {part:g} %": {"albedo": 1 + part / 100} for part in (0.1, 1, 4)}
+CHANGES |= {f"camera {part:g} px": {"shift": part} for part in (0.05, 0.5)}
 STAM = "Stam's normals"
-
-
-def made(name: str, change: str) -> Any:
-    return stam(5) if change == STAM else SCENES[name](**CHANGES[change])
 
 
 def rendered(name: str, change: str, spp: int, batches: int, seeds: range, cache: Path) -> Iterator[Image]:
@@ -191,41 +164,40 @@ def rendered(name: str, change: str, spp: int, batches: int, seeds: range, cache
     for seed in seeds:
         path = cache / f"{mi.variant()} {name} {change} {spp} {seed}.exr".replace(" ", "-")
         if not path.exists():
-            loaded = loaded or load_scene(made(name, change))
+            loaded = loaded or load_scene(stam(5) if change == STAM else SCENES[name](**CHANGES[change]))
             save_image(path, render_pass(loaded, Sampling(batches, spp // batches, seed)))
         yield load_image(path)
 
 
-def tile_tier(reference: Image, test: Image) -> bool:
-    return compare(reference, test, ["tile"]).status is Status.FAIL
+def fails(tier: str, reference: Image, test: Image) -> bool:
+    return compare(reference, test, [tier]).status is Status.FAIL
 
 
 def normal_tiles(reference: Image, test: Image) -> bool:
     """The tile tier without rare events: the test's own variance shows none, as it is the reference's."""
-    assert reference.estimate is not None
-    assert test.estimate is not None
-    return tile_tier(reference, replace(test, estimate=replace(test.estimate, variance=reference.estimate.variance)))
+    estimate = replace(test.estimate, variance=reference.estimate.variance)
+    return fails("tile", reference, replace(test, estimate=estimate))
 
 
 def mitsuba_z_test(reference: Image, test: Image) -> bool:
     """The rule of Mitsuba's src/render/tests/test_renders.py: enough pixels must pass, by the reference's variance."""
-    assert reference.estimate is not None
-    assert test.estimate is not None
     variance = np.maximum(reference.estimate.variance @ (XYZ**2).T, LEAST_VARIANCE)
     z = np.abs((test.pixels - reference.pixels) @ XYZ.T) * np.sqrt(test.estimate.count[..., None] / variance)
     limit = 1 - (1 - ALPHA) ** (1 / test.estimate.count.size)
     return bool(np.mean(2 * norm.sf(z) > limit) < PIXEL_SUCCESS_RATE)
 
 
-def flip(reference: Image, test: Image) -> bool:
-    return compare(reference, test, ["flip"]).status is Status.FAIL
-
-
 def idiff(reference: Image, test: Image) -> bool:
     return subprocess.run([*IDIFF, reference.name, test.name], capture_output=True, check=False).returncode == 2
 
 
-RULES = {"tile": tile_tier, "normal": normal_tiles, "Mitsuba": mitsuba_z_test, "FLIP": flip, "idiff": idiff}
+RULES = {
+    "tile": partial(fails, "tile"),
+    "normal": normal_tiles,
+    "Mitsuba": mitsuba_z_test,
+    "FLIP": partial(fails, "flip"),
+    "idiff": idiff,
+}
 
 
 def main() -> None:
@@ -241,15 +213,13 @@ def main() -> None:
     cache = options.cache or Path(tempfile.mkdtemp())
     rules = [name for name in options.rules if name != "idiff" or shutil.which("idiff")]
     print(f"{'scene':10}{'change':17}{'spp':>5}{'seeds':>6}" + "".join(f"{name:>9}" for name in rules))
+    seeds = range(FIRST_SEED, FIRST_SEED + BATCHES * options.seeds, BATCHES)
     for name in options.scenes:
         mi.set_variant("llvm_ad_rgb")
         (reference,) = rendered(name, "unchanged", REFERENCE_SPP, REFERENCE_SPP // 64, range(1), cache)
         mi.set_variant(options.variant)
-        for change in options.changes:
-            if change == STAM and name != "valence5":
-                continue
+        for change in (each for each in options.changes if each != STAM or name == "valence5"):
             for spp in options.spp:
-                seeds = range(FIRST_SEED, FIRST_SEED + BATCHES * options.seeds, BATCHES)
                 failed = np.zeros(len(rules), int)
                 for test in rendered(name, change, spp, BATCHES, seeds, cache):
                     failed += [RULES[rule](reference, test) for rule in rules]

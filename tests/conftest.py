@@ -24,17 +24,8 @@ ALL_THREADS = dr.thread_count()
 # Folders of tests that compute with Dr.Jit, but for those marked `threads`. Its threads wait for work in a loop, for 20
 # ms each time, while the other processes of pytest have tests for all cores.
 IN_ONE_THREAD = {
-    "documents",
-    "evaluation",
-    "figures",
-    "fit",
-    "gradients",
-    "kernels",
-    "patches",
-    "regression",
-    "shapes",
-    "surface",
-    "tessellation",
+    *("documents", "evaluation", "figures", "fit", "gradients", "kernels"),
+    *("patches", "regression", "shapes", "surface", "tessellation"),
 }
 
 
@@ -115,25 +106,23 @@ def _missing(variant: str) -> str | None:
     if variant not in mi.variants():
         return "Mitsuba was compiled without it"
     backend = variant.partition("_")[0]
-    if backend == "scalar":
-        return None
-    if backend == "llvm":
-        return llvm_problem()
+    if backend in ("scalar", "llvm"):
+        return llvm_problem() if backend == "llvm" else None
     return None if dr.has_backend(getattr(dr.JitBackend, {"cuda": "CUDA"}.get(backend, "Metal"))) else "no such device"
 
 
 _COMPILED = list(mi.variants())
+_RGB = [v for v in _COMPILED if v.endswith("_rgb")]
 _GROUPS = {
     "all": _COMPILED,
-    "all_rgb": [v for v in _COMPILED if v.endswith("_rgb")],
-    "array_rgb": [v for v in _COMPILED if v.endswith("_rgb") and not v.startswith("scalar")],
-    "all_ad_rgb": [v for v in _COMPILED if v.endswith("_ad_rgb")],
+    "all_rgb": _RGB,
+    "array_rgb": [v for v in _RGB if not v.startswith("scalar")],
+    "all_ad_rgb": [v for v in _RGB if v.endswith("_ad_rgb")],
 }
 
 
 def _in_variant(variant: str):
-    reason = _missing(variant)
-    if reason:
+    if reason := _missing(variant):
         pytest.skip(f"{variant}: {reason}")
     mi.set_variant(variant)
     yield variant
@@ -145,23 +134,17 @@ def _in_variant(variant: str):
         dr.set_flag(dr.JitFlag.Default, True)
 
 
-def _variant_fixture(variant: str):
-    @pytest.fixture(name=f"variant_{variant}")
-    def fixture():
-        yield from _in_variant(variant)
+def _fixture(name: str, variants: list[str] | None = None):
+    """One for each of some variants, or one of a variant's name."""
 
-    return fixture
-
-
-def _group_fixture(name: str, variants: list[str]):
-    @pytest.fixture(name=f"variants_{name}", params=variants)
+    @pytest.fixture(name=f"variants_{name}" if variants else f"variant_{name}", params=variants)
     def fixture(request):
-        yield from _in_variant(request.param)
+        yield from _in_variant(request.param if variants else name)
 
     return fixture
 
 
 for _name in {*_COMPILED, "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"}:
-    globals()[f"variant_{_name}"] = _variant_fixture(_name)
+    globals()[f"variant_{_name}"] = _fixture(_name)
 for _name, _variants in _GROUPS.items():
-    globals()[f"variants_{_name}"] = _group_fixture(_name, _variants)
+    globals()[f"variants_{_name}"] = _fixture(_name, _variants)

@@ -20,7 +20,6 @@ import argparse
 import resource
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +34,7 @@ from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.ball_fits import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
 from mitsuba_subdivision.fit.to_mesh import triangle_samples
+from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
@@ -59,6 +59,10 @@ CREASE_TARGET_SPP = 4096
 CREASE_START = 2.6
 STAGE = {"integrator": integrator(SPP, EDGE_SPP), **LIGHTS}
 BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
+CUBE = msub.ControlCage(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
+    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]],
+)
 
 
 class Course(NamedTuple):
@@ -91,43 +95,51 @@ MESH_COURSES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Triangles:
+class Triangles(NamedTuple):
     """A mesh with normals."""
 
     positions: np.ndarray
     normals: np.ndarray
     triangles: np.ndarray
 
+    @classmethod
+    def of_surface(cls, cage: msub.ControlCage, rate: int) -> Triangles:
+        found = msub.LimitSurface(cage).tessellate(rate)
+        return cls(found.positions, found.normals, found.triangles)
+
+    @classmethod
+    def averaged(cls, positions: np.ndarray, triangles: np.ndarray) -> Triangles:
+        """With the averages of the triangles' normals, by area."""
+        a, b, c = positions[triangles].swapaxes(0, 1)
+        normals = np.zeros_like(positions)
+        np.add.at(normals, triangles, np.cross(b - a, c - a)[:, None])
+        return cls(positions, unit(normals), triangles)
+
     def samples(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Random points, uniform by area, and their normals."""
         chosen, weights = triangle_samples(self.positions, self.triangles, count, seed)
         corners, weights = self.triangles[chosen], weights[:, :, None]
         points, normals = ((each[corners] * weights).sum(axis=1) for each in (self.positions, self.normals))
-        return points, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        return points, unit(normals)
 
     def folded(self) -> float:
         """Part of the triangles that face away from all of their neighbours taken together."""
         a, b, c = self.positions[self.triangles].swapaxes(0, 1)
         normals = np.cross(b - a, c - a)
         sides = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-        _, edge = np.unique(sides, axis=0, return_inverse=True)
-        edge, of = edge.ravel(), np.repeat(np.arange(len(self.triangles)), 3)
-        total = np.zeros((edge.max() + 1, 3))
-        np.add.at(total, edge, normals[of])
-        others = (total[edge] - normals[of]).reshape(-1, 3, 3).sum(axis=1)
+        edges, edge = np.unique(sides, axis=0, return_inverse=True)
+        own, total = np.repeat(normals, 3, axis=0), np.zeros((len(edges), 3))
+        np.add.at(total, edge.ravel(), own)
+        others = (total[edge.ravel()] - own).reshape(-1, 3, 3).sum(axis=1)
         return float(((others * normals).sum(axis=1) < 0).mean())
 
 
-@dataclass(frozen=True)
-class Result:
-    """What came of a fit."""
+def unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
-    unknowns: int
-    chamfer: float
-    angle: float
-    folded: float
-    seconds: float
+
+# Of a fit: unknowns, distance, angle of normals, part of triangles that are folded over, seconds of a step.
+Result = tuple[int, float, float, float, float]
 
 
 def main() -> None:
@@ -143,56 +155,40 @@ def main() -> None:
         target = normalized(TARGETS[name]())
         views = pictures(target)
         for kind, fitted, courses in (("cage", fitted_cage, CAGE_COURSES), ("mesh", fitted_mesh, MESH_COURSES)):
-            found = {
-                each: [fitted(target, views, course, seed, options.steps) for seed in range(options.seeds)]
-                for each, course in courses.items()
-            }
-            # Courses whose surfaces fold come after those whose do not.
-            ordered = sorted(
-                found, key=lambda each: (median(found[each], "folded") > 0, median(found[each], "chamfer"))
-            )
-            for each in ordered if options.all else ordered[:1]:
-                report(name, f"{kind} {each}", found[each])
-    if "creases" not in options.targets:
-        return
-    creased = np.array([fitted_creases(seed) for seed in range(options.seeds)])
-    mean, largest, grown = np.median(creased, axis=0)
-    print(f"creases: sharpness found to {mean:.3f} in the mean, {largest:.3f} at most; memory grows by {grown:.0f} MB")
+            found = []
+            for each, course in courses.items():
+                results = [fitted(target, views, course, seed, options.steps) for seed in range(options.seeds)]
+                _, distance, _, folded, _ = np.median(results, axis=0)
+                # Courses whose surfaces fold come after those whose do not.
+                found.append((folded > 0, distance, f"{kind} {each}", results))
+            for *_, title, results in sorted(found) if options.all else [min(found)]:
+                report(name, title, results)
+    if "creases" in options.targets:
+        creased = [fitted_creases(seed) for seed in range(options.seeds)]
+        mean, most, grown = np.median(creased, axis=0)
+        print(f"creases: sharpness found to {mean:.3f} in the mean, {most:.3f} at most; memory grows by {grown:.0f} MB")
 
 
-def median(results: list[Result], field: str) -> float:
-    return float(np.median([getattr(each, field) for each in results]))
-
-
-def report(name: str, kind: str, results: list[Result]) -> None:
-    distances, folded = ([100 * getattr(each, field) for each in results] for field in ("chamfer", "folded"))
+def report(name: str, title: str, results: list[Result]) -> None:
+    unknowns, distances, angles, folded, seconds = np.transpose(results)
+    distances, folded = 100 * distances, 100 * folded
     print(
-        f"{name:<8} {kind:<15} {results[0].unknowns:9d}   "
+        f"{name:<8} {title:<15} {unknowns[0]:9.0f}   "
         f"{np.median(distances):6.3f} % ({min(distances):.3f} to {max(distances):.3f})   "
-        f"{median(results, 'angle'):6.2f} deg   "
-        f"{np.median(folded):6.4f} % (at most {max(folded):.4f})   {median(results, 'seconds'):.3f}",
+        f"{np.median(angles):6.2f} deg   "
+        f"{np.median(folded):6.4f} % (at most {max(folded):.4f})   {np.median(seconds):.3f}",
         flush=True,
     )
 
 
-def from_cage(name: str) -> Callable[[], Triangles]:
-    def made() -> Triangles:
-        found = msub.LimitSurface(msub.ControlCage.from_file(CAGES / f"{name}.obj")).tessellate(16)
-        return Triangles(found.positions, found.normals, found.triangles)
-
-    return made
+def from_cage(name: str) -> Triangles:
+    return Triangles.of_surface(msub.ControlCage.from_file(CAGES / f"{name}.obj"), 16)
 
 
-def from_ball(moved: Callable[[np.ndarray], np.ndarray]) -> Callable[[], Triangles]:
+def from_ball(moved: Callable[[np.ndarray], np.ndarray]) -> Triangles:
     """A smooth image of the unit sphere."""
-
-    def made() -> Triangles:
-        ball = ball_cage(7, 1.0)
-        triangles = ball.triangles
-        positions = moved(ball.positions)
-        return Triangles(positions, vertex_normals(positions, triangles), triangles)
-
-    return made
+    ball = ball_cage(7, 1.0)
+    return Triangles.averaged(moved(ball.positions), ball.triangles)
 
 
 def arms(directions: np.ndarray) -> np.ndarray:
@@ -211,57 +207,44 @@ def bean(directions: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(angle) * radius, np.cos(angle) * radius, z * waist], axis=1)
 
 
-TARGETS = {"star": from_cage("star"), "arms": from_ball(arms), "bean": from_ball(bean), "human": from_cage("human")}
+TARGETS = {
+    "star": lambda: from_cage("star"),
+    "arms": lambda: from_ball(arms),
+    "bean": lambda: from_ball(bean),
+    "human": lambda: from_cage("human"),
+}
 
 
 def normalized(mesh: Triangles) -> Triangles:
     low, high = mesh.positions.min(axis=0), mesh.positions.max(axis=0)
-    positions = (mesh.positions - (low + high) / 2) * DIAGONAL / np.linalg.norm(high - low)
-    return Triangles(positions, mesh.normals, mesh.triangles)
+    return mesh._replace(positions=(mesh.positions - (low + high) / 2) * DIAGONAL / np.linalg.norm(high - low))
 
 
 def ball_cage(halvings: int, radius: float) -> msub.ControlCage:
     """A cube, halved so often along each edge, on a sphere."""
-    corners = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
-    cage = msub.ControlCage(
-        corners, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    )
+    cage = CUBE
     for _ in range(halvings):
         cage = cage.refined()
     return cage.with_positions(radius * cage.positions / np.linalg.norm(cage.positions, axis=1, keepdims=True))
 
 
-def vertex_normals(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = positions[triangles].swapaxes(0, 1)
-    normals = np.zeros_like(positions)
-    for corner in range(3):
-        np.add.at(normals, triangles[:, corner], np.cross(b - a, c - a))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-
-
 def mesh_shape(mesh: Triangles) -> mi.Mesh:
     """A mesh for a scene, smoothly shaded."""
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict(BSDF)
-    shape = mi.Mesh("mesh", len(mesh.positions), len(mesh.triangles), props=props, has_vertex_normals=True)
-    params = mi.traverse(shape)
-    params["vertex_positions"] = upload(mi.Float, mesh.positions)
-    params["faces"] = upload(mi.UInt32, mesh.triangles)
-    params.update()
-    return shape
+    buffers = {"vertex_positions": mesh.positions}
+    return mitsuba_mesh("mesh", mesh.triangles, buffers, bsdf=mi.load_dict(BSDF), averages_normals=True)
 
 
 def sensors(target: Triangles) -> list[dict]:
     """Cameras around a target, which it fills."""
     radius = np.linalg.norm(target.positions, axis=1).max()
     fov = float(np.degrees(2 * np.arcsin(MARGIN * radius / DISTANCE)))
-    film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
-    found = []
+    size = {"width": RESOLUTION, "height": RESOLUTION}
+    film, found = {"type": "hdrfilm", **size, "rfilter": {"type": "box"}, "sample_border": True}, []
     for view in range(VIEWS):
         angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
         place = DISTANCE * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
-        found.append({"type": "perspective", "fov": fov, "to_world": to_world, "film": {**film, "sample_border": True}})
+        found.append({"type": "perspective", "fov": fov, "to_world": to_world, "film": film})
     return found
 
 
@@ -289,15 +272,13 @@ def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int,
         seed=1000 * seed,
         callbacks=[lambda _: clock.append(time.perf_counter())],
     ).run(steps)
-    found = msub.LimitSurface(fit.cage).tessellate(8)
-    mesh = Triangles(found.positions, found.normals, found.triangles)
-    return compared(mesh, target, fit.cage.positions.size, np.diff(clock))
+    return compared(Triangles.of_surface(fit.cage, 8), target, fit.cage.positions.size, np.diff(clock))
 
 
 def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
     ball = ball_cage(DENSE, RADIUS * DIAGONAL)
-    start = Triangles(ball.positions, vertex_normals(ball.positions, ball.triangles), ball.triangles)
-    scene = mi.load_dict({"type": "scene", **STAGE, "mesh": mesh_shape(start)})
+    mesh = mesh_shape(Triangles.averaged(ball.positions, ball.triangles))
+    scene = mi.load_dict({"type": "scene", **STAGE, "mesh": mesh})
     params, key = mi.traverse(scene), "mesh.vertex_positions"
     targets = [upload(mi.TensorXf, view.picture) for view in views]
     cameras = [mi.load_dict(view.sensor) for view in views]
@@ -306,7 +287,6 @@ def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int,
     large_steps = mi.ad.LargeSteps(params[key], params["mesh.faces"], MESH_LAMBDA)
     optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(params[key])
-
     rates = Schedule.of(course.rates(steps), "rate")
 
     def loss(image: mi.TensorXf, view: int) -> mi.Float:
@@ -324,22 +304,16 @@ def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int,
         float(np.array(total).ravel()[0])
         clock.append(time.perf_counter())
     positions = np.array(large_steps.from_differential(optimizer["u"]), dtype=np.float64).reshape(-1, 3)
-    mesh = Triangles(positions, vertex_normals(positions, ball.triangles), ball.triangles)
-    return compared(mesh, target, positions.size, np.diff(clock))
+    return compared(Triangles.averaged(positions, ball.triangles), target, positions.size, np.diff(clock))
 
 
 def fitted_creases(seed: int) -> tuple[float, float, float]:
     """Mean and largest error of sharpness, and megabytes that the process has grown by."""
-    cube = msub.ControlCage(
-        0.8 * np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)]),
-        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]],
-    )
+    cube = CUBE.with_positions(0.8 * CUBE.positions)
     # By how high their ends lie: below, uprights, above.
     sharpness = np.array([1.5, 0.8, 2.3])[(cube.positions[cube.edges, 2] > 0).sum(axis=1)]
     box = tagged(cube, sharpness).with_positions(cube.positions * (1.1, 1.0, 0.9))
-    found = msub.LimitSurface(box).tessellate(32)
-    views = pictures(Triangles(found.positions, found.normals, found.triangles), CREASE_TARGET_SPP)
-    peaks: list[int] = []
+    views, peaks = pictures(Triangles.of_surface(box, 32), CREASE_TARGET_SPP), []
     fit = CageFit(
         tagged(cube, np.full(len(sharpness), CREASE_START)),
         views,
@@ -354,7 +328,7 @@ def fitted_creases(seed: int) -> tuple[float, float, float]:
         callbacks=[lambda _: peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)],
     ).run(CREASE_STEPS)
     errors = np.abs(fit.sharpness - sharpness)
-    return float(errors.mean()), float(errors.max()), (peaks[-1] - peaks[50]) / 1024
+    return errors.mean(), errors.max(), (peaks[-1] - peaks[50]) / 1024
 
 
 def tagged(cage: msub.ControlCage, sharpness: np.ndarray) -> msub.ControlCage:
@@ -371,9 +345,7 @@ def compared(found: Triangles, target: Triangles, unknowns: int, seconds: np.nda
         distance, nearest = cKDTree(places).query(points)
         distances.append(distance.mean() / DIAGONAL)
         angles.append(np.degrees(np.arccos(np.clip((normals * others[nearest]).sum(axis=1), -1, 1))).mean())
-    return Result(
-        unknowns, float(np.mean(distances)), float(np.mean(angles)), found.folded(), float(np.median(seconds))
-    )
+    return unknowns, np.mean(distances), np.mean(angles), found.folded(), np.median(seconds)
 
 
 if __name__ == "__main__":

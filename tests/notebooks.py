@@ -8,8 +8,6 @@ notebook stays as it was.
 The metadata of a cell may have ``"tests": {"replace": ["A", "B", ..]}``: with ``--quick``, A is then B in its code.
 """
 
-from __future__ import annotations
-
 import argparse
 import base64
 import io
@@ -46,27 +44,18 @@ def main() -> None:
 
 
 def executed(notebook: nbformat.NotebookNode, quick: bool) -> nbformat.NotebookNode:
-    """The notebook with the outputs of a run."""
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    if quick:
-        for cell in cells:
-            replace_for_tests(cell)
+    for cell in cells if quick else ():
+        replace_for_tests(cell)
     with tempfile.TemporaryDirectory() as folder:
         # Neither a user's settings nor another backend for plots.
         environment = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"}
         environment |= {"IPYTHONDIR": folder, "JUPYTER_CONFIG_DIR": folder}
-        resources = {"metadata": {"path": folder}}
-        arguments = ["--log-level=ERROR"]
-        if quick:
-            arguments.append(f"--IPKernelApp.exec_files={Path(__file__).with_name('quick_kernels.py')}")
-        client = NotebookClient(
-            notebook,
-            timeout=TIMEOUT,
-            resources=resources,
-            extra_arguments=arguments,
-            # What a cell prints is one output, however it arrives.
-            coalesce_streams=True,
-        )
+        quick_kernels = f"--IPKernelApp.exec_files={Path(__file__).with_name('quick_kernels.py')}"
+        client = NotebookClient(notebook, timeout=TIMEOUT, resources={"metadata": {"path": folder}})
+        client.extra_arguments = ["--log-level=ERROR", *([quick_kernels] if quick else [])]
+        # What a cell prints is one output, however it arrives.
+        client.coalesce_streams = True
         client.execute(env=environment)
     for cell in cells:
         cell.metadata.pop("execution", None)
@@ -77,7 +66,6 @@ def executed(notebook: nbformat.NotebookNode, quick: bool) -> nbformat.NotebookN
 
 
 def replace_for_tests(cell: nbformat.NotebookNode) -> None:
-    """Change a cell's code as its metadata says."""
     words = cell.metadata.get("tests", {}).get("replace", [])
     for old, new in zip(words[::2], words[1::2], strict=True):
         if old not in cell.source:
@@ -108,12 +96,10 @@ def tidy(output: nbformat.NotebookNode, cell: nbformat.NotebookNode) -> None:
 
 
 def has_picture(output: nbformat.NotebookNode) -> bool:
-    """Whether an output is a picture."""
     return any(kind in output.get("data", {}) for kind in PICTURES)
 
 
 def picture(output: nbformat.NotebookNode) -> Image.Image:
-    """The picture of an output."""
     (data,) = (output.data[kind] for kind in PICTURES if kind in output.data)
     return Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")
 

@@ -23,18 +23,14 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor, UniformGrid, VertexTable
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
 SURFACES = {
-    "human": ("human", "catmull_clark"),
-    "rook": ("rook", "catmull_clark"),
-    "barrel": ("barrel", "catmull_clark"),
-    "propeller": ("propeller", "catmull_clark"),
-    "star": ("star", "catmull_clark"),
-    "star, Doo-Sabin": ("star", "doo_sabin"),
-    "star, Loop": ("star", "loop"),
+    **{name: (name, "catmull_clark") for name in ("human", "rook", "barrel", "propeller", "star")},
+    **{"star, Doo-Sabin": ("star", "doo_sabin"), "star, Loop": ("star", "loop")},
 }
 WITH_OUTLINES = ("human", "rook", "barrel")
 REFERENCE_RATE = 64
@@ -63,23 +59,17 @@ def main() -> None:
         adaptive = surface.adaptive_sampling(Criterion(Measure.CHORD, error))
         report(f"{name}, chord", uniform, error, adaptive, chord_error(surface, adaptive))
         if name in WITH_OUTLINES:
-            outlines = Outlines(surface)
+            outlines, asked = Outlines(surface), COARSEST
             error = outlines.error(uniform)
-            asked, adaptive = COARSEST, outlines.adaptive(COARSEST)
-            while outlines.error(adaptive) > error:
+            while (found := outlines.error(adaptive := outlines.adaptive(asked))) > error:
                 asked *= FINER
-                adaptive = outlines.adaptive(asked)
-            report(f"{name}, outline", uniform, error, adaptive, outlines.error(adaptive))
+            report(f"{name}, outline", uniform, error, adaptive, found)
 
 
 def report(name: str, uniform: VertexTable, error: float, adaptive: VertexTable, found: float) -> None:
-    """Print a line of the table."""
-    counts = len(uniform.triangles), len(adaptive.triangles)
-    print(
-        f"{name:<18} {counts[0]:8} triangles {error:.5f}   {counts[1]:8} triangles {found:.5f}"
-        f" {counts[0] / counts[1]:8.2f}",
-        flush=True,
-    )
+    many, few = len(uniform.triangles), len(adaptive.triangles)
+    sides = f"{many:8} triangles {error:.5f}   {few:8} triangles {found:.5f}"
+    print(f"{name:<18} {sides} {many / few:8.2f}", flush=True)
 
 
 def chord_error(surface: LimitSurface, table: VertexTable) -> float:
@@ -89,23 +79,18 @@ def chord_error(surface: LimitSurface, table: VertexTable) -> float:
     i, j = (each.ravel() for each in np.indices((STEPS + 1, STEPS + 1)))
     inside = (i + j <= STEPS) & (np.max([i, j, STEPS - i - j], axis=0) < STEPS)
     weights = np.stack([i, j, STEPS - i - j], axis=1)[inside] / STEPS
-    kernel = surface.on_device("llvm_ad_rgb_double")
-    element = surface.patches.elements.face[corner]
-    first = surface.patches.elements.face_offsets[element]
-    found = 0.0
+    kernel, float64 = surface.on_device("llvm_ad_rgb_double"), dr.llvm.ad.Float64
+    element, found = surface.patches.elements.face[corner], []
+    corner = corner - surface.patches.elements.face_offsets[element]
     for begin in range(0, len(corner), TRIANGLES_AT_ONCE):
         own = slice(begin, begin + TRIANGLES_AT_ONCE)
-        points = (weights @ positions[table.triangles[own]]).reshape(-1, 3)
-        starts = (weights @ uv[own]).reshape(-1, 2)
-        elements, corners = (
-            upload(dr.llvm.ad.UInt32, np.repeat(each, len(weights)))
-            for each in (element[own], corner[own] - first[own])
-        )
-        u, v = (upload(dr.llvm.ad.Float64, each) for each in starts.T)
-        p = kernel.types.vector3(*(upload(dr.llvm.ad.Float64, each) for each in points.T))
-        nearest = kernel.closest(p, elements, (u, v), corners)
-        found = max(found, float(np.max(np.array(nearest.distance))))
-    return found
+        points, starts = (weights @ positions[table.triangles[own]]).T, (weights @ uv[own]).T
+        p = kernel.types.vector3(*(upload(float64, each.T.ravel()) for each in points))
+        starts = tuple(upload(float64, each.T.ravel()) for each in starts)
+        places = (np.repeat(each[own], len(weights)) for each in (element, corner))
+        elements, corners = (upload(dr.llvm.ad.UInt32, each) for each in places)
+        found.append(np.array(kernel.closest(p, elements, starts, corners).distance).max())
+    return max(found)
 
 
 def locations(surface: LimitSurface, table: VertexTable) -> tuple[np.ndarray, np.ndarray]:
@@ -146,17 +131,16 @@ class Outlines:
     def error(self, table: VertexTable) -> float:
         """Hausdorff distance from the reference, in pixels."""
         outline = self.outline(table)
-        there, back = self.tree.query(outline)[0].max(), cKDTree(outline).query(self.reference)[0].max()
-        return max(there, back) / self.pixel
+        there, back = self.tree.query(outline)[0], cKDTree(outline).query(self.reference)[0]
+        return max(there.max(), back.max()) / self.pixel
 
     def outline(self, table: VertexTable) -> np.ndarray:
         """``(n, 2)`` points of the outline in the plane at a distance of one."""
         positions, _ = table.apply(self.surface.cage.positions)
         triangles = table.weld_target[table.triangles]
-        a, b, c = (positions[triangles[:, i]] for i in range(3))
+        a, b, c = positions[triangles].swapaxes(0, 1)
         faces_camera = np.einsum("ij,ij->i", np.cross(b - a, c - a), a - self.eye) < 0
-        edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-        edges.sort(axis=1)
+        edges = np.sort(np.concatenate([triangles[:, [i, i - 1]] for i in range(3)]))
         unique, edge = np.unique(edges, axis=0, return_inverse=True)
         front = np.bincount(edge.ravel(), np.tile(faces_camera, 3), minlength=len(unique))
         count = np.bincount(edge.ravel(), minlength=len(unique))
@@ -171,7 +155,8 @@ class Outlines:
         seen /= np.linalg.norm(seen, axis=1)[:, None]
         beside = np.cross(seen, (end - begin)[which])
         beside /= np.maximum(np.linalg.norm(beside, axis=1), np.finfo(float).tiny)[:, None]
-        scene = mi.load_dict({"type": "scene", "mesh": mesh_of(positions, triangles)})
+        mesh = mitsuba_mesh("outline", triangles, {"vertex_positions": positions})
+        scene = mi.load_dict({"type": "scene", "mesh": mesh})
         is_free = np.full(len(points), False)
         for side in (BESIDE * self.pixel, -BESIDE * self.pixel):
             directions = mi.Vector3f(*(upload(mi.Float, each) for each in (seen + side * beside).T.astype(np.float32)))
@@ -181,16 +166,6 @@ class Outlines:
         axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(right, forward), forward)]
         x, y, depth = (seen[is_free] @ np.array(axes).T).T
         return np.stack([x / depth, y / depth], axis=1)
-
-
-def mesh_of(positions: np.ndarray, triangles: np.ndarray) -> mi.Mesh:
-    """A mesh of Mitsuba's own."""
-    mesh = mi.Mesh("outline", len(positions), len(triangles))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = upload(mi.Float, positions)
-    parameters["faces"] = upload(mi.UInt32, triangles)
-    parameters.update()
-    return mesh
 
 
 if __name__ == "__main__":

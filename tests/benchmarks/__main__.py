@@ -10,28 +10,22 @@ Cold is the first call in a process; stages, mesh, load and picture then find no
 Dr.Jit's cache. Peaks are resident memory, of warm calls.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from cages import MAKERS, cage_files
+from cages import CACHE, MAKERS, cage_files
 from peers import built_peers, time_peer
+from processes import measured
 
-HERE = Path(__file__).parent
-CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 # Above so many triangles a dense file is not written.
 DENSE_TRIANGLES = 20_000_000
 OWN = "this package"
 
 
 def main(arguments=None):
-    """Run the benchmarks that the command line asks for."""
     options = _parsed(arguments)
     commands, absent = ({}, {}) if options.no_peers else built_peers(options.cache)
     for name, reason in absent.items():
@@ -40,8 +34,7 @@ def main(arguments=None):
     for cage in options.cages:
         files = cage_files(cage, options.cache)
         for rate in options.rates:
-            result = _measured(files, rate, options, commands)
-            results.append({"cage": cage, "rate": rate, **result})
+            results.append({"cage": cage, "rate": rate, **_measured(files, rate, options, commands)})
             _show(results[-1], floors)
     if options.json:
         found = {"absent": absent, "memory of a cube": floors, "results": results}
@@ -54,9 +47,8 @@ def _parsed(arguments):
     parser.add_argument("--rates", nargs="+", type=int, default=[8])
     parser.add_argument("--variants", nargs="*", default=["scalar_rgb", "llvm_ad_rgb"])
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument(
-        "--samples", choices=["shared", "grid"], default="shared", help="of the peers: each once, or all"
-    )
+    once = "of the peers: each once, or all"
+    parser.add_argument("--samples", choices=["shared", "grid"], default="shared", help=once)
     parser.add_argument("--quick", action="store_true", help="totals and peers only")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--cache", type=Path, default=CACHE, help=f"folder of cages and peers; {CACHE}")
@@ -65,14 +57,13 @@ def _parsed(arguments):
 
 
 def _measured(files, rate, options, commands):
-    def own(task, variant="", home=None):
-        return _own(task, files, rate, options.repeats, variant, home)
+    def with_empty_cache(task, variant=""):
+        # Dr.Jit keeps compiled kernels at home.
+        with tempfile.TemporaryDirectory() as home:
+            return _own(task, files, rate, options.repeats, variant, HOME=home)
 
     triangles = 2 * rate**2 * (files["bin"].stat().st_size // 28)
-    with tempfile.TemporaryDirectory() as home:
-        # Dr.Jit keeps compiled kernels at home.
-        result = {"empty kernel cache": own("total", home=home)}
-    result["total"] = own("total")
+    result = {"empty kernel cache": with_empty_cache("total"), "total": _own("total", files, rate, options.repeats)}
     result["peers"] = {
         name: time_peer(command, files["bin"], rate, options.repeats, options.samples)
         for name, command in commands.items()
@@ -86,8 +77,7 @@ def _measured(files, rate, options, commands):
             if not variant.startswith("scalar"):
                 tasks.append(("picture", variant))
         for task, variant in tasks:
-            with tempfile.TemporaryDirectory() as home:
-                result[f"{task}, {variant}" if variant else task] = own(task, variant, home)
+            result[f"{task}, {variant}" if variant else task] = with_empty_cache(task, variant)
     return result
 
 
@@ -95,21 +85,14 @@ def _memory_of_cube(options, commands):
     """Peak memory in MB of the package and of each peer for a cube: that of the program itself."""
     files = cage_files("cube", options.cache)
     found = {name: time_peer(command, files["bin"], 1, 1, options.samples) for name, command in commands.items()}
-    return {name: peer["memory"] for name, peer in found.items() if "failed" not in peer} | {
-        OWN: _own("total", files, 1, 2, "", None)["peak"]
-    }
+    memory = {name: peer["memory"] for name, peer in found.items() if "failed" not in peer}
+    return memory | {OWN: _own("total", files, 1, 2)["peak"]}
 
 
-def _own(task, files, rate, repeats, variant, home):
-    environment = dict(os.environ)
-    environment["PYTHONPATH"] = os.pathsep.join([str(HERE.parents[1] / "plugin"), environment.get("PYTHONPATH", "")])
-    if home:
-        environment["HOME"] = home
-    words = [sys.executable, HERE / "measure.py", task, files["obj"], files["bin"], rate, repeats, variant]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=environment, check=False)
-    if done.returncode:
-        raise SystemExit(f"{task} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
+def _own(task, files, rate, repeats, variant="", **variables):
+    program = Path(__file__).with_name("measure.py")
+    words = [sys.executable, program, task, files["obj"], files["bin"], rate, repeats, variant]
+    return measured(task, words, **variables)
 
 
 def _show(result, floors):

@@ -11,25 +11,24 @@ pictures with exact shading ask for: outlines within a tenth of a pixel, where t
 USD is tessellated mesh by mesh, and its rows are sums.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource
-import subprocess
 import sys
 import time
 import warnings
 from pathlib import Path
 
 import numpy as np
+from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
+from processes import ran
 
 OUTLINES = "outlines"
 HEADER = "model, scheme, error         faces   uniform             s    MB   adaptive            s    MB   us/triangle"
 
 
 def main(arguments=None):
-    """Print the table, or measure one row of it."""
     options = _parsed(arguments)
     if options.process:
         print(json.dumps(_measured(*json.loads(options.process))))
@@ -57,30 +56,19 @@ def _error(word):
 
 def _row(model, scheme, error, rate):
     """One line of the table; each side is measured in a process of its own."""
-    found = []
+    name, found = f"{model.name}, {scheme}, {error if error == OUTLINES else format(error, 'g')}", []
     for kind in ("uniform", "adaptive"):
-        words = json.dumps([str(model), scheme, error, rate, kind])
-        done = subprocess.run(
-            [sys.executable, __file__, "--process", words], capture_output=True, text=True, check=False
-        )
+        done = ran([sys.executable, __file__, "--process", json.dumps([str(model), scheme, error, rate, kind])])
         if done.returncode:
-            return f"{model.name}, {scheme}, {_shown(error)}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
+            return f"{name}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
         found.append(json.loads(done.stdout))
     uniform, adaptive = found
-    sides = "".join(f"{each['triangles']:10,} {each['seconds']:12.2f} {each['memory']:5.0f}   " for each in found)
-    name = f"{model.name}, {scheme}, {_shown(error)}"
+    sides = "".join("{triangles:10,} {seconds:12.2f} {memory:5.0f}   ".format(**each) for each in found)
     beyond = adaptive["seconds"] - 2 * uniform["seconds"] if rate == 1 else adaptive["seconds"]
     return f"{name:27} {adaptive['faces']:6,} {sides}{1e6 * max(0, beyond) / adaptive['triangles']:8.2f}"
 
 
-def _shown(error):
-    return error if error == OUTLINES else f"{error:g}"
-
-
 def _criterion(cage, error):
-    """The criterion of an error."""
-    from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
-
     size = np.linalg.norm(np.ptp(cage.positions, axis=0))
     if error != OUTLINES:
         return Criterion(Measure.CHORD, error * size)
@@ -91,10 +79,7 @@ def _criterion(cage, error):
 
 
 def _measured(model, scheme, error, rate, kind):
-    from mitsuba_subdivision import LimitSurface
-
-    faces = triangles = 0
-    seconds, memory = 0.0, 0
+    faces = triangles = seconds = memory = 0
     for cage in _cages(Path(model)):
         surface = LimitSurface(cage, scheme)
         # Classes are found once for all tessellations.
@@ -121,8 +106,6 @@ def _peak():
 
 def _cages(path):
     """Control cages of a file: one of a model, all limit surfaces of a stage, in the space of their points."""
-    from mitsuba_subdivision import ControlCage
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not path.suffix.startswith(".usd"):

@@ -1,27 +1,20 @@
 """The cages that are timed: closed, all quadrilaterals, always the same; made by whole-array operations and cached."""
 
-from __future__ import annotations
-
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
-GOLDEN = (1 + 5**0.5) / 2
-ICOSAHEDRON = np.stack(
-    [
-        (-1, 1, -1, 1, 0, 0, 0, 0, GOLDEN, GOLDEN, -GOLDEN, -GOLDEN),
-        (GOLDEN, GOLDEN, -GOLDEN, -GOLDEN, -1, 1, -1, 1, 0, 0, 0, 0),
-        (0, 0, 0, 0, GOLDEN, GOLDEN, -GOLDEN, -GOLDEN, -1, 1, -1, 1),
-    ],
-    axis=1,
-)
-ICOSAHEDRON_FACES = np.stack(
+CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
+# Four corners of each of three golden rectangles.
+SHORT, LONG = np.array([(-1, 1, -1, 1), np.repeat([1, -1], 2) * (1 + 5**0.5) / 2])
+ICOSAHEDRON = np.block([[SHORT, 0 * LONG, LONG], [LONG, SHORT, 0 * LONG], [0 * LONG, LONG, SHORT]]).T
+ICOSAHEDRON_FACES = np.transpose(
     [
         (0, 0, 0, 0, 0, 1, 5, 11, 10, 7, 3, 3, 3, 3, 3, 4, 2, 6, 8, 9),
         (11, 5, 1, 7, 10, 5, 11, 10, 7, 1, 9, 4, 2, 6, 8, 9, 4, 2, 6, 8),
         (5, 1, 7, 10, 11, 9, 4, 2, 6, 8, 4, 2, 6, 8, 9, 5, 11, 10, 7, 1),
-    ],
-    axis=1,
+    ]
 )
 
 
@@ -72,16 +65,10 @@ def refined(points, quads):
     return np.concatenate([moved, middles, centres]), np.concatenate(children)
 
 
-PLY_HEADER = """ply
-format binary_little_endian 1.0
-element vertex {}
-property float x
-property float y
-property float z
-element face {}
-property list uchar int vertex_indices
-end_header
-"""
+PLY_HEADER = (
+    "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+)
 MAKERS = {
     "cube": cube,
     "star": lambda: split_sphere(2, 3, 8, 10, 0.25),
@@ -103,15 +90,12 @@ def cage_files(name, folder):
         with files["obj"].open("w") as out:
             np.savetxt(out, points, "v %.9g %.9g %.9g")
             np.savetxt(out, quads + 1, "f %d %d %d %d")
-        with files["ply"].open("wb") as out:
-            rows = np.empty(len(quads), [("count", "u1"), ("vertices", "<i4", 4)])
-            rows["count"], rows["vertices"] = 4, quads
-            out.write(PLY_HEADER.format(len(points), len(quads)).encode())
-            out.write(points.astype("<f4").tobytes() + rows.tobytes())
-        with files["bin"].open("wb") as out:
-            np.array([len(points), len(quads)], dtype=np.int32).tofile(out)
-            points.astype(np.float32).tofile(out)
-            quads.astype(np.int32).tofile(out)
+        rows = np.empty(len(quads), [("count", "u1"), ("vertices", "<i4", 4)])
+        rows["count"], rows["vertices"] = 4, quads
+        header = PLY_HEADER.format(len(points), len(quads)).encode()
+        files["ply"].write_bytes(header + points.astype("<f4").tobytes() + rows.tobytes())
+        arrays = np.array([len(points), len(quads)], np.int32), points.astype(np.float32), quads.astype(np.int32)
+        files["bin"].write_bytes(b"".join(array.tobytes() for array in arrays))
     return files
 
 

@@ -6,27 +6,21 @@ Both sides render 128 by 128 pixels with 4 samples, in processes of their own th
 compiled before. The interpreter's own start does not count. Times are medians; of the stages, too.
 """
 
-from __future__ import annotations
-
 import argparse
-import json
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from cages import MAKERS, cage_files
+from cages import CACHE, MAKERS, cage_files
+from processes import ROOT, measured, ran
 
-ROOT = Path(__file__).parents[2]
 PROCESS = Path(__file__).with_name("one_picture.py")
-CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 SHAPES = ("subdivision", "ply")
 
 
 def main(arguments=None):
-    """Time the cages that the command line asks for."""
     options = _parsed(arguments)
     for cage in options.cages:
         path = options.cages_folder / f"{cage}.obj"
@@ -34,10 +28,11 @@ def main(arguments=None):
             path = cage_files(cage, options.cache)["obj"]
         with tempfile.TemporaryDirectory() as folder:
             dense = Path(folder) / "dense.ply"
-            environment = _environment(folder)
-            _run(environment, "scalar_rgb", "subdivision", path, options.rate, write=dense)
+            # Bytecode is kept.
+            variables = {"PYTHONDONTWRITEBYTECODE": None, "PYTHONPYCACHEPREFIX": folder}
+            _run(variables, "scalar_rgb", "subdivision", path, options.rate, dense)
             for variant in options.variants:
-                _show(cage, variant, _measured(environment, variant, {"subdivision": path, "ply": dense}, options))
+                _show(cage, variant, _measured(variables, variant, {"subdivision": path, "ply": dense}, options))
 
 
 def _parsed(arguments):
@@ -51,38 +46,25 @@ def _parsed(arguments):
     return parser.parse_args(arguments)
 
 
-def _environment(folder):
-    """Of all processes: the package beside this file, bytecode that is kept, and an LLVM library for both sides."""
-    environment = dict(os.environ)
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    environment["PYTHONPYCACHEPREFIX"] = folder
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "plugin"), environment.get("PYTHONPATH", "")])
-    find = "from mitsuba_subdivision.llvm import select_llvm; print(select_llvm().path or '')"
-    command = [sys.executable, "-c", find]
-    library = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout.strip()
-    return environment | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
-
-
-def _measured(environment, variant, files, options):
+def _measured(variables, variant, files, options):
     """Seconds of each stage, for each kind of shape: one list for each run."""
+    # The package chooses a library by itself; Mitsuba would take another one.
+    find = "from mitsuba_subdivision.llvm import select_llvm; print(select_llvm().path or '')"
+    library = ran([sys.executable, "-c", find], **variables).stdout.strip()
+    of_kind = {"subdivision": None, "ply": library or os.environ.get("DRJIT_LIBLLVM_PATH")}
     found = {kind: [] for kind in SHAPES}
     for repeat in range(options.repeats + 1):
         # The order changes, so that neither side always finds the other's files in memory. The first runs compile.
         for kind in SHAPES if repeat % 2 else SHAPES[::-1]:
-            seconds = _run(environment, variant, kind, files[kind], options.rate)
+            own = {**variables, "DRJIT_LIBLLVM_PATH": of_kind[kind]}
+            seconds = _run(own, variant, kind, files[kind], options.rate)
             if repeat:
                 found[kind].append(seconds)
     return found
 
 
-def _run(environment, variant, kind, path, rate, write=None):
-    # The package chooses a library by itself; Mitsuba would take another one.
-    own = {k: v for k, v in environment.items() if k != "DRJIT_LIBLLVM_PATH"} if kind == "subdivision" else environment
-    words = [sys.executable, PROCESS, variant, kind, path, rate, *([write] if write else [])]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, env=own, check=False)
-    if done.returncode:
-        raise SystemExit(f"{kind} failed:\n{done.stderr}")
-    return json.loads(done.stdout.splitlines()[-1])
+def _run(variables, variant, kind, *words):
+    return measured(kind, [sys.executable, PROCESS, variant, kind, *words], **variables)
 
 
 def _show(cage, variant, found):

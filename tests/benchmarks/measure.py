@@ -3,17 +3,20 @@
 measure.py total|stages|mesh|load|picture CAGE.obj CAGE.bin RATE REPEATS VARIANT
 """
 
-from __future__ import annotations
-
 import json
 import resource
 import sys
+import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
 
 # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
 import mitsuba_subdivision as msub
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from cages import read_bin
 
@@ -29,48 +32,36 @@ def total(_obj, binary, rate, repeats, _variant):
 
     The first run is cold in this process; the others keep what the package and Dr.Jit keep from shape to shape.
     """
-    import drjit as dr
     from drjit.llvm.ad import Float
     from mitsuba_subdivision.kernels import VertexKernel
 
     positions, quads = read_bin(binary)
-    runs = []
-    for _ in range(max(2, repeats)):
-        clock = Clock()
+
+    def run(clock):
         surface = msub.LimitSurface(msub.ControlCage(positions, quads))
         kernel = VertexKernel(surface.sampling(rate), Float)
         points = Float(surface.cage.positions.ravel())
-        found = kernel(points)
-        dr.eval(found)
-        dr.sync_thread()
+        found = computed(kernel(points))
         clock.lap("total")
-        moved = points + 0.001
-        dr.eval(moved)
-        dr.sync_thread()
+        moved = computed(points + 0.001)
         # Their memory is used again, as the peers do.
         del found
         clock.lap()
-        found = kernel(moved)
-        dr.eval(found)
-        dr.sync_thread()
+        _ = computed(kernel(moved))
         clock.lap("update")
-        runs.append(clock)
-        del found, kernel, surface
-    return summary(runs)
+
+    return summary(run, repeats)
 
 
 def stages(obj, binary, rate, repeats, _variant):
-    """Each step by itself."""
-    import drjit as dr
     from drjit.llvm.ad import Float
     from mitsuba_subdivision.files.obj_reader import read_obj
     from mitsuba_subdivision.kernels import VertexKernel
     from mitsuba_subdivision.mesh.connectivity import Topology
 
-    positions, quads = read_bin(binary)
-    runs = []
-    for _ in range(max(2, repeats)):
-        clock = Clock()
+    (positions, quads), vertex_counts = read_bin(binary), []
+
+    def run(clock):
         read_obj(obj)
         clock.lap("read")
         topology = Topology(len(positions), np.full(len(quads), 4), quads.ravel())
@@ -88,58 +79,44 @@ def stages(obj, binary, rate, repeats, _variant):
         points = Float(cage.positions.ravel())
         dr.eval(points)
         clock.lap("device_arrays")
-        found = kernel(points)
-        dr.eval(found)
-        dr.sync_thread()
+        found = computed(kernel(points))
         clock.lap("evaluation")
-        _ = table.triangles, table.element
+        _ = table.triangles, table.element, found
         clock.lap("triangles")
-        runs.append(clock)
-        del found, kernel
-        vertex_count = table.vertex_count
-        del table, surface, cage
-    result = summary(runs)
+        vertex_counts.append(table.vertex_count)
+
+    result = summary(run, repeats)
     # Points and normals, three floats each, against filling an array of that size.
-    evaluation = 24 * vertex_count / result["warm"]["evaluation"]
-    return result | {"bandwidth": {"evaluation": evaluation, "fill": fill_bandwidth(6 * vertex_count)}}
+    evaluation = 24 * vertex_counts[0] / result["warm"]["evaluation"]
+    return result | {"bandwidth": {"evaluation": evaluation, "fill": fill_bandwidth(6 * vertex_counts[0])}}
 
 
 def fill_bandwidth(count):
     """Bytes per second of a kernel that does nothing but write floats."""
-    import drjit as dr
     from drjit.llvm.ad import Float
 
-    times = []
-    for _ in range(4):
-        clock = Clock()
-        filled = dr.arange(Float, count)
-        dr.eval(filled)
-        dr.sync_thread()
+    def run(clock):
+        _ = computed(dr.arange(Float, count))
         clock.lap("fill")
-        times.append(clock.seconds["fill"])
-        del filled
-    return 4 * count / min(times)
+
+    return 4 * count / summary(run, 4)["warm"]["fill"]
 
 
 def mesh(_obj, binary, rate, repeats, variant):
     """The shape of a cage in memory, and a scene of it with the hierarchy that rays need."""
-    import mitsuba as mi
-
     mi.set_variant(variant)
     shape = {"type": "subdivision", "tessellation_rate": rate}
     shape |= msub.ControlCage(*read_bin(binary)).as_properties(mi)
-    runs = []
-    for _ in range(max(2, repeats)):
-        clock = Clock()
+
+    def run(clock):
         loaded = mi.load_dict(shape)
         finish(loaded)
         clock.lap("mesh")
-        scene = mi.load_dict({"type": "scene", "surface": loaded})
+        _ = mi.load_dict({"type": "scene", "surface": loaded})
         finish(loaded)
         clock.lap("hierarchy")
-        runs.append(clock)
-        del loaded, scene
-    return summary(runs)
+
+    return summary(run, repeats)
 
 
 def load(obj, _binary, rate, repeats, variant):
@@ -147,83 +124,70 @@ def load(obj, _binary, rate, repeats, variant):
 
     What comes first in the process is the cage's text; only its first time is a cold one.
     """
-    import tempfile
-
-    import mitsuba as mi
-
     mi.set_variant(variant)
-    runs = []
+
+    def run(clock):
+        for name, filename in (("OBJ cage", obj), ("PLY cage", str(Path(obj).with_suffix(".ply")))):
+            loaded = mi.load_dict({"type": "subdivision", "filename": filename, "tessellation_rate": rate})
+            finish(loaded)
+            clock.lap(name)
+            if not Path(dense).exists():
+                loaded.write_ply(dense)
+            del loaded
+            clock.lap()
+        finish(mi.load_dict({"type": "ply", "filename": dense}))
+        clock.lap("dense PLY")
+
     with tempfile.TemporaryDirectory() as folder:
         dense = str(Path(folder) / "dense.ply")
-        for _ in range(max(2, repeats)):
-            clock = Clock()
-            for name, filename in (("OBJ cage", obj), ("PLY cage", str(Path(obj).with_suffix(".ply")))):
-                loaded = mi.load_dict({"type": "subdivision", "filename": filename, "tessellation_rate": rate})
-                finish(loaded)
-                clock.lap(name)
-                if not Path(dense).exists():
-                    loaded.write_ply(dense)
-                del loaded
-                clock.lap()
-            finish(mi.load_dict({"type": "ply", "filename": dense}))
-            clock.lap("dense PLY")
-            runs.append(clock)
-    return summary(runs)
+        return summary(run, repeats)
 
 
 def picture(_obj, binary, rate, repeats, variant):
     """From a cage in memory to a picture: by vertex shading at a rate, and by exact shading at one segment per edge."""
-    import mitsuba as mi
-
     mi.set_variant(variant)
-    shape = msub.ControlCage(*read_bin(binary)).as_properties(mi)
+    shape = msub.ControlCage(*read_bin(binary)).as_properties(mi) | {"type": "subdivision"}
     sky = np.random.default_rng(0).uniform(0, 9, (64, 128, 3)).astype(np.float32)
+    camera = {"fov": 35, "to_world": mi.ScalarTransform4f().look_at([0, -4, 1.5], [0, 0, 0], [0, 0, 1])}
+    film = {"type": "hdrfilm", "width": 256, "height": 256, "rfilter": {"type": "box"}}
     rest = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": 3},
         "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)},
-        "sensor": {
-            "type": "perspective",
-            "fov": 35,
-            "to_world": mi.ScalarTransform4f().look_at([0, -4, 1.5], [0, 0, 0], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 256, "height": 256, "rfilter": {"type": "box"}},
-        },
+        "sensor": {"type": "perspective", **camera, "film": film},
     }
-    runs = []
-    for _ in range(max(2, repeats)):
-        clock = Clock()
+
+    def run(clock):
         for shading, own_rate in (("vertex", rate), ("exact", 1)):
-            surface = {"type": "subdivision", **shape, "tessellation_rate": own_rate, "shading": shading}
+            surface = {**shape, "tessellation_rate": own_rate, "shading": shading, "bsdf": {"type": "conductor"}}
             name = f"{shading}, rate {own_rate}"
             clock.lap()
-            scene = mi.load_dict({**rest, "surface": {**surface, "bsdf": {"type": "conductor"}}})
+            scene = mi.load_dict({**rest, "surface": surface})
             finish(scene)
             clock.lap(f"{name}: load, with hierarchy")
             for lap in ("first picture", "next picture"):
                 np.array(mi.render(scene, spp=16))
                 clock.lap(f"{name}: {lap}")
             del scene
-        runs.append(clock)
-    return summary(runs)
+
+    return summary(run, repeats)
+
+
+def computed(arrays):
+    """Arrays of Dr.Jit that are in memory."""
+    dr.eval(arrays)
+    dr.sync_thread()
+    return arrays
 
 
 def finish(shape):
     """Wait for all that the shape has started."""
-    import drjit as dr
-
     shape.bbox()
     dr.sync_thread()
 
 
 class Clock:
-    """Seconds, and peak resident memory in MB, of laps.
-
-    Attributes
-    ----------
-    seconds, memory : dict of str to float
-    peak : float
-        Of all laps.
-    """
+    """Seconds, and peak resident memory in MB, of laps by their names, and the peak of all laps."""
 
     def __init__(self):
         self.seconds, self.memory, self.peak = {}, {}, 0.0
@@ -242,14 +206,18 @@ class Clock:
         self._last = time.perf_counter()
 
 
-def summary(runs):
+def summary(run, repeats):
     """Of the first run, and the best of the others; of these, each lap's peak memory, and the highest of all."""
-    cold, *warm = runs
+    clocks = []
+    for _ in range(max(2, repeats)):
+        clocks.append(Clock())
+        run(clocks[-1])
+    cold, *warm = clocks
     return {
         "cold": cold.seconds,
-        "warm": {name: min(run.seconds[name] for run in warm) for name in cold.seconds},
-        "memory": {name: max(run.memory[name] for run in warm) for name in cold.memory},
-        "peak": max(run.peak for run in runs),
+        "warm": {name: min(clock.seconds[name] for clock in warm) for name in cold.seconds},
+        "memory": {name: max(clock.memory[name] for clock in warm) for name in cold.memory},
+        "peak": max(clock.peak for clock in clocks),
     }
 
 

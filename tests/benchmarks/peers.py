@@ -1,7 +1,5 @@
 """The same work by OpenSubdiv and Embree, where their development files are installed."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -18,28 +16,16 @@ PROGRAMS = {
 
 
 def built_peers(folder):
-    """Build what can be built.
-
-    Returns
-    -------
-    commands : dict of list of str
-        By name of the peer.
-    absent : dict of str
-        Why a peer is missing.
-    """
+    """By name of a peer, the command of what can be built, and why others are missing."""
     commands, absent = {}, {}
     for name, (source, libraries, first) in PROGRAMS.items():
         program = Path(folder) / source
         sources = [HERE / f"{source}.cpp", HERE / "peer_timing.h"]
         if not program.exists() or program.stat().st_mtime < max(path.stat().st_mtime for path in sources):
             program.parent.mkdir(parents=True, exist_ok=True)
+            command = ["c++", *FLAGS, str(sources[0]), "-o", str(program), *libraries, "-lpthread"]
             try:
-                subprocess.run(
-                    ["c++", *FLAGS, str(sources[0]), "-o", str(program), *libraries, "-lpthread"],
-                    check=True,
-                    capture_output=True,
-                    text=True,
-                )
+                subprocess.run(command, check=True, capture_output=True, text=True)
             except FileNotFoundError:
                 absent[name] = "there is no C++ compiler"
                 continue

@@ -6,8 +6,6 @@ Both are times of the processor, for one sample and one vertex; the tessellation
 again to control points. Only the ratios within one run mean anything.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path
@@ -19,7 +17,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def main(arguments=None):
-    """Time the cages that the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("cages", nargs="*", type=Path, default=[ROOT / "scenes/cages/human.obj"])
     parser.add_argument("--samples", type=int, default=20000)

@@ -14,21 +14,25 @@ kernels, in the second those of the first. Times are wall seconds, and seconds o
 other programs run beside; "next" is the best of some repeats. Only the ratios within one run mean anything.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-from mitsuba_subdivision.device_arrays import upload
+# Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
+import mitsuba_subdivision as msub
 
-ROOT = Path(__file__).parents[2]
+# isort: split
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from measure import peak_memory
+from mitsuba_subdivision.device_arrays import upload
+from processes import ROOT, ran
+
 VARIANT = "llvm_ad_rgb"
 SHADINGS = ("vertex", "exact")
 # Segments on each edge with which the surface looks alike.
@@ -42,10 +46,11 @@ STEPS = ("load", "first", "next")
 
 
 def main(arguments=None):
-    """Run the tables that the command line asks for."""
     options = _parsed(arguments)
     if options.process:
-        print(json.dumps(_in_this_process(*json.loads(options.process))))
+        task, shading, words, repeats = json.loads(options.process)
+        mi.set_variant(VARIANT)
+        print(json.dumps(TASKS[task][0](shading, repeats, *words)))
         return
     for task in options.tasks:
         found = []
@@ -78,28 +83,17 @@ def _counts(text):
 
 def _measured(task, words, repeats):
     """By shading, what a process with an empty cache of kernels has measured, and one after it; or why not."""
-    found = {}
+    found, failed = {}, {}
     for shading in SHADINGS:
         with tempfile.TemporaryDirectory() as home:
             # Dr.Jit keeps compiled kernels at home.
-            environment = {**os.environ, "HOME": home}
-            environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "plugin"), environment.get("PYTHONPATH", "")])
             command = [sys.executable, __file__, "--process", json.dumps([task, shading, words, repeats])]
-            found[shading] = [
-                subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-                for _ in ("cold", "warm")
-            ]
-    failed: dict[str, str] = {
-        shading: (run.stderr.strip().splitlines() or [f"status {run.returncode}"])[-1]
-        for shading, runs in found.items()
-        for run in runs
-        if run.returncode
-    }
-    return (
-        {**dict.fromkeys(SHADINGS, "not shown, as the other failed"), **failed}
-        if failed
-        else {shading: [json.loads(run.stdout.splitlines()[-1]) for run in runs] for shading, runs in found.items()}
-    )
+            runs = [ran(command, HOME=home) for _ in ("cold", "warm")]
+        for run in (run for run in runs if run.returncode):
+            failed[shading] = (run.stderr.strip().splitlines() or [f"status {run.returncode}"])[-1]
+        if not failed:
+            found[shading] = [json.loads(run.stdout.splitlines()[-1]) for run in runs]
+    return dict.fromkeys(SHADINGS, "not shown, as the other failed") | failed if failed else found
 
 
 def _show(title, found):
@@ -122,64 +116,40 @@ def _show(title, found):
 
 def _show_further(few, many):
     """What each of the further shapes costs, with compiled kernels."""
+    if any(isinstance(each, str) for found in (few, many) for each in found.values()):
+        return
     for shading in SHADINGS:
-        less, more = few[shading], many[shading]
-        if isinstance(less, str) or isinstance(more, str):
-            continue
-        times = [
-            f"{step} {(more[1]['seconds'][step][0] - less[1]['seconds'][step][0]) / (MANY - FEW) * 1e3:.1f} ms"
-            for step in STEPS
-        ]
-        memory = (more[1]["memory"] - less[1]["memory"]) / (MANY - FEW)
-        print(f"  each further shape, {shading}: {', '.join(times)}, {memory:.1f} MB")
-
-
-def _in_this_process(task, shading, words, repeats):
-    """Seconds of each step, wall and of all processors, and resident memory in MB."""
-    # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
-    import mitsuba_subdivision  # noqa: F401, I001
-    import mitsuba as mi
-
-    mi.set_variant(VARIANT)
-    return TASKS[task][0](shading, repeats, *words)
+        (_, less), (_, more) = few[shading], many[shading]
+        times = ((more["seconds"][step][0] - less["seconds"][step][0]) / (MANY - FEW) * 1e3 for step in STEPS)
+        steps = ", ".join(f"{step} {milliseconds:.1f} ms" for step, milliseconds in zip(STEPS, times, strict=True))
+        memory = (more["memory"] - less["memory"]) / (MANY - FEW)
+        print(f"  each further shape, {shading}: {steps}, {memory:.1f} MB")
 
 
 def hits(shading, repeats, cage):
-    """One shape, as rough metal."""
     shape = _shape(cage, shading, RATES[shading], bsdf={"type": "roughconductor", "alpha": 0.2})
-    scene = _scene({"shape": shape}, 256, 64, {"type": "path", "max_depth": 4})
-    return _pictures(scene, repeats)
+    return _pictures(_scene({"shape": shape}, 256, 64), repeats)
 
 
 def shapes(shading, repeats, count):
-    """Shapes of six cages."""
     return _pictures(_scene(_spread(shading, SIX_CAGES, count), 64, 4), repeats)
 
 
-def instances(shading, repeats, shape_count=7, instance_count=64, group_count=1, samples=4):
+def instances(shading, repeats, shape_count=7, instance_count=64, group_count=1, *, samples=4):
     """Shapes and instances of one cage, the latter of several groups in turn."""
-    placed = _spread(shading, ["star"], shape_count + instance_count)
-    entries = dict(list(placed.items())[:shape_count])
+    placed = list(_spread(shading, ["star"], shape_count + instance_count).items())
+    entries = dict(placed[:shape_count])
     for number in range(group_count):
-        shape = _shape("star", shading, 2)
         # Mitsuba would make one of equal groups.
-        entries[f"group_{number}"] = {"type": "shapegroup", f"shape_of_{number}": shape}
-    for number, (name, shape) in enumerate(list(placed.items())[shape_count:]):
+        entries[f"group_{number}"] = {"type": "shapegroup", f"shape_of_{number}": _shape("star", shading, 2)}
+    for number, (name, shape) in enumerate(placed[shape_count:]):
         group = {"type": "ref", "id": f"group_{number % group_count}"}
         entries[f"of_{name}"] = {"type": "instance", "group": group, "to_world": shape["to_world"]}
     return _pictures(_scene(entries, 64, samples), repeats)
 
 
-def growth(shading, repeats, shape_count, instance_count, group_count):
-    """Likewise, with one sample."""
-    return instances(shading, repeats, shape_count, instance_count, group_count, 1)
-
-
 def copies(shading, repeats, count):
     """A stage of so many copies in a square, turned at random."""
-    import mitsuba as mi
-    import mitsuba_subdivision as msub
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "copies.usdc"
         _write_copies(path, msub.ControlCage.from_file(ROOT / "scenes/cages/rook.obj"), count)
@@ -213,11 +183,7 @@ def _write_copies(path, cage, count):
 
 def gradients(shading, repeats, cage):
     """A step of a fit: render, differentiate by control points, update."""
-    import drjit as dr
-    import mitsuba as mi
-
-    laps = _Laps()
-    shape = _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
+    laps, shape = _Laps(), _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
     scene = mi.load_dict(_scene({"shape": shape}, 128, 16, {"type": "prb", "max_depth": 3}))
     parameters = mi.traverse(scene)
     (key,) = (key for key in parameters.keys() if key.endswith("control_points"))  # noqa: SIM118
@@ -229,8 +195,7 @@ def gradients(shading, repeats, cage):
         dr.enable_grad(moved)
         parameters[key] = moved
         parameters.update()
-        loss = dr.mean(mi.render(scene, parameters, seed=step, spp=16) ** 2, axis=None)
-        dr.backward(loss)
+        dr.backward(dr.mean(mi.render(scene, parameters, seed=step, spp=16) ** 2, axis=None))
         dr.eval(dr.grad(moved))
         dr.sync_thread()
         laps.end("first" if step == 0 else "next")
@@ -241,7 +206,7 @@ TASKS = {
     "hits": (hits, lambda options: [[cage] for cage in options.cages]),
     "shapes": (shapes, lambda _: [[FEW], [MANY]]),
     "instances": (instances, lambda _: [[]]),
-    "growth": (growth, lambda options: options.growth),
+    "growth": (partial(instances, samples=1), lambda options: options.growth),
     "copies": (copies, lambda options: [[count] for count in options.copies]),
     "gradients": (gradients, lambda options: [[cage] for cage in options.cages]),
 }
@@ -249,9 +214,6 @@ TASKS = {
 
 def _pictures(scene, repeats, laps=None):
     """A scene, loaded, and pictures of it."""
-    import drjit as dr
-    import mitsuba as mi
-
     laps = laps or _Laps()
     loaded = mi.load_dict(scene)
     dr.sync_thread()
@@ -266,39 +228,28 @@ class _Laps:
     """The best of the laps of each name."""
 
     def __init__(self):
-        self._seconds = {}
-        self._start()
-
-    def _start(self):
-        self._last = time.perf_counter(), time.process_time()
+        self._seconds, self._last = {}, (time.perf_counter(), time.process_time())
 
     def end(self, name):
         lap = time.perf_counter() - self._last[0], time.process_time() - self._last[1]
         self._seconds[name] = tuple(map(min, self._seconds.get(name, lap), lap))
-        self._start()
+        self._last = time.perf_counter(), time.process_time()
 
     def found(self):
-        from measure import peak_memory
-
         return {"seconds": self._seconds, "memory": peak_memory()}
 
 
 def _scene(shapes, size, spp, integrator=None):
     """Shapes around the origin, in a box of half a side 1.5, seen from the front."""
-    import mitsuba as mi
-
+    camera = {"fov": 30, "to_world": mi.ScalarTransform4f().look_at([2, -6, 3], [0, 0, 0], [0, 0, 1])}
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    sampler = {"type": "independent", "sample_count": spp}
     return {
         "type": "scene",
         "integrator": integrator or {"type": "path", "max_depth": 4},
         "sky": {"type": "constant", "radiance": 0.5},
         "lamp": {"type": "point", "position": [3.0, -5.0, 4.0], "intensity": 30.0},
-        "sensor": {
-            "type": "perspective",
-            "fov": 30,
-            "to_world": mi.ScalarTransform4f().look_at([2, -6, 3], [0, 0, 0], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
-            "sampler": {"type": "independent", "sample_count": spp},
-        },
+        "sensor": {"type": "perspective", **camera, "film": film, "sampler": sampler},
         **shapes,
     }
 
@@ -315,8 +266,6 @@ def _spread(shading, cages, count):
 
 def _shape(cage, shading, rate, *, scale=1.0, place=(0, 0, 0), bsdf=None):
     """The shape of a cage of ``scenes/cages`` within the unit ball, scaled and placed."""
-    import mitsuba as mi
-
     path = ROOT / "scenes/cages" / f"{cage}.obj"
     # Not by the package: what it keeps of a cage would not be measured.
     lines = (line.split() for line in path.read_text().splitlines())

@@ -2,56 +2,51 @@
 
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from benchmarks.peers import time_peer
+from benchmarks.processes import ran
 from benchmarks.whole_stage import without_materials
 from mitsuba_subdivision.llvm import llvm_problem
 
 HERE = Path(__file__).parent
 # They measure with the module resource.
 pytestmark = pytest.mark.posix
+needs_llvm = pytest.mark.skipif(llvm_problem() is not None, reason=str(llvm_problem()))
 
 
-def test_benchmarks_of_the_smallest_cage_run(tmp_path):
-    if problem := llvm_problem():
-        pytest.skip(problem)
-    written = tmp_path / "found.json"
-    words = [sys.executable, HERE, "--cages", "cube", "--rates", "4", "--repeats", "1", "--no-peers", "--variants"]
-    words += ["scalar_rgb", "--cache", tmp_path, "--json", written]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+def said(*words):
+    """What a program of this folder prints."""
+    done = ran([sys.executable, *words])
     assert done.returncode == 0, done.stderr
-    assert "cube, rate 4" in done.stdout
+    return done.stdout
+
+
+@needs_llvm
+def test_benchmarks_of_the_smallest_cage_run(tmp_path):
+    written = tmp_path / "found.json"
+    words = [HERE, "--cages", "cube", "--rates", "4", "--repeats", "1", "--no-peers", "--variants", "scalar_rgb"]
+    assert "cube, rate 4" in said(*words, "--cache", tmp_path, "--json", written)
     (result,) = json.loads(written.read_text())["results"]
     assert result["total"]["warm"]["total"] > 0
     assert set(result["stages"]["warm"]) == set(result["stages"]["cold"])
 
 
-def test_the_first_picture_is_measured():
-    words = [sys.executable, HERE / "first_picture.py", "--repeats", "1", "--variants", "scalar_rgb", "--rate", "2"]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "star, scalar_rgb" in done.stdout
-
-
-def test_samples_are_measured():
-    words = [sys.executable, HERE / "samples.py", "--samples", "100", "--rate", "2", "--repeats", "2"]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "times a vertex of the tessellation" in done.stdout
-
-
-def test_scenes_are_measured_in_both_shadings():
-    if problem := llvm_problem():
-        pytest.skip(problem)
-    words = [sys.executable, HERE / "scenes.py", "growth", "--growth", "1,2,2", "--repeats", "1"]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "failed" not in done.stdout
-    assert "compiled: next" in done.stdout
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("first_picture.py --repeats 1 --variants scalar_rgb --rate 2", "star, scalar_rgb"),
+        ("samples.py --samples 100 --rate 2 --repeats 2", "times a vertex of the tessellation"),
+        pytest.param("scenes.py growth --growth 1,2,2 --repeats 1", "compiled: next", marks=needs_llvm),
+    ],
+)
+def test_other_benchmarks_run(words, expected):
+    program, *options = words.split()
+    found = said(HERE / program, *options)
+    assert expected in found
+    assert "failed" not in found
 
 
 STAGE = """#usda 1.0
@@ -73,30 +68,25 @@ def test_a_stage_without_materials_has_all_else(tmp_path):
     found = usd.Stage.Open(str(without_materials(path, tmp_path / "grey.usda")))
     assert [each.GetName() for each in given.Traverse()] == ["red", "quads"]
     assert [each.GetName() for each in found.Traverse()] == ["quads"]
-    bindings = [
-        each.GetPrimAtPath("/quads").GetRelationship("material:binding").GetTargets() for each in (given, found)
-    ]
-    assert [len(each) for each in bindings] == [1, 0]
+    quads = [each.GetPrimAtPath("/quads") for each in (given, found)]
+    assert [len(each.GetRelationship("material:binding").GetTargets()) for each in quads] == [1, 0]
     assert found.GetMetadata("upAxis") == given.GetMetadata("upAxis") == "Z"
-    points = [each.GetPrimAtPath("/quads").GetAttribute("points").Get() for each in (given, found)]
-    assert points[0] == points[1]
+    points, expected = (each.GetAttribute("points").Get() for each in quads)
+    assert points == expected
 
 
+@needs_llvm
 def test_a_whole_stage_is_measured_without_cycles(tmp_path):
-    if problem := llvm_problem():
-        pytest.skip(problem)
     pytest.importorskip("pxr")
     stage = tmp_path / "quads.usda"
-    words = [sys.executable, HERE / "whole_stage.py", stage, "--size", "16", "12", "--spp", "1", "--repeats", "1"]
-    command = [str(word) for word in words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    words = [HERE / "whole_stage.py", stage, "--size", "16", "12", "--spp", "1", "--repeats", "1"]
+    done = ran([sys.executable, *words])
     assert done.returncode == 1
     assert "there is no such file; expected a USD stage" in done.stderr
     stage.write_text(STAGE)
-    done = subprocess.run([*command, "--cycles", sys.executable], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Cycles: left out" in done.stdout
-    (ratios,) = re.findall("exact / vertex: (.*)", done.stdout)
+    found = said(*words, "--cycles", sys.executable)
+    assert "Cycles: left out" in found
+    (ratios,) = re.findall("exact / vertex: (.*)", found)
     stages = [re.sub(r" [0-9.]+ \(CPU [0-9.]+\)$", "", each) for each in ratios.split(", ")]
     assert stages == ["program to picture", "file to picture", "next picture"]
 

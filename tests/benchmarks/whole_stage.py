@@ -12,8 +12,6 @@ they import at first is a stage of its own; what reads USD is imported then by B
 kernels are in Dr.Jit's cache. Times are the best of the repeats.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -26,14 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).parents[2]
 CYCLES = Path(__file__).with_name("cycles_stage.py")
 SHADINGS = ("vertex", "exact")
 STAGES = ("imports", "read", "load", "first picture", "program to picture", "file to picture", "next picture")
 
 
 def main(arguments=None):
-    """Time a stage."""
     options = _parsed(arguments)
     if not options.stage.is_file():
         raise SystemExit(f'"{options.stage}": there is no such file; expected a USD stage, such as chess_set.usda')
@@ -93,9 +89,9 @@ def _measured(sides, options):
     """By side, the best wall and processor seconds of each stage, and the peak of memory in MB."""
     found = {name: [] for name in sides}
     with tempfile.TemporaryDirectory() as folder:
-        stage = (
-            without_materials(options.stage.resolve(), Path(folder) / "grey.usda") if options.grey else options.stage
-        )
+        stage = options.stage
+        if options.grey:
+            stage = without_materials(stage.resolve(), Path(folder) / "grey.usda")
         common = [stage, "--size", *options.size, "--spp", options.spp]
         # Modules that are imported later are compiled once, as in an installation.
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -104,31 +100,22 @@ def _measured(sides, options):
         # The first round compiles kernels and modules, and reads files into memory.
         for number in range(options.repeats + 1):
             for name, command in sides.items():
-                words = [*command, *common] if name != "cycles" else [*command, stage, camera]
-                run = _run(name, words)
+                run = _run(name, [*command, *common] if name != "cycles" else [*command, stage, camera])
                 if number:
                     found[name].append(run)
                 if name in SHADINGS:
                     camera.write_text(json.dumps(run["camera"] | {"spp": options.spp}))
-    return {
-        name: {
-            "seconds": {
-                stage: [min(run["seconds"][stage][kind] for run in runs) for kind in (0, 1)] for stage in STAGES
-            },
-            "memory": max(run["memory"] for run in runs),
-        }
-        for name, runs in found.items()
-    }
+    best = {}
+    for name, runs in found.items():
+        seconds = {stage: np.min([run["seconds"][stage] for run in runs], axis=0).tolist() for stage in STAGES}
+        best[name] = {"seconds": seconds, "memory": max(run["memory"] for run in runs)}
+    return best
 
 
 def _run(name, words):
-    environment = {**os.environ, "BEGUN": repr(time.monotonic())}
-    if name in SHADINGS:
-        environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "plugin"), environment.get("PYTHONPATH", "")])
-    else:
-        environment.pop("PYTHONPATH", None)
-    command = [str(word) for word in words]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    from processes import ran
+
+    done = ran(words, BEGUN=repr(time.monotonic()), **({} if name in SHADINGS else {"PYTHONPATH": None}))
     lines = [line for line in done.stdout.splitlines() if line.startswith('{"seconds"')]
     if done.returncode or not lines:
         raise SystemExit(f"{name} failed:\n{done.stderr or done.stdout}")
@@ -136,21 +123,16 @@ def _run(name, words):
 
 
 def _show(found):
-    print(f"{'':<20}" + "".join(f"{name:>22}" for name in found))
-    print(f"{'':<20}" + f"{'wall s':>14}{'CPU s':>8}" * len(found))
+    print(" " * 20 + "".join(f"{name:>22}" for name in found))
+    print(" " * 20 + f"{'wall s':>14}{'CPU s':>8}" * len(found))
     for stage in STAGES:
         columns = (each["seconds"][stage] for each in found.values())
         print(f"{stage:<20}" + "".join(f"{wall:14.2f}{processor:8.2f}" for wall, processor in columns))
     print(f"{'peak memory, MB':<20}" + "".join(f"{each['memory']:22.0f}" for each in found.values()))
-    exact = found["exact"]["seconds"]
-    for name in found:
-        if name != "exact":
-            ratios = [
-                f"{stage} {exact[stage][0] / found[name]['seconds'][stage][0]:.2f} (CPU "
-                f"{exact[stage][1] / found[name]['seconds'][stage][1]:.2f})"
-                for stage in STAGES[-3:]
-            ]
-            print(f"exact / {name}: {', '.join(ratios)}")
+    for name in (name for name in found if name != "exact"):
+        exact, other = (np.array([found[each]["seconds"][stage] for stage in STAGES[-3:]]) for each in ("exact", name))
+        ratios = zip(STAGES[-3:], *(exact / other).T, strict=True)
+        print(f"exact / {name}: " + ", ".join(f"{stage} {wall:.2f} (CPU {cpu:.2f})" for stage, wall, cpu in ratios))
 
 
 def _own(options):
@@ -188,24 +170,20 @@ def _own(options):
 
     sensor, stage = loaded.sensors()[0], Usd.Stage.Open(str(options.stage))
     seen = mi.traverse(sensor)
-    domes = [
-        UsdLux.DomeLight(prim).GetTextureFileAttr().Get() for prim in stage.Traverse() if prim.IsA(UsdLux.DomeLight)
-    ]
-    return {
-        "seconds": seconds,
-        "memory": memory,
-        "camera": {
-            "to_world": np.array(sensor.world_transform().matrix).reshape(4, 4).tolist(),
-            "fov": float(np.array(seen["x_fov"]).ravel()[0]),
-            # Radius and distance in focus, with depth of field.
-            "lens": [float(seen[name][0]) for name in ("aperture_radius", "focus_distance") if name in seen],
-            "dome": next((dome.resolvedPath for dome in domes if dome and dome.resolvedPath), None),
-            "size": list(options.size),
-            "is_open": loaded.environment() is not None,
-            "max_depth": max_depth,
-            "up": str(UsdGeom.GetStageUpAxis(stage)).lower(),
-        },
+    domes = (UsdLux.DomeLight(prim) for prim in stage.Traverse() if prim.IsA(UsdLux.DomeLight))
+    domes = [dome.GetTextureFileAttr().Get() for dome in domes]
+    camera = {
+        "to_world": np.array(sensor.world_transform().matrix).reshape(4, 4).tolist(),
+        "fov": float(np.array(seen["x_fov"]).ravel()[0]),
+        # Radius and distance in focus, with depth of field.
+        "lens": [float(seen[name][0]) for name in ("aperture_radius", "focus_distance") if name in seen],
+        "dome": next((dome.resolvedPath for dome in domes if dome and dome.resolvedPath), None),
+        "size": list(options.size),
+        "is_open": loaded.environment() is not None,
+        "max_depth": max_depth,
+        "up": str(UsdGeom.GetStageUpAxis(stage)).lower(),
     }
+    return {"seconds": seconds, "memory": memory, "camera": camera}
 
 
 if __name__ == "__main__":

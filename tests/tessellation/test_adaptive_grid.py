@@ -14,60 +14,64 @@ from mitsuba_subdivision.tessellation import Criterion, Measure
 from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from mitsuba_subdivision.tessellation.tile_choice import feature_edges
 from patches.closed_cages import bumpy
-from tessellation.test_attribute_table import CAGES as WITH_SEAMS
-from tessellation.test_attribute_table import with_seams
+from tessellation.distances import distances_of_pairs
+from tessellation.test_attribute_table import EVERY_CAGE, with_seams
 
 # Parameters are sums of fractions of a power of two; points of some tens of products.
 ROUNDING = 1e-12
 
-# Some tiles with one segment only, and many sizes of tiles side by side.
-ERRORS = (3e-2, 1e-3)
-EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
-EVERY_ERROR = pytest.mark.parametrize("error", ERRORS)
+
+def size_of(surface):
+    return np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
 
 
 def table_of(surface, error=1e-3, max_rate=16, measure=Measure.CHORD, **options):
-    size = np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
     # Grids are tested at any rates, also at those that are too low.
     with without_warnings():
-        return surface.adaptive_sampling(Criterion(measure, error * size, **options), max_rate)
+        return surface.adaptive_sampling(Criterion(measure, error * size_of(surface), **options), max_rate)
 
 
 def directed_edges(triangles):
-    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
+    return np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]).astype(np.int64)
 
 
-def numbered(edges, count):
-    return edges[:, 0] * count + edges[:, 1]
+def numbered_edges(triangles):
+    """Directed edges, a number for each, and the number of the same edge in the other direction."""
+    edges = directed_edges(triangles)
+    return edges, edges @ [1 << 32, 1], edges @ [1, 1 << 32]
 
 
-@EVERY_SURFACE
-@EVERY_ERROR
+def distances_to(corners, points):
+    """Distances of points from the nearest of triangles ``(t, 3, 3)``, which may have no area."""
+    pairs = ((np.broadcast_to(point, (len(corners), 3)), corners) for point in points)
+    return np.array([distances_of_pairs(*pair).min() for pair in pairs])
+
+
+# Some tiles with one segment only, and many sizes of tiles side by side.
+@pytest.mark.parametrize("error", [3e-2, 1e-3])
+@pytest.mark.parametrize("name", SURFACES)
 def test_triangles_have_no_cracks_and_no_folds_and_vertices_where_they_say(name, error):
     surface = surface_named(name)
-    table = table_of(surface, error)
-    assert_each_edge_inside_has_its_twin(surface, table)
-    assert_nothing_is_open_but_the_boundary_of_the_cage(surface, table)
-    assert_elements_are_covered(surface, table)
-    if error == min(ERRORS):
-        assert_vertices_lie_where_triangles_say(surface, table)
-
-
-def assert_each_edge_inside_has_its_twin(surface, table):
-    """No edge occurs twice in a direction, and those without a twin lie on edges of the elements without neighbours."""
-    edges = directed_edges(table.triangles)
-    keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
+    table, t = table_of(surface, error), surface.patches.elements
+    # No edge occurs twice in a direction, and those without a twin lie on edges of the elements without neighbours.
+    edges, keys, twins = numbered_edges(table.triangles)
     assert len(np.unique(keys)) == len(keys)
     corner, uv = table.locations()
     lonely = np.unique(edges[~np.isin(twins, keys)])
-    t, domain = surface.patches.elements, surface.scheme.domain
-    whole = surface.patches.is_whole[t.face[corner[lonely]]]
-    on_side = domain.inside(uv[lonely]) <= ROUNDING
-    assert on_side.all()
+    assert (surface.scheme.domain.inside(uv[lonely]) <= ROUNDING).all()
     if (t.twin >= 0).all():
         assert not len(lonely)
     # Seen from their corner, patches that are not whole have the element's edges along u = 0 and v = 0 only.
-    assert (uv[lonely[~whole]].min(axis=1, initial=0) <= ROUNDING).all()
+    is_whole = surface.patches.is_whole[t.face[corner[lonely]]]
+    assert (uv[lonely[~is_whole]].min(axis=1, initial=0) <= ROUNDING).all()
+    # With copies along creases joined, nothing is open on a closed cage.
+    _, keys, twins = numbered_edges(table.weld_target[table.triangles])
+    is_closed = (surface.cage.topology.twin >= 0).all() and not surface.cage.is_hole.any()
+    if surface.scheme.element == "face" and is_closed:
+        assert np.isin(twins, keys).all()
+    assert_elements_are_covered(surface, table)
+    if error == 1e-3:
+        assert_vertices_lie_where_triangles_say(surface, table)
 
 
 def assert_elements_are_covered(surface, table):
@@ -86,29 +90,18 @@ def assert_elements_are_covered(surface, table):
 
 def assert_vertices_lie_where_triangles_say(surface, table):
     positions, normals = table.apply(surface.cage.positions)
-    size = np.abs(positions).max()
+    rounding = ROUNDING * np.abs(positions).max()
     corner, uv = table.grid.triangle_locations
     for i in range(3):
         seen = surface._evaluate_from(corner.astype(np.int64), uv[:, i], "stabilized", np.float64)
-        np.testing.assert_allclose(positions[table.triangles[:, i]], seen.p, rtol=0, atol=ROUNDING * size)
+        np.testing.assert_allclose(positions[table.triangles[:, i]], seen.p, rtol=0, atol=rounding)
     found = surface._evaluate_from(*table.locations(), "stabilized", np.float64)
     np.testing.assert_allclose(normals, found.n, rtol=0, atol=ROUNDING / 1e-3)
     np.testing.assert_array_equal(positions, positions[table.weld_target])
     assert np.array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
 
 
-def assert_nothing_is_open_but_the_boundary_of_the_cage(surface, table):
-    """With copies along creases joined, nothing is open on a closed cage."""
-    edges = table.weld_target[directed_edges(table.triangles)]
-    keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
-    open_edges = edges[~np.isin(twins, keys)]
-    t = surface.cage.topology
-    is_closed = bool((t.twin >= 0).all()) and not surface.cage.is_hole.any()
-    if surface.scheme.element == "face" and is_closed:
-        assert not len(open_edges)
-
-
-@pytest.mark.parametrize(("scheme", "cage"), WITH_SEAMS.values(), ids=WITH_SEAMS.keys())
+@EVERY_CAGE
 def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
     surface = LimitSurface(with_seams(bumpy(cage), np_rng), scheme)
     table = table_of(surface)
@@ -124,12 +117,10 @@ def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
 
 
 def test_the_same_cage_has_the_same_triangles():
-    surfaces = [LimitSurface(bumpy(torus(5, 4))) for _ in range(2)]
-    first, second = (table_of(surface) for surface in surfaces)
+    cage = bumpy(torus(5, 4))
+    first, second = (table_of(LimitSurface(bumpy(torus(5, 4)))) for _ in range(2))
     np.testing.assert_array_equal(first.triangles, second.triangles)
-    np.testing.assert_array_equal(
-        first.apply(surfaces[0].cage.positions)[0], second.apply(surfaces[1].cage.positions)[0]
-    )
+    np.testing.assert_array_equal(*(each.apply(cage.positions)[0] for each in (first, second)))
 
 
 def with_a_diagonal_twice():
@@ -144,55 +135,46 @@ def with_a_diagonal_twice():
     return ControlCage(np.array(points, dtype=float), faces)
 
 
-def two_triangles():
-    """Back to back; they meet along both edges of each corner."""
-    return ControlCage([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2], [2, 1, 0]])
+# Back to back; they meet along both edges of each corner.
+TWO_TRIANGLES = ControlCage([[0, 0, 0], [1, 0, 0], [0.5, 0, 1]], [[0, 1, 2], [1, 0, 2]])
+# Two opposite vertices of the first face are the ends of an edge on the border.
+WITH_A_DIAGONAL_ON_THE_BORDER = ControlCage(
+    [(0, 0, 1), (1, 0, 0), (0, 0, -1), (0, 1, 0), (-1, 0.3, -1), (-1, 1, 0), (-1, 0.3, 1)],
+    [[1, 2, 3, 0], [3, 2, 4, 5], [0, 3, 5, 6], [4, 2, 0, 6], [5, 4, 6]],
+)
 
 
-def with_a_diagonal_on_the_border():
-    """A face of which two opposite vertices are the ends of an edge on the border."""
-    points = [(0, 0, 1), (1, 0, 0), (0, 0, -1), (0, 1, 0), (-1, 0.3, -1), (-1, 1, 0), (-1, 0.3, 1)]
-    return ControlCage(points, [[1, 2, 3, 0], [3, 2, 4, 5], [0, 3, 5, 6], [4, 2, 0, 6], [5, 4, 6]])
-
-
-def test_an_edge_on_the_border_meets_a_diagonal():
-    cage = with_a_diagonal_on_the_border()
-    surface = LimitSurface(cage)
-    table = table_of(surface, 100, 1)
-    edges = directed_edges(table.triangles)
-    keys, twins = (numbered(each, table.vertex_count) for each in (edges, edges[:, ::-1]))
-    assert len(np.unique(keys)) == len(keys)
-    # All edges have two triangles, but for the three that the border has at least.
-    assert len(np.setdiff1d(keys, twins)) >= 3
-    assert_elements_are_covered(surface, table)
-
-
-@pytest.mark.parametrize(("cage", "scheme"), [(with_a_diagonal_twice(), "catmull_clark"), (two_triangles(), "loop")])
-def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme):
+@pytest.mark.parametrize(
+    ("cage", "scheme", "is_open"),
+    [
+        (with_a_diagonal_twice(), "catmull_clark", False),
+        (TWO_TRIANGLES, "loop", False),
+        (WITH_A_DIAGONAL_ON_THE_BORDER, "catmull_clark", True),
+    ],
+)
+def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme, is_open):
     """The diagonals of two patches would be one edge, with four triangles; so would cuts across their corners."""
     surface = LimitSurface(cage, scheme)
     table = table_of(surface, 100, 1)
-    edges = directed_edges(table.triangles)
-    keys, twins = (np.sort(numbered(each, table.vertex_count)) for each in (edges, edges[:, ::-1]))
-    assert (np.diff(keys) > 0).all()
-    np.testing.assert_array_equal(keys, twins)
+    _, keys, twins = numbered_edges(table.triangles)
+    assert len(np.unique(keys)) == len(keys)
+    # All edges have two triangles, but for the three that a border has at least.
+    lonely = np.setdiff1d(keys, twins)
+    assert len(lonely) >= 3 if is_open else len(lonely) == 0
     assert len(np.unique(np.sort(table.triangles, axis=1), axis=0)) == len(table.triangles)
     assert_elements_are_covered(surface, table)
     assert_vertices_lie_where_triangles_say(surface, table)
 
 
 # Random cages of whole elements, of which some meet twice: of three corners, and of four.
-MEETING_TWICE = (82, 115, 19, 114, 468)
-
-
-@pytest.mark.parametrize("seed", MEETING_TWICE)
+@pytest.mark.parametrize("seed", [82, 115, 19, 114, 468])
 def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(seed):
     """Every edge of the mesh connects its ends once, and so does every diagonal of an element of four corners."""
     with without_warnings():
         surface = LimitSurface(*random_cage(np.random.default_rng(seed)))
     frames, t = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex), surface.patches.elements
     connections, of_face = defaultdict(set), defaultdict(set)
-    for half_edge, face in enumerate(t.face[np.arange(t.half_edge_count)]):
+    for half_edge, face in enumerate(t.face):
         following = t.next[half_edge]
         ways = [(("edge", t.edge[half_edge]), following)]
         if t.face_sizes[face] == 4:
@@ -228,23 +210,18 @@ def test_any_cage_has_an_adaptive_tessellation(seed):
     table = table_of(surface, (1, 0.1, 0.01)[seed % 3], 1 + seed % 8)
     assert_elements_are_covered(surface, table)
     assert_vertices_lie_where_triangles_say(surface, table)
-    tables = table, surface.sampling(3)
-    keys = [np.sort(numbered(directed_edges(each.triangles), each.vertex_count)) for each in tables]
-    is_unique, is_expected = ((np.diff(own) > 0).all() for own in keys)
+    (_, keys, twins), (_, uniform_keys, _) = (numbered_edges(each.triangles) for each in (table, surface.sampling(3)))
+    is_unique, is_expected = (len(np.unique(each)) == len(each) for each in (keys, uniform_keys))
     assert is_unique or not is_expected
     if (surface.patches.elements.twin >= 0).all():
-        edges = directed_edges(table.triangles)[:, ::-1]
-        np.testing.assert_array_equal(keys[0], np.sort(numbered(edges, table.vertex_count)))
+        np.testing.assert_array_equal(np.sort(keys), np.sort(twins))
 
 
-def faces_back_to_back(points, size):
-    """A polygon twice, in opposite directions, which meet along the middle; flat, as a sheet of paper folded once."""
-    return ControlCage(np.insert(np.array(points, dtype=float), 2, 0, axis=1), [range(size), range(size)[::-1]])
-
-
+# The first two are a polygon twice, in opposite directions, which meet along its sides, as of paper folded once.
+TWICE = [range(4), range(4)[::-1]]
 FOLDED = {
-    "convex": faces_back_to_back([(0, 0), (1, 0), (1.4, 1), (0, 1)], 4),
-    "concave": faces_back_to_back([(0, 0), (1, 0.8), (2, 0), (1, 2)], 4),
+    "convex": ControlCage([(0, 0, 0), (1, 0, 0), (1.4, 1, 0), (0, 1, 0)], TWICE),
+    "concave": ControlCage([(0, 0, 0), (1, 0.8, 0), (2, 0, 0), (1, 2, 0)], TWICE),
     "foldover": ControlCage(
         np.array([(-2, -4, 0), (2, -4, 0), (4, 0, 0), (2, 4, 0), (-2, 4, 0), (-4, 0, 0)]) / 4,
         [(0, 1, 2, 3, 4, 5), (5, 4, 3), (5, 1, 0)],
@@ -261,23 +238,10 @@ def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
     assert (feature_edges(surface.patches, frames, cage.positions[vertex], criterion) == is_folded).all()
 
 
-def distance_to_triangles(points, corners):
-    """``(s,)`` distances in a plane of points ``(s, 2)`` from the nearest of triangles ``(t, 3, 2)``."""
-    origin, along = corners[None], (np.roll(corners, -1, axis=1) - corners)[None]
-    offset = points[:, None, None] - origin
-    part = (offset * along).sum(axis=-1) / np.maximum((along**2).sum(axis=-1), np.finfo(float).tiny)
-    from_sides = np.linalg.norm(offset - np.clip(part, 0, 1)[..., None] * along, axis=-1).min(axis=2)
-    side = along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
-    is_inside = (side > 0).all(axis=2) | (side < 0).all(axis=2)
-    return np.where(is_inside, 0, from_sides).min(axis=1)
-
-
 @pytest.mark.parametrize("name", FOLDED)
 def test_a_surface_folded_in_its_plane_is_covered(name):
     """All heights are equal, and still the surface's points are as near to the triangles as the limit says."""
     surface, error = LimitSurface(FOLDED[name]), 1e-3
-    table, dense = table_of(surface, error, 1024), surface.sampling(12)
-    corners = table.apply(surface.cage.positions)[0][table.triangles][..., :2]
-    reached = distance_to_triangles(dense.apply(surface.cage.positions)[0][:, :2], corners).max()
-    size = np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
-    assert reached <= error * size * (1 + ROUNDING)
+    table, dense = table_of(surface, error, 1024), surface.tessellate(12).positions
+    reached = distances_to(table.apply(surface.cage.positions)[0][table.triangles], dense).max()
+    assert reached <= error * size_of(surface) * (1 + ROUNDING)

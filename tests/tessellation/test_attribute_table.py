@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
 from patches.closed_cages import bumpy, mixed_torus
@@ -56,21 +56,15 @@ EVERY_GRID = pytest.mark.parametrize(("scheme", "cage", "rate"), GRIDS.values(),
 
 
 @EVERY_GRID
-def test_positions_and_normals_do_not_change_by_a_bit(scheme, cage, rate, np_rng):
-    cage = with_seams(bumpy(cage), np_rng)
-    split, plain = (LimitSurface(each, scheme).tessellate(rate) for each in (cage, without_attributes(cage)))
-    assert len(split.positions) > len(plain.positions)
-    assert len(split.normals) == len(split.texcoords) == len(split.positions)
-    np.testing.assert_array_equal(split.positions[split.triangles], plain.positions[plain.triangles])
-    np.testing.assert_array_equal(split.normals[split.triangles], plain.normals[plain.triangles])
-    np.testing.assert_array_equal(split.element, plain.element)
-
-
-@EVERY_GRID
 @pytest.mark.parametrize("mode", ["corners_plus1", "all"])
 def test_every_vertex_has_the_values_of_its_element_at_its_place(scheme, cage, rate, mode, np_rng):
+    """And positions and normals do not change by a bit."""
     surface = LimitSurface(with_seams(bumpy(cage), np_rng, mode), scheme)
-    found = surface.tessellate(rate)
+    found, plain = (each.tessellate(rate) for each in (surface, LimitSurface(without_attributes(surface.cage), scheme)))
+    assert len(found.normals) == len(found.texcoords) == len(found.positions) > len(plain.positions)
+    np.testing.assert_array_equal(found.positions[found.triangles], plain.positions[plain.triangles])
+    np.testing.assert_array_equal(found.normals[found.triangles], plain.normals[plain.triangles])
+    np.testing.assert_array_equal(found.element, plain.element)
     # The fewest corners and the most among them.
     for element in np.argsort(surface.cage.face_sizes, kind="stable")[[0, 1, 2, 5, -3, -2, -1]]:
         vertices = np.unique(found.triangles[found.element == element])
@@ -112,8 +106,7 @@ def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng
 def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
     cage = bumpy(mixed_torus())
     colour = np_rng.random((cage.vertex_count, 3))
-    coloured = tagged(cage, attributes={"colour": Attribute(colour)})
-    surface = LimitSurface(coloured, scheme)
+    surface = LimitSurface(tagged(cage, attributes={"colour": Attribute(colour)}), scheme)
     table = surface.sampling(3)
     found = surface.attribute_table(table)
     assert found.surface_vertex is None
@@ -132,14 +125,9 @@ def test_other_evaluators_keep_the_values(np_rng):
 
 def test_smooth_attributes_are_the_same_on_both_sides_of_a_crease(np_rng):
     base = extraordinary(5)
-    ring = base.face_vertices.reshape(-1, 4)[:5, 1].tolist()
-    cage = ControlCage(
-        base.positions,
-        base.face_vertices.reshape(-1, 4),
-        creases=[(0, far, 10) for far in ring[:3]],
-        attributes={"weight": Attribute(np_rng.standard_normal((base.vertex_count, 3)))},
-    )
-    found = LimitSurface(cage).tessellate(5)
+    creases = [(0, far, 10) for far in base.face_vertices.reshape(-1, 4)[:3, 1].tolist()]
+    attribute = Attribute(np_rng.standard_normal((base.vertex_count, 3)))
+    found = LimitSurface(tagged(base, creases=creases, attributes={"weight": attribute})).tessellate(5)
     places = np.unique(found.positions, axis=0)
     assert len(places) < len(found.positions)
     # Bit by bit.

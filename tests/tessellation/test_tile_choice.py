@@ -1,10 +1,11 @@
 """Tessellations do not depend on the blocks in which they are made."""
 
 import numpy as np
+import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.mesh import ragged
-from mitsuba_subdivision.tessellation import tile_choice
+from mitsuba_subdivision.tessellation import Criterion, Measure, tile_choice
 from tessellation.test_adaptive_grid import table_of
 
 
@@ -34,11 +35,23 @@ def test_tessellations_do_not_depend_on_the_chunks_that_fit_a_cache(monkeypatch)
         monkeypatch.setattr(ragged, "CHUNK_LENGTH", length)
         # Tables of its own: a surface keeps what it has made.
         surface = LimitSurface(named.cage, named.scheme)
-        adaptive = table_of(surface)
-        corner, uv = adaptive.grid.triangle_locations
-        tables.append([adaptive.triangles, adaptive.element, *adaptive.locations(), corner, uv])
-        tables[-1] += adaptive.apply(named.cage.positions)
-        tables[-1] += [surface.sampling(3).triangles, *surface.sampling(3).apply(named.cage.positions)]
+        adaptive, uniform = table_of(surface), surface.sampling(3)
+        vertices = *adaptive.apply(named.cage.positions), *uniform.apply(named.cage.positions)
+        places = *adaptive.locations(), *adaptive.grid.triangle_locations
+        tables.append([adaptive.triangles, adaptive.element, uniform.triangles, *vertices, *places])
     assert len(tables[0][0]) > 100
     for whole, cut in zip(*tables, strict=True):
         np.testing.assert_array_equal(whole, cut)
+
+
+def test_too_many_triangles_are_refused_before_most_tiles_are_looked_at(monkeypatch):
+    surface, seen, decided = surface_named("rook"), [], tile_choice._decided
+
+    def counted(rates, part):
+        seen.append(len(part.tiles))
+        return decided(rates, part)
+
+    monkeypatch.setattr(tile_choice, "_decided", counted)
+    with pytest.raises(MemoryError, match="expected a larger error"):
+        surface.adaptive_sampling(Criterion(Measure.EDGE, 1e-9), 1024)
+    assert sum(seen) < 10 * surface.patches.patch_count

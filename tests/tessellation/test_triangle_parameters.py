@@ -6,9 +6,8 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import torus
 from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus, triangulated
 from reference.refined_cages import half_disc, sheet, tagged
+from tessellation.test_uniform import NORMAL, ROUNDING
 
-# Of cages of a size of about 3.
-ROUNDING = 1e-13
 CAGES = {
     **{f"{scheme} {name}": (scheme, cage_of(scheme, name)) for scheme, name in SURFACES},
     "holes": ("catmull_clark", tagged(mixed_torus(), holes=[0, 3, 4])),
@@ -26,13 +25,9 @@ def places(surface, grid):
     elements, is_whole = surface.patches.elements, surface.patches.is_whole
     whole, corner = grid.triangle_parameters()
     found = []
-    for element, size in enumerate(elements.face_sizes):
-        if size == 0:
-            continue
-        if is_whole[element]:
-            found.append((np.full(len(whole), element), np.zeros(len(whole), dtype=int), whole))
-        else:
-            found += [(np.full(len(corner), element), np.full(len(corner), k), corner) for k in range(size)]
+    for element in np.flatnonzero(elements.face_sizes):
+        own, corners = (whole, 1) if is_whole[element] else (corner, elements.face_sizes[element])
+        found += [(np.full(len(own), element), np.full(len(own), each), own) for each in range(corners)]
     element, begins, uv = (np.concatenate(column) for column in zip(*found, strict=True))
     begins, uv = np.repeat(begins[:, None], 3, axis=1), uv.copy()
     # What is beyond u = 1 is in the next corner, where u and v change places.
@@ -44,26 +39,28 @@ def places(surface, grid):
 
 
 @EVERY_CAGE
-def test_they_are_where_the_vertices_lie(scheme, cage):
+def test_vertices_are_the_surface_at_their_parameters_in_every_triangle(scheme, cage):
+    """Whichever patch evaluates a vertex, the elements of all triangles around it find it in the same place."""
+    surface = LimitSurface(bumpy(cage, size=0.05), scheme)
     for rate in RATES:
-        surface = LimitSurface(bumpy(cage, size=0.05), scheme)
         table = surface.sampling(rate)
         element, corner, uv = places(surface, table.grid)
-        assert len(uv) == len(table.triangles)
         np.testing.assert_array_equal(element[:, 0], table.element)
-        found = surface.evaluate(element, uv, corner).p
-        expected = table.apply(surface.cage.positions)[0][table.triangles.ravel()]
-        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
+        found = surface.evaluate(element, uv, corner)
+        positions, normals = (each[table.triangles.ravel()] for each in table.apply(surface.cage.positions))
+        np.testing.assert_allclose(found.p, positions, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(found.n, normals, rtol=0, atol=NORMAL)
 
 
 @EVERY_CAGE
 def test_triangles_cover_the_domain_once(scheme, cage):
     """Their areas are positive, and add up to that of the domain, as those of a polygon's corners do."""
+    surface = LimitSurface(cage, scheme)
     for rate in RATES:
-        surface = LimitSurface(cage, scheme)
-        domain, grid = surface.scheme.domain, surface.sampling(rate).grid
-        for parameters in grid.triangle_parameters():
-            if len(parameters):
-                areas = np.linalg.det(parameters[:, 1:] - parameters[:, :1]) / 2
-                assert (areas > 0).all()
-                assert areas.sum() == pytest.approx(1 if domain.corner_count == 4 else 0.5, abs=ROUNDING)
+        both = surface.sampling(rate).grid.triangle_parameters()
+        # Those of whole elements are cells of the lattice.
+        assert np.ptp(both[0], axis=1).max(initial=0) <= 1 / rate + ROUNDING
+        for parameters in filter(len, both):
+            areas = np.linalg.det(parameters[:, 1:] - parameters[:, :1]) / 2
+            assert (areas > 0).all()
+            assert areas.sum() == pytest.approx(1 if surface.scheme.domain.corner_count == 4 else 0.5, abs=ROUNDING)

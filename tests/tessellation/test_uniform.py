@@ -1,15 +1,13 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import CageWarning
+from mitsuba_subdivision.cage import CageWarning, named_cages
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.tessellation import uniform_table
-from patches.closed_cages import SURFACES, bumpy, cage_of, polygons
+from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus, polygons
 from reference.brute_force import BruteForce
 
 pytestmark = pytest.mark.core
 
-EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 # Cages have a size of about 3; weights and their sums lose some tens of roundings.
 ROUNDING = 1e-13
 # Normals of valence 7 and above lose what the eigenbasis is ill-conditioned by.
@@ -18,47 +16,43 @@ NORMAL = 1e-12
 DIFFERENCES = 1e-7
 
 
-def surface_of(scheme, name):
-    return LimitSurface(bumpy(cage_of(scheme, name), size=0.05), scheme)
+@pytest.fixture(params=SURFACES, ids=" ".join)
+def surface(request):
+    return LimitSurface(bumpy(cage_of(*request.param), size=0.05), request.param[0])
 
 
-def samples_of(surface, element, corner, uv):
-    first = surface.patches.elements.face_offsets
-    return surface.evaluate(element, uv, corner - first[element])
-
-
-@EVERY_SURFACE
-@pytest.mark.parametrize("rate", [1, 2, 3, 8])
-def test_every_vertex_lies_on_one_polynomial(scheme, name, rate):
-    table = surface_of(scheme, name).sampling(rate)
-    assert_every_vertex_lies_on_one_polynomial(table)
+# Odd and even, halves of these odd and even, and a single segment.
+@pytest.mark.parametrize("rate", [1, 2, 3, 5, 6, 8])
+def test_every_vertex_lies_on_one_polynomial_where_it_says(surface, rate):
+    table = surface.sampling(rate)
+    assert_every_vertex_lies_on_one_polynomial_where_it_says(surface, table)
     assert table.triangles.max() == table.vertex_count - 1
 
 
-def assert_every_vertex_lies_on_one_polynomial(table):
-    parts = table.polynomials
+def assert_every_vertex_lies_on_one_polynomial_where_it_says(surface, table):
     vertices = []
-    for part in parts:
+    for part in table.polynomials:
         assert (part.patch < part.blocks[part.block, 1]).all()
         assert (np.diff(part.first_run) > 0).all()
         assert (np.diff(part.first_entry) > 0).all()
         assert part.first_run[-1] == len(part.kind) == len(part.first_vertex)
         for kind, first in zip(part.kind.tolist(), part.first_vertex.tolist(), strict=True):
             vertices.append(first + part.offset[part.first_entry[kind] : part.first_entry[kind + 1]])
-    np.testing.assert_array_equal(np.sort(np.concatenate(vertices)), np.arange(table.vertex_count))
-
-
-@EVERY_SURFACE
-@pytest.mark.parametrize("rate", [1, 5])
-def test_weights_sum_to_one_for_constants_and_to_zero_for_other_coefficients(scheme, name, rate):
-    for part in surface_of(scheme, name).sampling(rate).polynomials:
+        # Weights sum to one for constants, and to zero for other coefficients.
         for weights in part.weights:
-            is_constant = (part.powers == 0).all(axis=1)
-            assert np.abs(weights.sum(axis=2) - is_constant).max() <= ROUNDING
+            assert np.abs(weights.sum(axis=2) - (part.powers == 0).all(axis=1)).max() <= ROUNDING
+    np.testing.assert_array_equal(np.sort(np.concatenate(vertices)), np.arange(table.vertex_count))
+    corner, uv = table.locations()
+    element = surface.patches.elements.face[corner]
+    exact = surface.evaluate(element, uv, corner - surface.patches.elements.face_offsets[element])
+    positions, normals = table.apply(surface.cage.positions)
+    np.testing.assert_allclose(positions, exact.p, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(normals, exact.n, rtol=0, atol=NORMAL)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=0, atol=ROUNDING)
 
 
 def test_vertices_of_the_cage_that_no_face_uses_have_none_in_the_tessellation():
-    cube = cage_of("catmull_clark", "cube")
+    cube = named_cages.cube()
     positions = np.insert(cube.positions, [0, 3], 99.0, axis=0)
     faces = np.array([1, 2, 3, 5, 6, 7, 8, 9])[cube.face_vertices].reshape(-1, 4)
     with pytest.warns(CageWarning, match="2 of 10 vertices are used by no face"):
@@ -69,9 +63,7 @@ def test_vertices_of_the_cage_that_no_face_uses_have_none_in_the_tessellation():
     np.testing.assert_array_equal(found.triangles, expected.triangles)
 
 
-@EVERY_SURFACE
-def test_tangents_are_the_derivatives_up_to_a_positive_factor(scheme, name):
-    surface = surface_of(scheme, name)
+def test_tangents_are_the_derivatives_up_to_a_positive_factor(surface):
     # One sample in each child, and some nearer to the corner.
     uv = np.array([(0.15, 0.2), (0.6, 0.3), (0.3, 0.6), (0.45, 0.3), (0.05, 0.02)])
     step = 1e-5
@@ -88,55 +80,11 @@ def test_tangents_are_the_derivatives_up_to_a_positive_factor(scheme, name):
         np.testing.assert_allclose(tangents * factor[..., None], differences, rtol=0, atol=DIFFERENCES)
 
 
-@EVERY_SURFACE
-@pytest.mark.parametrize("rate", [1, 2, 3, 6])
-def test_vertices_are_the_surface_at_their_locations(scheme, name, rate):
-    surface = surface_of(scheme, name)
-    table = surface.sampling(rate)
-    positions, normals = table.apply(surface.cage.positions)
-    corner, uv = table.locations()
-    exact = samples_of(surface, surface.patches.elements.face[corner], corner, uv)
-    np.testing.assert_allclose(positions, exact.p, rtol=0, atol=ROUNDING)
-    np.testing.assert_allclose(normals, exact.n, rtol=0, atol=NORMAL)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=0, atol=ROUNDING)
-
-
-@EVERY_SURFACE
-@pytest.mark.parametrize("rate", [2, 5])
-def test_shared_vertices_are_the_surface_as_seen_from_every_side(scheme, name, rate):
-    """Whichever patch evaluates a sample, its neighbours find it in the same place."""
-    surface = surface_of(scheme, name)
-    tessellation = surface.tessellate(rate)
-    t = surface.patches.elements
-    whole = surface.patches.is_whole
-    step = np.arange(rate + 1) / rate
-    along = np.stack([step, np.zeros_like(step)], axis=1)
-    start = t.vertex_count + t.edge * (rate - 1)
-    expected, corners, parameters = [], [], []
-    for corner in range(t.half_edge_count):
-        # Sub-patches of a polygon reach the middle of an edge only.
-        is_whole = whole[t.face[corner]]
-        reached = np.arange(1 + (rate if is_whole else rate // 2))
-        forward = t.edge_half_edge[t.edge[corner]] == corner
-        vertices = start[corner] + (reached if forward else rate - reached) - 1
-        vertices[reached == 0] = t.face_vertices[corner]
-        vertices[reached == rate] = t.face_vertices[t.next[corner]]
-        expected.append(vertices)
-        corners.append(np.full(len(reached), corner))
-        parameters.append(along[reached] * (1 if is_whole else 2))
-    vertices, corner = np.concatenate(expected), np.concatenate(corners)
-    found = samples_of(surface, t.face[corner], corner, np.concatenate(parameters))
-    np.testing.assert_allclose(tessellation.positions[vertices], found.p, rtol=0, atol=ROUNDING)
-    np.testing.assert_allclose(tessellation.normals[vertices], found.n, rtol=0, atol=NORMAL)
-
-
-@EVERY_SURFACE
 @pytest.mark.parametrize("rate", [4, 5])
-def test_elements_hold_the_points_of_the_brute_force_reference(scheme, name, rate):
-    surface = surface_of(scheme, name)
+def test_elements_hold_the_points_of_the_brute_force_reference(surface, rate):
     cage, t = surface.cage, surface.patches.elements
     tessellation = surface.tessellate(rate)
-    reference = BruteForce(scheme, cage.positions, polygons(cage.topology), digits=40)
+    reference = BruteForce(surface.scheme.name, cage.positions, polygons(cage.topology), digits=40)
     rng = np.random.default_rng(9)
     for element in rng.choice(t.face_count, 3, replace=False).tolist():
         corner = int(rng.integers(t.face_sizes[element]))
@@ -144,55 +92,35 @@ def test_elements_hold_the_points_of_the_brute_force_reference(scheme, name, rat
         # A sample of the lattice that is inside both a triangle and a square, and in a polygon's corner too.
         u, v = (1 / rate, 2 / rate) if surface.patches.is_whole[element] else (2 / rate, 2 / rate)
         expected = reference.evaluate(element, corner, u, v)
-        nearest = own[np.argmin(np.linalg.norm(tessellation.positions[own] - np.array(expected.p, float), axis=1))]
-        np.testing.assert_allclose(tessellation.positions[nearest], np.array(expected.p, float), rtol=0, atol=ROUNDING)
-        np.testing.assert_allclose(tessellation.normals[nearest], np.array(expected.n, float), rtol=0, atol=NORMAL)
+        p, n = np.array(expected.p, float), np.array(expected.n, float)
+        nearest = own[np.argmin(np.linalg.norm(tessellation.positions[own] - p, axis=1))]
+        np.testing.assert_allclose(tessellation.positions[nearest], p, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(tessellation.normals[nearest], n, rtol=0, atol=NORMAL)
 
 
-@EVERY_SURFACE
+@pytest.mark.parametrize(("scheme", "name"), SURFACES)
 def test_triangles_face_outward(scheme, name):
     surface = LimitSurface(cage_of(scheme, name), scheme)
     for rate in (5, 6):
         t = surface.tessellate(rate)
-        a, b, c = (t.positions[t.triangles[:, i]] for i in range(3))
-        across = np.cross(b - a, c - a)
-        towards = np.einsum("ij,ij->i", across, t.normals[t.triangles].sum(axis=1))
+        a, b, c = t.positions[t.triangles].swapaxes(0, 1)
+        towards = np.einsum("ij,ij->i", np.cross(b - a, c - a), t.normals[t.triangles].sum(axis=1))
         # A triangle without area faces nowhere; folds of a cage that is not convex stay thin.
         assert (towards > 0).mean() > 0.99
         assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0
 
 
-@EVERY_SURFACE
-def test_triangles_lie_in_their_element(scheme, name):
-    """All corners of a triangle are samples of the element that it is said to belong to."""
-    surface = surface_of(scheme, name)
-    t, rate = surface.patches.elements, 4
-    tessellation = surface.tessellate(rate)
-    uv = [(u / rate, v / rate) for u in range(rate + 1) for v in range(rate + 1) if scheme != "loop" or u + v <= rate]
-    for element in range(0, t.face_count, max(1, t.face_count // 6)):
-        sizes = range(1 if surface.patches.is_whole[element] else t.face_sizes[element])
-        samples = np.concatenate([surface.evaluate(element, uv, corner).p for corner in sizes])
-        own = tessellation.positions[np.unique(tessellation.triangles[tessellation.element == element])]
-        distance = np.linalg.norm(own[:, None] - samples, axis=2).min(axis=1)
-        np.testing.assert_allclose(distance, 0, rtol=0, atol=ROUNDING)
-
-
-@EVERY_SURFACE
-def test_moved_control_points_give_the_tessellation_of_the_moved_cage(scheme, name):
-    surface = surface_of(scheme, name)
-    table = surface.sampling(3)
+def test_moved_control_points_give_the_tessellation_of_the_moved_cage(surface):
+    table, moved = surface.sampling(3), bumpy(surface.cage, seed=11)
     table.apply(surface.cage.positions)
-    moved = bumpy(surface.cage, seed=11)
-    fresh = LimitSurface(moved, scheme).tessellate(3)
+    fresh = LimitSurface(moved, surface.scheme).tessellate(3)
     for again, other in zip(table.apply(moved.positions), (fresh.positions, fresh.normals), strict=True):
         np.testing.assert_array_equal(again, other)
     np.testing.assert_array_equal(table.triangles, fresh.triangles)
     np.testing.assert_array_equal(table.element, fresh.element)
 
 
-@EVERY_SURFACE
-def test_translation_moves_points_and_keeps_normals(scheme, name):
-    surface = surface_of(scheme, name)
+def test_translation_moves_points_and_keeps_normals(surface):
     table = surface.sampling(4)
     # On this grid a translation by a power of two is exact, so nothing is lost before the weights.
     grid = np.round(surface.cage.positions * 2**30) / 2**30
@@ -204,9 +132,7 @@ def test_translation_moves_points_and_keeps_normals(scheme, name):
     np.testing.assert_array_equal(moved_normals, normals)
 
 
-@EVERY_SURFACE
-def test_normals_are_numbers_where_sums_overflow(scheme, name):
-    surface = surface_of(scheme, name)
+def test_normals_are_numbers_where_sums_overflow(surface):
     with np.errstate(all="ignore"):
         normals = surface.sampling(3).apply(surface.cage.positions * 3e307)[1]
     lengths = np.linalg.norm(normals, axis=1)
@@ -216,7 +142,7 @@ def test_normals_are_numbers_where_sums_overflow(scheme, name):
 @pytest.mark.parametrize("coefficients", [1, 1000])
 @pytest.mark.parametrize("weights", [1, 5000])
 def test_runs_do_not_show(weights, coefficients, monkeypatch):
-    surface = surface_of("catmull_clark", "mixed torus")
+    surface = LimitSurface(bumpy(mixed_torus(), size=0.05))
     table = surface.sampling(3)
     expected = table.apply(surface.cage.positions)
     for name, value in (("WEIGHTS_AT_ONCE", weights), ("COEFFICIENTS_AT_ONCE", coefficients)):
@@ -225,19 +151,7 @@ def test_runs_do_not_show(weights, coefficients, monkeypatch):
         np.testing.assert_allclose(found, one, rtol=0, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("rate", [0, -1])
-def test_rate_below_one_is_refused(rate):
-    surface = surface_of("catmull_clark", "cube")
-    with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
-        uniform_table(surface.patches, rate)
-    with pytest.raises(ValueError, match=rf"tessellation rate {rate}; expected 1 or more"):
-        surface.tessellate(rate)
-
-
-@EVERY_SURFACE
-def test_more_vertices_than_buffers_hold_are_refused(scheme, name):
-    surface = surface_of(scheme, name)
-    with pytest.raises(
-        ValueError, match=r"tessellation rate 100000 makes \d{11,} vertices; expected at most 715827882"
-    ):
+def test_more_vertices_than_buffers_hold_are_refused(surface):
+    message = r"tessellation rate 100000 makes \d{11,} vertices; expected at most 715827882"
+    with pytest.raises(ValueError, match=message):
         surface.tessellate(100_000)
