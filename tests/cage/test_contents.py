@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import Attribute, CageError, ControlCage
+from mitsuba_subdivision.cage import Attribute, ControlCage
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.cage.rules import RULES
@@ -47,28 +47,3 @@ def test_values_and_indices_of_attributes_are_arrays(values):
     assert isinstance(attribute.values, np.ndarray)
     assert isinstance(attribute.indices, np.ndarray)
     assert Attribute(values).indices is None
-
-
-def test_given_arrays_are_not_copied_before_a_cage_takes_them():
-    values = np.zeros((8, 2))
-    attribute = Attribute(values)
-    assert attribute.values is values
-    cage = tagged(cube(), texcoords=attribute)
-    values[:] = 7
-    np.testing.assert_array_equal(cage.texcoords.values, 0)
-
-
-RAGGED = Attribute(np.zeros((2, 1)), "face_varying", [[0, 1], [0]])
-
-
-@pytest.mark.parametrize(
-    ("attributes", "message"),
-    [
-        ({"age": Attribute([[1], [2, 3]])}, '"age" has values that are no table of numbers: .*inhomogeneous'),
-        ({"age": RAGGED}, 'attribute "age" has indices of .*; expected 24 integers, one per face'),
-        ({"texcoords": np.zeros((8, 2))}, 'control cage: an attribute is called "texcoords"; expected another name'),
-    ],
-)
-def test_malformed_attributes_are_errors_with_their_names(attributes, message):
-    with pytest.raises(CageError, match=message):
-        tagged(cube(), attributes=attributes)

@@ -46,34 +46,25 @@ def options(tmp_path):
 
 
 @pytest.fixture
-def set_constants(monkeypatch):
-    def set_in(module, **values):
-        for name, value in values.items():
-            monkeypatch.setattr(f"mitsuba_subdivision.figures.{module}.{name}", value)
-
-    return set_in
-
-
-@pytest.fixture
-def coarse(monkeypatch, set_constants):
-    """Figures without the pixels and triangles that a printer needs: most of the time to draw one goes into these."""
+def coarse(monkeypatch):
+    """Figures without the pixels, triangles and steps that a printer needs: most of the time goes into these."""
     from matplotlib.figure import Figure
 
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
     monkeypatch.setitem(write_plot.__kwdefaults__, "layouts", 1)
-    set_constants("creases", RATE=3)
-    set_constants("normal_error", VALENCES=(3,), OFFSETS=(0,), LEVELS=np.arange(3))
-    set_constants("displacement", COLUMNS=96, ROWS=96)
-    set_constants("zebra", FINE_LEVEL=3, OWN_LEVEL=3, STRIPE_PIXELS=256)
-
-
-@pytest.fixture
-def few_steps(set_constants):
-    """Fits that go a little way only."""
-    set_constants("fit", STEPS=2, CREASE_STEPS=1, RATE=4)
-    set_constants("ball_fits", PIXELS=12, VIEWS=2, SPP=1, TARGET_SPP=1, SAMPLES=500, FINE=3, DENSE=3)
-    set_constants("crease_fit", PIXELS=12, SPP=1)
+    constants = {
+        "creases": {"RATE": 3},
+        "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
+        "displacement": {"COLUMNS": 96, "ROWS": 96},
+        "zebra": {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
+        "fit": {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4},
+        "ball_fits": {"PIXELS": 12, "VIEWS": 2, "SPP": 1, "TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
+        "crease_fit": {"PIXELS": 12, "SPP": 1},
+    }
+    for module, values in constants.items():
+        for name, value in values.items():
+            monkeypatch.setattr(f"mitsuba_subdivision.figures.{module}.{name}", value)
 
 
 def test_the_command_line_knows_every_figure_and_the_table_every_module_that_draws():
@@ -96,7 +87,7 @@ def test_figures_of_users_leave_a_checkout_as_it_is():
 RENDERED_TWICE, WRITTEN_TWICE = "shading", "refinement"
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "few_steps")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
 @pytest.mark.parametrize("name", FIGURE_NAMES)
 def test_a_figure_draws_without_warnings_fit_for_print(name, options):
     """In a column, where its PDF has text of 6 points, embedded fonts and the pixels that were rendered."""
@@ -171,14 +162,10 @@ def test_cages_that_do_not_fit_a_figure_are_told(options, tmp_path):
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb", "coarse")
-@pytest.mark.parametrize("name", ["subdivision", "zebra", "displacement"])
-def test_scalar_variants_draw_too(name, options):
+def test_scalar_variants_draw_too_all_but_fits(options):
     """So do `artifact` and `creases`, by commands of the README and of the guide."""
-    assert len(FIGURES[name](options(formats=("png",)))) == 1
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_fits_without_derivatives_are_refused(options):
+    for name in ("subdivision", "zebra", "displacement"):
+        assert len(FIGURES[name](options(formats=("png",)))) == 1
     with pytest.raises(FigureError, match="variant scalar_rgb; expected one with derivatives"):
         FIGURES["fit"](options())
 
@@ -211,10 +198,16 @@ def no_programs(monkeypatch, tmp_path):
 
 @pytest.fixture
 def answering(tmp_path):
-    """Function that writes a program of the shell, and returns its path."""
+    """Function that writes a program of the shell, and returns its path.
 
-    def write(name, text):
+    With records to answer, it copies what it is asked to a file `asked`.
+    """
+
+    def write(name, text, **records):
         program = tmp_path / name
+        if records:
+            peers.write_records(tmp_path / "answers", {key: np.array(values) for key, values in records.items()})
+            text += f'\ncp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"'
         program.write_text(f"#!/bin/sh\n{text}\n")
         program.chmod(0o755)
         return program
@@ -355,8 +348,7 @@ def test_a_failing_program_says_why(answering):
 @pytest.mark.posix
 def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
     answers = {"p": [1.0, 2, 3, 4, 5, 6], "du": [2.0, 0, 0, 0, 0, 0], "dv": [0, 3.0, 0, 1, 0, 0]}
-    peers.write_records(tmp_path / "answers", {name: np.array(values) for name, values in answers.items()})
-    program = answering("osd_peer", f'cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"')
+    program = answering("osd_peer", "", **answers)
     points, normals = peers.osd_samples(program, cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
     assert np.array_equal(points, [[1, 2, 3], [4, 5, 6]])
     # Where a derivative vanishes there is no normal.
@@ -370,12 +362,10 @@ def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
 @pytest.mark.posix
 def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path, answering):
     points, normals, quad = np.arange(12.0), np.tile([0.0, 0, 1], 4), np.arange(4, dtype=np.int32)
-    version = np.array([3, 4, 1], dtype=np.int32)
-    peers.write_records(tmp_path / "answers", {"p": points, "n": normals, "corners": quad, "version": version})
+    answers = {"p": points, "n": normals, "corners": quad, "version": np.array([3, 4, 1], dtype=np.int32)}
     # The last three words are both files and the level.
     said = f'while [ $# -gt 3 ]; do echo "$1"; shift; done > {tmp_path}/words; echo "$3" >> {tmp_path}/words'
-    program = answering("blender", f'{said}; cp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"')
-    mesh = peers.blender_mesh(program, cube(), 5)
+    mesh = peers.blender_mesh(answering("blender", said, **answers), cube(), 5)
     assert np.array_equal(mesh.positions, points.reshape(4, 3))
     assert np.array_equal(mesh.normals, normals.reshape(4, 3))
     assert (mesh.quads.tolist(), mesh.version) == ([[0, 1, 2, 3]], "3.4")

@@ -13,13 +13,11 @@ from mitsuba_subdivision.fit.regularizers import LEAST_COSINE, folds
 ROUNDING = 1e-6
 # Central differences of values near one, in float32.
 STEP, DIFFERENCE = 1e-3, 2e-3
-# Some vertices have no page.
-pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
-
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant("llvm_ad_rgb")
+pytestmark = [
+    # Some vertices have no page.
+    pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
+    pytest.mark.usefixtures("variant_llvm_ad_rgb"),
+]
 
 
 def book(angle, pages=((0, 1, 2, 3), (1, 0, 4, 5))):

@@ -9,8 +9,8 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.fit import LargeSteps
-from mitsuba_subdivision.fit.regularizers import Regularizer, device_form
+from mitsuba_subdivision.fit import LargeSteps, regularizer
+from mitsuba_subdivision.fit.regularizers import Regularizer
 
 # Sums of some hundred terms in single precision.
 SINGLE = 2e-5
@@ -20,14 +20,6 @@ SINGLE = 2e-5
 def surface():
     mi.set_variant("llvm_ad_rgb")
     return LimitSurface(torus(6, 5))
-
-
-@pytest.mark.core
-def test_coordinates_and_points_are_inverse(surface):
-    points = surface.cage.positions
-    steps = LargeSteps(surface.cage.laplacian(), 3.0)
-    found = steps.from_differential(steps.to_differential(points))
-    np.testing.assert_allclose(np.array(found).reshape(-1, 3), points, atol=SINGLE)
 
 
 def test_a_step_is_that_of_mitsuba(surface, np_rng):
@@ -46,8 +38,12 @@ def test_a_step_is_that_of_mitsuba(surface, np_rng):
 
 
 @pytest.mark.core
-def test_derivatives_are_solutions_of_the_same_system(surface, np_rng):
+def test_coordinates_and_points_are_inverse_and_derivatives_solve_the_same_system(surface, np_rng):
     """In reverse and in forward mode, as the matrix is symmetric."""
+    points, steps = surface.cage.positions, LargeSteps(surface.cage.laplacian(), 3.0)
+    found = steps.from_differential(steps.to_differential(points))
+    np.testing.assert_allclose(np.array(found).reshape(-1, 3), points, atol=SINGLE)
+
     steps = LargeSteps(surface.stiffness(), 2.0)
     dense = np.eye(surface.cage.vertex_count) + 2.0 * surface.stiffness().toarray()
     given = np_rng.normal(size=surface.cage.positions.shape)
@@ -74,14 +70,17 @@ def test_a_step_of_one_point_moves_what_is_around(surface):
 
 @pytest.mark.core
 @pytest.mark.parametrize("name", ["laplacian", "bending", "anchor"])
-def test_regularizers_are_quadratic_forms(surface, np_rng, name):
-    regularizer = Regularizer.named(name, surface)
-    points = surface.cage.positions + np_rng.normal(scale=0.1, size=surface.cage.positions.shape)
-    away = points - regularizer.origin
-    product = regularizer.matrix @ away
+def test_regularizers_are_quadratic_forms_of_these_matrices(surface, np_rng, name):
+    cage = surface.cage
+    points = cage.positions + np_rng.normal(scale=0.1, size=cage.positions.shape)
+    away = points - cage.positions if name == "anchor" else points
+    laplacian, count = cage.laplacian(), cage.vertex_count
+    mean_square = laplacian.T @ laplacian / count
+    matrix = {"laplacian": mean_square, "bending": surface.bending(), "anchor": np.eye(count) / count}[name]
+    product = matrix @ away
     flat = upload(mi.Float, points)
     dr.enable_grad(flat)
-    value = device_form(regularizer)(flat)
+    value = regularizer(name, surface)(flat)
     dr.backward(value)
     assert float(np.array(value)[0]) == pytest.approx((away * product).sum() / 2, rel=SINGLE)
     np.testing.assert_allclose(np.array(flat.grad).reshape(-1, 3), product, atol=SINGLE * np.abs(product).max())

@@ -63,20 +63,17 @@ def test_control_points_that_nothing_holds_stay(target):
     assert (fit.control_points[is_held] != start.positions[is_held]).all()
 
 
-def test_refining_moves_nothing(target):
-    fit = PointFit(moved(target.cage), target.sample(300, 1).p)
+def test_refining_moves_nothing_and_tags_stay(target):
+    creased = tagged(target.cage, creases=[(*target.cage.edges[0], 3.0)])
+    points = LimitSurface(creased).sample(300, 1).p
+    found = PointFit(moved(creased), points, refine=[1]).run(2).cage
+    assert found.tags.creases(found.topology)[:, 2].tolist() == [2.0, 2.0]
+    fit = PointFit(moved(target.cage), points)
     before = LimitSurface(fit.cage).tessellate(4).positions
     fit.refine()
     after = LimitSurface(fit.cage).tessellate(2)
     assert LimitSurface(fit.cage).closest_point(before).distance.max() < 1e-12
     assert len(after.positions) == len(before)
-
-
-def test_tags_stay():
-    creased = tagged(torus(6, 5), creases=[(*torus(6, 5).edges[0], 3.0)])
-    points = LimitSurface(creased).sample(300, 1).p
-    found = PointFit(moved(creased), points, refine=[1]).run(2).cage
-    assert found.tags.creases(found.topology)[:, 2].tolist() == [2.0, 2.0]
 
 
 def test_a_mesh_becomes_a_cage(target):
@@ -88,22 +85,16 @@ def test_a_mesh_becomes_a_cage(target):
     assert distance(LimitSurface(found), target) < 2 * triangles / size
 
 
-def test_a_checkpoint_resumes_the_fit(target, tmp_path):
+def test_a_checkpoint_resumes_its_fit_and_no_other(target, tmp_path):
     """The same steps follow, whether or not the fit was interrupted."""
     points = target.sample(300, 1).p
-
-    def made():
-        return PointFit(moved(target.cage), points, refine=[2])
-
-    whole = made().run(5)
-    made().run(3, checkpoint=tmp_path / "fit.npz")
-    resumed = made().resume(tmp_path / "fit.npz").run(2)
+    whole, begun, again = (PointFit(moved(target.cage), points, refine=[2]) for _ in range(3))
+    whole.run(5)
+    begun.run(3, checkpoint=tmp_path / "fit.npz")
+    resumed = again.resume(tmp_path / "fit.npz").run(2)
     assert resumed.losses == whole.losses
     np.testing.assert_array_equal(resumed.control_points, whole.control_points)
 
-
-def test_a_checkpoint_of_another_fit_is_refused(target, tmp_path):
-    points = target.sample(300, 1).p
     PointFit(torus(5, 4), points).run(1, checkpoint=tmp_path / "fit.npz")
     with pytest.raises(ValueError, match='has no "points" of this fit; expected that of a fit with the same arguments'):
         PointFit(target.cage, points).resume(tmp_path / "fit.npz")

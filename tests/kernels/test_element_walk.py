@@ -78,14 +78,21 @@ def test_both_sides_of_an_edge_are_the_same_points(name, np_rng):
 
 
 @EVERY_SURFACE
-def test_carried_there_and_back_is_where_it_was(name, np_rng):
+def test_carried_there_and_back_is_where_it_was_or_at_the_border(name, np_rng):
     """Beyond an edge by as much as inside of it: reflected there, it leads back to the reflected place here."""
     surface, kernel = kernel_of(name)
     domain, elements = surface.scheme.domain, surface.patches.elements
     for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
-        outside = beside(domain, side, along, -BEYOND)
+        inside, outside = (beside(domain, side, along, depth) for depth in (BEYOND, -BEYOND))
+        stayed, unchanged = carried(kernel, locations(kernel.types, half_edge, inside))
+        np.testing.assert_array_equal(stayed, half_edge)
+        np.testing.assert_array_equal(unchanged, inside)
         found, uv = carried(kernel, locations(kernel.types, half_edge, outside))
         assert domain.inside(uv).min() >= 0
+        at_border = ~has_neighbour
+        np.testing.assert_array_equal(found[at_border], half_edge[at_border])
+        assert np.abs(uv - outside)[at_border].max(initial=0) <= 2 * BEYOND
+        assert np.abs(domain.inside(uv[at_border])).max(initial=0) <= ROUNDING
         # The side of the neighbour that it has come in by is the nearest; the place as far beyond that side.
         sides = np.array([beside(domain, k, np.zeros(1), 0)[0] for k in range(domain.corner_count)])
         normals = np.array([beside(domain, k, np.zeros(1), 1)[0] for k in range(domain.corner_count)]) - sides
@@ -93,7 +100,6 @@ def test_carried_there_and_back_is_where_it_was(name, np_rng):
         entered = depths.argmin(axis=1)
         back = uv - 2 * depths[np.arange(len(uv)), entered][:, None] * normals[entered]
         again, there = carried(kernel, locations(kernel.types, found, back))
-        inside = beside(domain, side, along, BEYOND)
         here, expected = (as_seen_from_first(surface, h, x) for h, x in ((again, there), (half_edge, inside)))
         kept = has_neighbour & (elements.face[found] != elements.face[half_edge])
         np.testing.assert_array_equal(here[0][kept], expected[0][kept])
@@ -112,24 +118,6 @@ def as_seen_from_first(surface, half_edge, uv):
     turns = np.where(surface.patches.is_whole[face], half_edge - elements.face_offsets[face], 0)
     turned = np.array([domain.rotation(int(turn))(each) for turn, each in zip(turns, uv, strict=True)])
     return half_edge - turns, turned
-
-
-@EVERY_SURFACE
-def test_what_is_inside_stays_and_what_has_no_neighbour_goes_to_the_border(name, np_rng):
-    surface, kernel = kernel_of(name)
-    domain = surface.scheme.domain
-    for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
-        inside = beside(domain, side, along, BEYOND)
-        found, uv = carried(kernel, locations(kernel.types, half_edge, inside))
-        np.testing.assert_array_equal(found, half_edge)
-        np.testing.assert_array_equal(uv, inside)
-        if has_neighbour.all():
-            continue
-        outside = beside(domain, side, along, -BEYOND)[~has_neighbour]
-        found, uv = carried(kernel, locations(kernel.types, half_edge[~has_neighbour], outside))
-        np.testing.assert_array_equal(found, half_edge[~has_neighbour])
-        assert np.abs(uv - outside).max() <= 2 * BEYOND
-        assert np.abs(domain.inside(uv)).max() <= ROUNDING
 
 
 @EVERY_SURFACE

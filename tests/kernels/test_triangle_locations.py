@@ -10,8 +10,6 @@ pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
 SURFACES = ["torus", "hexagon", "holes", "loop corner", "doo_sabin mixed torus"]
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
-# Even and odd: at odd rates, triangles reach from one corner of a polygon into the next.
-EVERY_RATE = pytest.mark.parametrize("rate", [1, 2, 3, 4])
 # Of a size of about 3; where parameters are rounded, points move along by some units of that.
 POINT = 1e-13
 CHANGED = 1e-12
@@ -24,7 +22,8 @@ def made(name, rate):
 
 
 @EVERY_SURFACE
-@EVERY_RATE
+# Even and odd: at odd rates, triangles reach from one corner of a polygon into the next.
+@pytest.mark.parametrize("rate", [1, 2, 3, 4])
 def test_corners_of_triangles_are_vertices(name, rate):
     surface, kernel, table, locations = made(name, rate)
     types, expected = kernel.types, table.apply(surface.cage.positions)[0]

@@ -58,14 +58,17 @@ def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
     assert abs(measured / expected - 1) < NOISE
 
 
-def test_the_worst_pixel_is_none_that_only_one_image_hits(reference, np_rng):
+def test_the_worst_pixel_is_none_that_only_one_image_hits_and_names_values_and_surface(reference, np_rng):
     """A pixel of the outline is missing, and a normal in the middle is turned."""
     y, x = np.argwhere(dome().hit)[0]
     normal = dome().normal.copy()
     normal[y, x], normal[16, 12] = 0, -normal[16, 12]
     found = compare(reference, with_probe(np_rng, **dome_with("shape", (y, x), NOTHING), normal=normal))
     assert statuses(found)["probe"] == "fail"
-    assert (found.worst.x, found.worst.y) == (12, 16)
+    assert (found.worst.x, found.worst.y, found.worst.shown_by) == (12, 16, "probe")
+    element = dome().element[16, 12]
+    assert f"element {element}, triangle {element} of shape 0, (u, v) = (" in str(found.worst)
+    assert f"{reference.pixels[16, 12, 0]:.6g}" in str(found.worst)
 
 
 def test_evidence_is_of_the_scale_that_is_clearest(reference):
@@ -125,10 +128,6 @@ def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference
     turned = replace(test, probe=replace(test.probe, normal=-test.probe.normal))
     assert statuses(compare(reference, turned)) == {"probe": "fail", "paired": "pass", "tile": "fail"}
     assert statuses(compare(reference, test, ["paired", "tile"]))["tile"] == "fail"
-
-
-def test_one_batch_has_no_variance(reference, np_rng):
-    assert "the test has one batch" in compare(reference, random_image(np_rng, 1)).tier("tile").lines[0]
 
 
 @pytest.mark.parametrize(("side", "factor"), [(4, 1.4), (8, 1.2), (16, 1.08), (SIZE, 1.03)])
@@ -191,11 +190,11 @@ def test_more_scenes_ask_for_more_evidence(reference, np_rng):
     assert limits[1] == pytest.approx(limits[0] / 10, rel=2e-3)
 
 
-@pytest.mark.parametrize(("batches", "is_told"), [(25, False), (26, True)])
-def test_a_reference_needs_16_times_the_samples(reference, np_rng, batches, is_told):
+def test_one_batch_has_no_variance_and_a_reference_needs_16_times_the_samples(reference, np_rng):
     """It has 400 batches."""
-    lines = compare(reference, random_image(np_rng, batches), ["tile"]).tier("tile").lines
-    assert any("the reference has less than 16 times the samples" in line for line in lines) == is_told
+    assert "the test has one batch" in compare(reference, random_image(np_rng, 1)).tier("tile").lines[0]
+    told = [compare(reference, random_image(np_rng, n), ["tile"]).tier("tile").lines for n in (25, 26)]
+    assert ["the reference has less than 16 times the samples" in str(lines) for lines in told] == [False, True]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -230,17 +229,14 @@ def test_probe(reference, np_rng, changes, status, word):
     assert word in found.lines[0]
 
 
-def test_silhouettes_do_not_count(reference, np_rng):
-    """A pixel's normal at the rim of the dome may be any."""
+def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do(reference, np_rng):
+    """A silhouette is each pixel beside one of another shape; the eight neighbours of these do not count either."""
     shape = dome().shape
     rim = np.zeros(shape.shape, dtype=bool)
     rim[:, 1:] |= shape[:, 1:] != shape[:, :-1]
     changed = with_probe(np_rng, **dome_with("normal", rim & (shape == 0), (0, 0, 1)))
     assert compare(reference, changed, ["probe"]).exit_status == 0
 
-
-def test_normals_count_from_the_third_pixel_beside_one_of_another_shape(reference, np_rng):
-    """It and the four pixels beside it are a silhouette, and the eight neighbours of these do not count either."""
     silhouette = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]
     for y, x in np.argwhere(np.ones((7, 7))) - 3:
         normal = dome().normal.copy()
@@ -285,23 +281,16 @@ def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np
     assert 16 <= found.worst.y < 24
 
 
-def test_the_worst_pixel_names_both_values_and_the_surface(reference, np_rng):
-    found = compare(reference, with_probe(np_rng, normal=rotated(1.0)))
-    assert found.worst.shown_by == "probe"
-    assert 12 <= found.worst.x < 20
-    element = dome().element[found.worst.y, found.worst.x]
-    text = str(found.worst)
-    assert f"element {element}, triangle {element} of shape 0, (u, v) = (" in text
-    assert f"{reference.pixels[found.worst.y, found.worst.x, 0]:.6g}" in text
-
-
-def test_paired_difference_fails_and_says_where(reference, np_rng):
+def test_paired_differences_fail_and_say_where_but_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
     paired = reference.paired.copy()
     paired[7, 9, 2] *= 1.001
     found = compare(reference, random_image(np_rng, paired=paired))
     assert statuses(found) == {"probe": "pass", "paired": "fail", "tile": "pass"}
     assert (found.worst.x, found.worst.y) == (9, 7)
     assert found.exit_status == 2
+    rounded = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
+    assert compare(reference, rounded, ["paired"]).exit_status == 0
+    assert compare(reference, rounded, ["paired"], replace(LIMITS, paired_relative=0)).exit_status == 2
 
 
 @pytest.mark.parametrize(("part", "status"), [(0.5, "pass"), (2, "fail")])
@@ -311,12 +300,6 @@ def test_differences_of_dark_pixels_are_relative_to_a_thousandth_of_the_mean(ref
     light[7, 9] = part * LIMITS.paired_relative * 1e-3 * dark.mean()
     images = replace(reference, paired=dark), random_image(np_rng, paired=light)
     assert statuses(compare(*images, ["paired"]))["paired"] == status
-
-
-def test_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
-    test = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
-    assert compare(reference, test, ["paired"]).exit_status == 0
-    assert compare(reference, test, ["paired"], replace(LIMITS, paired_relative=0)).exit_status == 2
 
 
 def test_another_environment_downgrades_to_the_tile_tier(reference, np_rng):
@@ -333,24 +316,21 @@ def test_another_environment_downgrades_to_the_tile_tier(reference, np_rng):
     assert compare(reference, random_image(np_rng, **lacking), ["paired", "probe"]).exit_status == 2
 
 
+SKIPPED = {"paired": "skipped", "tile": "pass"}
+
+
 @pytest.mark.parametrize(
-    ("change", "said"),
-    [({"variant": "scalar_rgb"}, "variant scalar_rgb"), ({"paired": {"seed": 4, "spp": 16}}, "seed 4")],
+    ("change", "expected", "said"),
+    [
+        ({"variant": "scalar_rgb"}, SKIPPED, "variant scalar_rgb"),
+        ({"paired": {"seed": 4, "spp": 16}}, SKIPPED, "seed 4"),
+        ({"files": {"scene.xml": "2"}}, {"paired": "pass"}, "changed since the reference was made: scene.xml"),
+    ],
 )
-def test_other_samples_downgrade_to_the_tile_tier(reference, np_rng, change, said):
+def test_other_samples_downgrade_to_the_tile_tier_and_other_files_are_named(reference, np_rng, change, expected, said):
     found = compare(reference, random_image(np_rng, metadata={**METADATA, **change}), ["paired"])
-    assert statuses(found) == {"paired": "skipped", "tile": "pass"}
+    assert statuses(found) == expected
     assert said in str(found)
-
-
-def test_two_plain_images_are_left_to_flip():
-    assert statuses(compare(Image("a", truth()), Image("b", truth())))["flip"] == "pass"
-    assert compare(Image("a", truth()), Image("b", 1.05 * truth())).exit_status == 2
-
-
-def test_a_changed_file_is_named(reference, np_rng):
-    found = compare(reference, random_image(np_rng, metadata={**METADATA, "files": {"scene.xml": "2"}}))
-    assert "changed since the reference was made: scene.xml" in str(found)
 
 
 UNUSABLE = {
@@ -372,7 +352,7 @@ def test_what_cannot_be_compared_is_said(reference, message, run):
         run(reference)
 
 
-def test_flip_tells_changes_apart_and_refuses_what_it_does_not_see():
+def test_flip_tells_changes_of_plain_images_apart_and_refuses_what_it_does_not_see():
     def flip(test, limits=LIMITS):
         return compare_flip(Image("reference", truth()), Image("test", test), limits)
 
@@ -384,6 +364,9 @@ def test_flip_tells_changes_apart_and_refuses_what_it_does_not_see():
     broken[0, 0] = np.nan
     with pytest.raises(ImageError, match="not finite"):
         flip(broken)
+    # Without samples and geometry, there is no other tier.
+    assert statuses(compare(Image("a", truth()), Image("b", truth())))["flip"] == "pass"
+    assert compare(Image("a", truth()), Image("b", 1.05 * truth())).exit_status == 2
 
 
 def test_a_black_reference_does_not_end_the_process():

@@ -70,13 +70,8 @@ def test_any_file_with_r_g_b_is_a_image(tmp_path):
 HEADER = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
 
-def write_parts(path):
-    with OpenEXR.File([OpenEXR.Part(dict(HEADER), {"RGB": PIXELS}, name) for name in ("a", "b")]) as file:
-        file.write(str(path))
-
-
-def write_metadata(path, text):
-    with OpenEXR.File({**HEADER, METADATA_ATTRIBUTE: text}, {"RGB": PIXELS}) as file:
+def write(path, *content):
+    with OpenEXR.File(*content) as file:
         file.write(str(path))
 
 
@@ -90,15 +85,15 @@ def channels(**changes):
 UNUSABLE = {
     "is not a file": lambda path: None,  # noqa: ARG005
     "not an OpenEXR file": lambda path: path.write_bytes(b"P6 4 2 255 "),
-    "has 2 parts": write_parts,
+    "has 2 parts": lambda path: write(path, [OpenEXR.Part(dict(HEADER), {"RGB": PIXELS}, name) for name in "ab"]),
     "no channels R, G, B; found Y": lambda path: write_channels(path, {"Y": PIXELS[..., 0]}),
-    "no channel G": lambda path: write_channels(path, channels(G=None)),
-    "no channel variance.B": lambda path: write_channels(path, channels(**{"variance.B": None})),
+    "has no channel G; expected R, G, B": lambda path: write_channels(path, channels(G=None)),
+    "has no channel variance.B": lambda path: write_channels(path, channels(**{"variance.B": None})),
     "no channel N": lambda path: write_channels(path, channels(N=None)),
-    "N is 0": lambda path: write_channels(path, channels(N=np.zeros((2, 4), int))),
+    "has pixels without samples .channel N is 0": lambda path: write_channels(path, channels(N=np.zeros((2, 4), int))),
     "without P.Y": lambda path: write_channels(path, channels(**{"P.X": PIXELS[..., 0]})),
-    "schema 2": lambda path: write_exr(path, PIXELS, {"schema": 2}),
-    "not JSON": lambda path: write_metadata(path, "{"),
+    "metadata of schema 2; this version reads schema 1": lambda path: write_exr(path, PIXELS, {"schema": 2}),
+    "not JSON": lambda path: write(path, {**HEADER, METADATA_ATTRIBUTE: "{"}, {"RGB": PIXELS}),
 }
 
 

@@ -69,22 +69,19 @@ def test_merging_by_steps_counts_all_batches_and_keeps_what_only_the_first_pass_
 def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
     first = render_pass(loaded, SAMPLING, 1, 2)
     other = load_scene(SCENE, {"resolution": 16, "rate": 2}, "box")
-    for wrong, message in (
-        (render_pass(loaded, SAMPLING, 1, 3), "has batch 0, which another pass has"),
-        (render_pass(loaded, Sampling(12, 8, seed=6), 2, 2), "seed is 5 and 6"),
-        (render_pass(other, SAMPLING, 2, 2), "rate is "),
+    write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
+    for passes, message in (
+        ([first, render_pass(loaded, SAMPLING, 1, 3)], "has batch 0, which another pass has"),
+        ([first, render_pass(loaded, Sampling(12, 8, seed=6), 2, 2)], "seed is 5 and 6"),
+        ([first, render_pass(other, SAMPLING, 2, 2)], "rate is "),
+        ([first, load_image(tmp_path / "a.exr")], "is no pass"),
+        ([], "no passes"),
     ):
         with pytest.raises(RegressionError, match=message):
-            merge_passes([first, wrong])
-    with pytest.raises(RegressionError, match="no passes"):
-        merge_passes([])
-    write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
-    with pytest.raises(RegressionError, match="is no pass"):
-        merge_passes([first, load_image(tmp_path / "a.exr")])
-    with pytest.raises(RegressionError, match="12 batches, fewer than 13"):
-        SAMPLING.share(1, 13)
-    with pytest.raises(RegressionError, match="no pass 3 of 2"):
-        SAMPLING.share(3, 2)
+            merge_passes(passes)
+    for share, message in (((1, 13), "12 batches, fewer than 13"), ((3, 2), "no pass 3 of 2")):
+        with pytest.raises(RegressionError, match=message):
+            SAMPLING.share(*share)
 
 
 @pytest.mark.core

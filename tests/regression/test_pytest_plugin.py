@@ -67,14 +67,6 @@ def reference(project):
     return project.path / "references" / "ball.exr"
 
 
-def test_a_missing_reference_fails_and_says_how_to_make_it(project):
-    told = "there is no reference*ball.exr*make it with: pytest *::test_ball --render-update"
-    failing(project).stdout.fnmatch_lines([told])
-    assert not reference(project).exists()
-    failing(project, "--render-update")
-    project.runpytest().assert_outcomes(passed=1)
-
-
 def test_the_command_of_a_reference_gives_the_same_bytes(with_reference):
     written = reference(with_reference).read_bytes()
     words = load_image(reference(with_reference)).metadata["command"].split()[1:]
@@ -83,22 +75,22 @@ def test_the_command_of_a_reference_gives_the_same_bytes(with_reference):
     assert reference(with_reference).read_bytes() == written
 
 
-@pytest.mark.parametrize(
-    ("damage", "problem"),
-    [
-        ("truncated", "*ball.exr* is truncated, or damaged; make it with: pytest *"),
-        ("of another size", "*12 x 12 pixels*16 x 16;*"),
-    ],
-)
-def test_update_writes_references_that_cannot_be_used(with_reference, damage, problem):
-    path = reference(with_reference)
-    if damage == "truncated":
-        path.write_bytes(path.read_bytes()[:-100])
-    else:
-        with_reference.makefile(".xml", ball=SCENE.replace('"16"', '"12"'))
-    failing(with_reference).stdout.fnmatch_lines([problem])
-    failing(with_reference, "--render-update")
-    with_reference.runpytest().assert_outcomes(passed=1)
+def test_update_writes_references_that_are_missing_or_damaged_or_of_another_size(project):
+    """What is wrong with them is told, and how to make them."""
+    path = reference(project)
+
+    def update(problem):
+        existed = path.exists()
+        failing(project).stdout.fnmatch_lines([problem])
+        assert path.exists() == existed
+        failing(project, "--render-update")
+        project.runpytest().assert_outcomes(passed=1)
+
+    update("there is no reference*ball.exr*make it with: pytest *::test_ball --render-update")
+    path.write_bytes(path.read_bytes()[:-100])
+    update("*ball.exr* is truncated, or damaged; make it with: pytest *")
+    project.makefile(".xml", ball=SCENE.replace('"16"', '"12"'))
+    update("*12 x 12 pixels*16 x 16;*")
 
 
 def test_a_failure_is_printed_once_and_a_folder_that_is_protected_does_not_hide_it(with_reference):

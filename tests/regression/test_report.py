@@ -85,24 +85,22 @@ def test_the_ends_of_the_scale_are_the_differences_they_say(monkeypatch):
     np.testing.assert_allclose(np.unique(picture.get_array()), picture.get_clim())
 
 
-def test_equal_pictures_are_shown_alike_with_white_for_the_brightest(failed, monkeypatch):
-    panels = drawn(compare(failed.reference, failed.reference), monkeypatch)
+def test_equal_pictures_are_shown_alike_and_a_circle_is_around_the_worst_pixel_of_others(tmp_path, failed, monkeypatch):
+    """With white for the brightest."""
+    same = compare(failed.reference, failed.reference)
+    panels = drawn(same, monkeypatch)
     reference, test = (panels[name].images[0].get_array() for name in ("Reference", "Test"))
     np.testing.assert_array_equal(reference, test)
     is_brightest = failed.reference.pixels.max(axis=2) >= np.percentile(failed.reference.pixels, 99.5)
     assert (np.round(255 * reference[is_brightest].max(axis=1)) == 255).all()
     assert reference.min() < 0.8
-
-
-def test_the_circle_is_around_the_worst_pixel_where_there_is_one(tmp_path, failed, monkeypatch):
-    same = compare(failed.reference, failed.reference)
     for comparison, centre in ((failed, [(failed.worst.x, failed.worst.y)]), (same, [])):
         axes = drawn(comparison, monkeypatch)["Reference"]
         assert [patch.center for patch in axes.patches] == centre
         assert ("Dashed circle: worst pixel" in write_report(tmp_path, comparison).read_text()) == bool(centre)
 
 
-def test_the_picture_has_every_panel_and_colours_reach_what_they_say(failed, monkeypatch):
+def test_the_picture_has_every_panel_with_colours_and_outlines_of_what_they_say(failed, monkeypatch):
     panels = drawn(failed, monkeypatch)
     assert list(panels) == PANELS
     evidence, angle = (panels[name].images[0] for name in ("Evidence against noise", "Angle between normals"))
@@ -110,10 +108,7 @@ def test_the_picture_has_every_panel_and_colours_reach_what_they_say(failed, mon
     np.testing.assert_allclose(angle.norm([1e-5, 1e-2, 10]), [0, 0.5, 1])
     # Silhouettes are grey.
     np.testing.assert_allclose(angle.to_rgba(np.ma.masked_invalid([np.nan]))[0], [0.55, 0.55, 0.55, 1])
-
-
-def test_tiles_that_fail_are_outlined(failed, monkeypatch):
-    panels = drawn(failed, monkeypatch)
+    # Tiles that fail are outlined.
     tiles = {(x["x"] - 0.5, x["y"] - 0.5, x["width"], x["height"]) for x in failed.tier("tile").numbers["failing"]}
     for name, expected in (("z-score", tiles), ("Evidence against noise", tiles), ("FLIP", set())):
         boxes = [patch for patch in panels[name].patches if isinstance(patch, Rectangle)]

@@ -1,10 +1,13 @@
-"""Loading scenes, and what is left when that fails."""
+"""Loading scenes, what is left when that fails, and the environment: processors that add in other orders are named."""
 
 import subprocess
 import sys
+from pathlib import Path
+from unittest.mock import Mock
 
 import mitsuba as mi
 import pytest
+from mitsuba_subdivision.regression import scene as scenes
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
 
@@ -38,15 +41,48 @@ def test_rendering_works_after_errors_that_are_kept(variant_llvm_ad_rgb):  # noq
 @pytest.mark.usefixtures("variant_scalar_rgb")
 def test_instances_load_in_order(monkeypatch):
     """At once, they have kernels of their own in every process."""
-    instantiate, is_parallel = mi.parser.instantiate, []
-    monkeypatch.setattr(
-        mi.parser,
-        "instantiate",
-        lambda config, state: is_parallel.append(config.parallel) or instantiate(config, state),
-    )
+    monkeypatch.setattr(mi.parser, "instantiate", instantiate := Mock(wraps=mi.parser.instantiate))
     group = {"type": "shapegroup", "ball": {"type": "sphere"}}
     placed = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     scene = {"type": "scene", "sensor": {"type": "perspective"}, "group": group}
     load_scene(scene)
     load_scene({**scene, "placed": placed})
-    assert is_parallel == [True, False]
+    assert [call.args[0].parallel for call in instantiate.call_args_list] == [True, False]
+
+
+EPYC = """processor\t: 0
+vendor_id\t: AuthenticAMD
+cpu family\t: {family}
+model\t\t: {model}
+model name\t: AMD EPYC
+flags\t\t: fpu vme
+
+processor\t: 1
+model name\t: another one
+"""
+ARM = """processor\t: 0
+BogoMIPS\t: 243.75
+CPU implementer\t: 0x41
+CPU architecture: 8
+CPU part\t: 0xd40
+
+processor\t: 1
+"""
+
+
+def test_processors_of_one_name_are_told_apart_and_those_without_have_numbers():
+    assert scenes._first_of(EPYC.format(family=26, model=2)) == "AMD EPYC, cpu family 26, model 2"
+    assert scenes._first_of(EPYC.format(family=25, model=1)) == "AMD EPYC, cpu family 25, model 1"
+    assert scenes._first_of(ARM) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
+    # A list of another form gives nothing.
+    assert scenes._first_of("") == ""
+    assert scenes._first_of("no colon\n") == ""
+
+
+def test_this_processor_has_a_name():
+    found = scenes.environment("scalar_rgb")["processor"]
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        assert found == scenes._first_of(information.read_text(encoding="utf-8", errors="replace"))
+    else:
+        assert found
