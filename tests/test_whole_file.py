@@ -44,44 +44,40 @@ def kill(writer):
     writer.stdout.close()
 
 
-def write(path, text="new"):
+def write(path, text="new", then=lambda: None):
     with whole_file(path) as beside:
         beside.write_text(text)
+        then()
 
 
 def names(folder):
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path):
+@pytest.mark.parametrize("before", [[], ["a.txt"]])
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (lambda _: KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+        (lambda beside: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(beside)), OSError, r"a\.txt"),
+        (lambda beside: RuntimeError(f'cannot write "{beside}"'), OSError, r"a\.txt"),
+    ],
+)
+def test_a_failed_write_leaves_what_was_there_and_names_its_own_file(tmp_path, before, error, kind, message):
     path = tmp_path / "a.txt"
-    path.write_text("old")
-
-    def half():
-        with whole_file(path) as beside:
-            beside.write_text("ne")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        half()
-    assert path.read_text() == "old"
-    assert names(tmp_path) == ["a.txt"]
-
-
-@pytest.mark.parametrize("kind", [OSError, RuntimeError])
-def test_errors_name_the_file_and_not_the_one_beside(tmp_path, kind):
-    path = tmp_path / "a.txt"
+    for name in before:
+        (tmp_path / name).write_text("old")
 
     def fail():
         with whole_file(path) as beside:
-            if kind is OSError:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(beside))
-            raise RuntimeError(f'cannot write "{beside}"')
+            beside.write_text("ne")
+            raise error(beside)
 
-    with pytest.raises(OSError, match=r"a\.txt") as found:
+    with pytest.raises(kind, match=message) as found:
         fail()
     assert ".part" not in str(found.value)
-    assert names(tmp_path) == []
+    assert names(tmp_path) == before
+    assert [(tmp_path / name).read_text() for name in before] == ["old"] * len(before)
 
 
 @pytest.mark.posix
@@ -103,9 +99,8 @@ def test_a_killed_writer_leaves_a_whole_file_or_none(tmp_path, np_rng):
 def test_two_processes_write_one_file_without_mixing(tmp_path):
     path = tmp_path / "a.bin"
     writers = [start_writer(path, letter) for letter in "xy"]
+    seen, deadline = set(), time.monotonic() + 30
     try:
-        seen = set()
-        deadline = time.monotonic() + 30
         while seen != {b"x", b"y"} and time.monotonic() < deadline:
             if path.exists():
                 found = path.read_bytes()
@@ -128,21 +123,13 @@ def test_threads_write_one_file_without_mixing(tmp_path):
 
 
 def test_what_a_living_process_writes_stays(tmp_path):
-    with whole_file(tmp_path / "a.txt") as beside:
-        beside.write_text("a")
-        write(tmp_path / "b.txt")
-        assert beside.exists()
+    write(tmp_path / "a.txt", then=lambda: write(tmp_path / "b.txt"))
     assert names(tmp_path) == ["a.txt", "b.txt"]
 
 
 def test_a_process_that_ends_in_the_midst_takes_its_files_with_it(tmp_path):
-    def end():
-        with whole_file(tmp_path / "a.txt") as beside:
-            beside.write_text("a")
-            remove_unfinished()
-
     with pytest.raises(FileNotFoundError):
-        end()
+        write(tmp_path / "a.txt", then=remove_unfinished)
     assert names(tmp_path) == []
 
 

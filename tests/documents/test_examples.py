@@ -156,9 +156,9 @@ def folder(tmp_path, monkeypatch):
 
 def run_python(block, names):
     """Run a block of Python in a namespace; errors name the page's line."""
-    text = block.text
     if block.is_left_out:
         return
+    text = block.text
     replaced = re.fullmatch(r'in the tests: "(.+)" is "(.+)"', block.mark)
     if replaced:
         assert replaced[1] in text, block
@@ -173,25 +173,7 @@ def run_as_tests(block, folder):
     command = [sys.executable, "-c", PYTEST_TWICE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.count("1 passed") == 2, done.stdout + done.stderr
-    assert list((folder / "renders" / "references").iterdir()) == [folder / "renders" / "references" / "my_scene.exr"]
-
-
-def load_scene(block, folder):
-    """Load a block as a scene, and see that it has a subdivision surface."""
-    path = folder / "example.xml"
-    path.write_text(block.text)
-    shapes = mi.load_file(str(path)).shapes()
-    assert [type(shape).__name__ for shape in shapes] == ["Subdivision"], block
-
-
-def installation(words):
-    """What ``pip install`` installs: packages by name, and extras that there are."""
-    wanted = [word for word in words if not word.startswith("-")]
-    assert wanted
-    for word in wanted:
-        name, _, extras = re.fullmatch(r"([\w.-]+)(\[([\w,]+)\])?", word).groups(default="")
-        assert name in (".", OURS, "build", "twine"), word
-        assert set(filter(None, extras.split(","))) <= set(EXTRAS), word
+    assert os.listdir(folder / "renders" / "references") == ["my_scene.exr"]
 
 
 def requirements(extra):
@@ -222,7 +204,12 @@ def module(words):
     name, *arguments = words
     if name == "pip":
         assert arguments[0] == "install"
-        installation(arguments[1:])
+        wanted = [word for word in arguments[1:] if not word.startswith("-")]
+        assert wanted
+        for word in wanted:
+            package, _, extras = re.fullmatch(r"([\w.-]+)(\[([\w,]+)\])?", word).groups(default="")
+            assert package in (".", OURS, "build", "twine"), word
+            assert set(filter(None, extras.split(","))) <= set(EXTRAS), word
     elif name == "pytest":
         values = dict(itertools.pairwise(arguments))
         assert values.get("-m", MARKERS[0]) in MARKERS
@@ -230,7 +217,7 @@ def module(words):
         paths = [word for word in arguments if word.startswith("tests/")]
         assert [path for path in paths if not (ROOT / path).exists()] == []
     elif name == "sphinx":
-        assert "numpydoc" in requirements("docs")
+        assert "numpydoc" in requirements("dev")
         assert (ROOT / arguments[-2] / "conf.py").is_file()
     else:
         assert name in ("venv", "build", "twine"), words
@@ -278,7 +265,9 @@ def run_blocks(page, folder):
         elif block.language == "python":
             run_python(block, names)
         elif block.language == "xml":
-            load_scene(block, folder)
+            (folder / "example.xml").write_text(block.text)
+            shapes = mi.load_file(str(folder / "example.xml")).shapes()
+            assert [type(shape).__name__ for shape in shapes] == ["Subdivision"], block
         elif block.language == "sh":
             scripts += run_commands(block)
         else:
@@ -295,10 +284,9 @@ def test_every_example_of_a_page_runs(page, folder):
     written = {path.name for path in folder.rglob("*") if path.is_file()}
     assert written >= WRITTEN.get(page.stem, set())
     if page.stem == "parameters":
-        # The optimisation has found the size.
+        # One optimisation has found the size, the other the colours.
         points = np.array(mi.traverse(names["scene"])[names["key"]])
         assert 1.15 < np.linalg.norm(points) / np.linalg.norm(np.array(names["start"])) < 1.25
-        # And the other the colours.
         assert names["error"] < 0.03
 
 

@@ -118,19 +118,18 @@ def long_description():
 
 def targets(text):
     text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
-    return re.findall(r'\]\(([^)]+)\)|src="([^"]+)"', text)
+    return list(map("".join, re.findall(r'\]\(([^)]+)\)|src="([^"]+)"', text)))
 
 
 @pytest.mark.parametrize("repository", [None, REPOSITORY])
 def test_links_of_the_long_description_work_on_a_package_index(long_description, repository):
     readme = read("README.md")
     text = long_description(readme, repository, "v1.2.3")
-    found = ["".join(pair) for pair in targets(text)]
+    found = targets(text)
     assert found
     assert [target for target in found if not target.startswith("https://")] == []
     paths = set(re.findall(rf"^{REPOSITORY}/(?:blob|raw)/v1\.2\.3/([^#\n]+)", "\n".join(found), flags=re.MULTILINE))
-    relative = {"".join(pair).partition("#")[0] for pair in targets(readme)}
-    relative = {path for path in relative if not path.startswith("https:")}
+    relative = {target.partition("#")[0] for target in targets(readme) if not target.startswith("https:")}
     assert paths == (relative if repository else set())
     # All else is as it was.
     assert re.findall(r"```.*?```", text, flags=re.DOTALL) == re.findall(r"```.*?```", readme, flags=re.DOTALL)
@@ -171,9 +170,8 @@ def commands(tmp_path):
 
 @pytest.mark.posix
 def test_the_checks_say_which_programs_are_missing(commands):
-    lacking_one = "case $2 in libosd-dev) exit 1 ;; esac"
-    failing = "echo no network >&2; exit 100"
-    done = commands(dpkg=lacking_one, id="echo 0", apt_get=failing, chromium="exit 0")
+    programs = {"dpkg": "case $2 in libosd-dev) exit 1 ;; esac", "apt_get": "echo no network >&2; exit 100"}
+    done = commands(id="echo 0", chromium="exit 0", **programs)
     assert done.returncode == 0
     assert "no network" in done.stderr
     assert "missing: libosd-dev. Tests against OpenSubdiv and Embree" in done.stderr
@@ -199,8 +197,7 @@ def test_checks_before_a_commit_are_those_of_the_script():
 @pytest.mark.parametrize("path", sorted((GITHUB / "ISSUE_TEMPLATE").glob("[!c]*.yml")), ids=lambda path: path.stem)
 def test_an_issue_form_asks_for_something(path):
     form = yaml.safe_load(path.read_text(encoding="utf-8"))
-    assert form["name"]
-    assert form["description"]
+    assert all((form["name"], form["description"]))
     fields = [field for field in form["body"] if field["type"] != "markdown"]
     assert any(field.get("validations", {}).get("required") for field in fields)
     assert len({field["id"] for field in fields}) == len(fields)

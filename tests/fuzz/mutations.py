@@ -59,8 +59,7 @@ def _long_word(content: bytes, random: Random) -> bytes:
 
 
 def _swapped_words(content: bytes, random: Random) -> bytes:
-    spans = sorted((_any(_TOKEN, content, random), _any(_TOKEN, content, random)))
-    (a, b), (c, d) = spans
+    (a, b), (c, d) = sorted((_any(_TOKEN, content, random), _any(_TOKEN, content, random)))
     return content[:a] + content[c:d] + content[b:c] + content[a:b] + content[d:] if b <= c else content
 
 
@@ -77,8 +76,7 @@ def _flipped_bits(content: bytes, random: Random) -> bytes:
 
 
 def _random_bytes(content: bytes, random: Random) -> bytes:
-    start = random.randint(0, len(content))
-    count = random.choice((1, 2, 4, 8, 30))
+    start, count = random.randint(0, len(content)), random.choice((1, 2, 4, 8, 30))
     return _put(content, (start, start + random.choice((0, count))), random.randbytes(count))
 
 

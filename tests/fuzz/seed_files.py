@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from mitsuba_subdivision.cage import Attribute, ControlCage
+from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import cube
 from reference.refined_cages import tagged
 
@@ -156,47 +156,36 @@ WORDS = {
 }  # fmt: skip
 
 
+# With every end of a line. Of USD files, texts only: the library trusts the sizes that its binary files announce.
+_LITERAL = {
+    "obj": [_OBJ.replace(b"\n", end) for end in (b"\n", b"\r\n")],
+    "ply": [_PLY.replace(b"\n", end) for end in (b"\n", b"\r\n", b"\r")],
+    "usd": [_USD, _USD_ARCS],
+}
+
+
 @cache
 def seed_files(reader: str) -> list[tuple[str, bytes]]:
     """Suffix and content of each valid file of a kind: obj, ply or usd."""
-    return [*_literal(reader), *_written(reader)]
+    suffix = ".usda" if reader == "usd" else f".{reader}"
+    return [(suffix, content) for content in (*_LITERAL[reader], *_written(reader, suffix))]
 
 
-def _literal(reader: str) -> Iterator[tuple[str, bytes]]:
-    if reader == "obj":
-        yield from ((".obj", _OBJ.replace(b"\n", end)) for end in (b"\n", b"\r\n"))
-    elif reader == "ply":
-        yield from ((".ply", _PLY.replace(b"\n", end)) for end in (b"\n", b"\r\n", b"\r"))
-    else:
-        # The USD library trusts the sizes that its binary files announce.
-        yield from ((".usda", text) for text in (_USD, _USD_ARCS))
-
-
-def _written(reader: str) -> Iterator[tuple[str, bytes]]:
-    """What the package itself writes."""
+def _written(reader: str, suffix: str) -> Iterator[bytes]:
+    """What the package itself writes, of PLY files with the bytes of numbers in both orders."""
     options = {}
     if reader != "ply":
         uv = Attribute(np.arange(48.0).reshape(24, 2), "face_varying")
         options = {"creases": [(0, 1, 2.5), (1, 3, 10)], "texcoords": uv}
     if reader != "obj":
         options["attributes"] = {"color": Attribute(cube().positions * 0.5 + 0.5)}
-    for cage in (cube(), tagged(cube(), **options)):
-        suffix = {"usd": ".usda"}.get(reader, f".{reader}")
-        yield from _saved(cage.save, suffix)
-        if reader == "ply":
-            yield from _saved(lambda path, cage=cage: _save_big_endian(cage, path), suffix)
-
-
-def _save_big_endian(cage: ControlCage, path: str) -> None:
-    from plyfile import PlyData
-
-    cage.save(path)
-    data = PlyData.read(path, mmap=False)
-    PlyData(data.elements, byte_order=">").write(path)
-
-
-def _saved(save, suffix: str) -> Iterator[tuple[str, bytes]]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"seed{suffix}"
-        save(str(path))
-        yield suffix, path.read_bytes()
+        for cage in (cube(), tagged(cube(), **options)):
+            cage.save(path)
+            yield path.read_bytes()
+            if reader == "ply":
+                from plyfile import PlyData
+
+                PlyData(PlyData.read(path, mmap=False).elements, byte_order=">").write(path)
+                yield path.read_bytes()

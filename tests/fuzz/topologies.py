@@ -51,6 +51,14 @@ def edges_of(face):
     return list(zip(face, (*face[1:], face[0]), strict=True))
 
 
+def vertices_of(faces):
+    return sorted({v for face in faces for v in face})
+
+
+def new_vertex(faces):
+    return 1 + max(vertices_of(faces))
+
+
 def is_manifold(faces):
     """Whether no edge has two faces on one side, and the faces around every vertex are one fan."""
     directed = [edge for face in faces for edge in edges_of(face)]
@@ -71,7 +79,7 @@ def is_manifold(faces):
 
 def numbered(faces):
     """The same faces with vertices from 0 on."""
-    number = {vertex: i for i, vertex in enumerate(sorted({v for face in faces for v in face}))}
+    number = {vertex: i for i, vertex in enumerate(vertices_of(faces))}
     return [tuple(number[v] for v in face) for face in faces]
 
 
@@ -99,15 +107,14 @@ def glued(rng):
 def poked(faces, rng):
     """A face made triangles around its middle."""
     place = int(rng.integers(len(faces)))
-    middle = 1 + max(v for face in faces for v in face)
-    return faces[:place] + faces[place + 1 :] + [(a, b, middle) for a, b in edges_of(faces[place])]
+    return faces[:place] + faces[place + 1 :] + [(*edge, new_vertex(faces)) for edge in edges_of(faces[place])]
 
 
 def with_halved_edge(faces, rng):
     """An edge with a vertex in its middle, of valence 2."""
     face = faces[rng.integers(len(faces))]
     a, b = edges_of(face)[rng.integers(len(face))]
-    middle = 1 + max(v for face in faces for v in face)
+    middle = new_vertex(faces)
 
     def halved(edge):
         return (edge[0], middle) if {*edge} == {a, b} else edge[:1]
@@ -154,8 +161,7 @@ def without_face(faces, rng):
 
 
 def with_vertices_identified(faces, rng):
-    vertices = sorted({v for face in faces for v in face})
-    a, b = rng.choice(vertices, 2, replace=False)
+    a, b = rng.choice(vertices_of(faces), 2, replace=False)
     return identified(faces, int(a), int(b))
 
 
@@ -168,11 +174,10 @@ def doubled(faces):
     faces = numbered(faces)
     directed = {edge for face in faces for edge in edges_of(face)}
     border = {v for a, b in directed if (b, a) not in directed for v in (a, b)}
-    count = 1 + max(v for face in faces for v in face)
+    count = new_vertex(faces)
     copied = [tuple(v if v in border else v + count for v in face[::-1]) for face in faces]
     origin = {v: v % count for face in faces + copied for v in face}
-    both = faces + copied
-    return numbered(both), [origin[v] for v in sorted(origin)]
+    return numbered(faces + copied), [origin[v] for v in sorted(origin)]
 
 
 def triangulated(faces):
@@ -187,7 +192,7 @@ def random_topology(rng):
         if changed and is_manifold(changed) and max(map(len, changed)) <= MOST_CORNERS and len(changed) <= MOST_FACES:
             faces = changed
     faces = numbered(faces)
-    origin = list(range(1 + max(v for face in faces for v in face)))
+    origin = list(range(new_vertex(faces)))
     if rng.random() < 0.2:
         both, copy_of = doubled(faces)
         if is_manifold(both):
@@ -224,14 +229,13 @@ def random_tags(faces, rng):
     if rng.random() < 0.6:
         return {}
     edges = sorted({tuple(sorted(edge)) for face in faces for edge in edges_of(face)})
-    vertices = sorted({v for face in faces for v in face})
 
     def sharpness():
         return float("inf") if rng.random() < 0.6 else float(rng.choice([0.3, 0.5, 1.0, 1.5, 2.25]))
 
     share = rng.choice([0.1, 0.4, 1.0], p=[0.6, 0.3, 0.1])
     creases = [(*edge, sharpness()) for edge in edges if rng.random() < share]
-    corners = [(v, sharpness()) for v in vertices if rng.random() < 0.1]
+    corners = [(v, sharpness()) for v in vertices_of(faces) if rng.random() < 0.1]
     return {"creases": creases, "corners": corners, "crease_method": "chaikin" if rng.random() < 0.3 else "uniform"}
 
 
@@ -253,26 +257,15 @@ def random_cage(rng):
 
 @dataclass(frozen=True)
 class Differences:
-    """What a cage's surface and that of its refined cage differ by, at some samples.
-
-    Attributes
-    ----------
-    point : float
-    normal : float
-        The largest angle in radians, over what is allowed of it.
-    zero, unit : int
-        How many normals are exactly zero, and how many are of unit length. The others are wrong.
-    count : int
-    unlike : int
-        Samples at which one normal is zero and the other is not, though tangents are far from parallel.
-    """
+    """What a cage's surface and that of its refined cage differ by, at some samples."""
 
     point: float
-    normal: float
+    normal: float  # The largest angle in radians, over what is allowed of it.
+    # How many normals are exactly zero, and how many are of unit length, of all. The others are wrong.
     zero: int
     unit: int
     count: int
-    unlike: int
+    unlike: int  # Samples at which one normal is zero and the other is not, though tangents are far from parallel.
 
     @property
     def problem(self):
@@ -293,12 +286,10 @@ def some_samples(surface, rng, count):
 
     At three corners only: each new one-ring takes longer than many samples.
     """
-    elements = surface.patches.elements
-    corner = rng.choice(rng.integers(0, elements.half_edge_count, 3), count)
-    domain = surface.scheme.domain
+    corner = rng.choice(rng.integers(0, surface.patches.elements.half_edge_count, 3), count)
     uv = rng.random((count, 2))
     uv[rng.random(count) < 0.2, rng.integers(2)] = 0
-    if domain.corner_count == 3:
+    if surface.scheme.domain.corner_count == 3:
         uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
     uv *= 0.5 ** rng.choice([0, 0, 1, 3, 8], (count, 1))
     uv[rng.random(count) < 0.2] = 0
@@ -316,11 +307,10 @@ def evaluate_at(surface, half_edge, uv):
 def is_convention(surface, half_edge, found):
     """Whether each normal is one of the conventions that depend on the level: at tips of sharp vertices."""
     t = surface.patches.topology
-    vertex = t.face_vertices[half_edge]
     sharp = t.vertex_rules == VertexRule.CORNER
     if t.semi_sharpness is not None:
         sharp |= t.semi_sharpness.vertices > 0
-    return (found.level == AT_EXTRAORDINARY_POINT) & sharp[vertex]
+    return (found.level == AT_EXTRAORDINARY_POINT) & sharp[t.face_vertices[half_edge]]
 
 
 def differences_to_refined(surface, rng, count=24):
@@ -374,8 +364,7 @@ def outcome(seed):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CageWarning)
         try:
-            cage, scheme = random_cage(rng)
-            surface = LimitSurface(cage, scheme)
+            surface = LimitSurface(*random_cage(rng))
         except CageError:
             return "refused as a cage", None
         except SchemeError:
@@ -392,8 +381,7 @@ def main():
     parser.add_argument("--count", type=int, default=1000, help="cages to try")
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
     arguments = parser.parse_args()
-    counts, zeros, begin = Counter(), 0, time.monotonic()
-    worst = [0.0, 0.0]
+    counts, zeros, worst, begin = Counter(), 0, [0.0, 0.0], time.monotonic()
     for seed in range(arguments.first, arguments.first + arguments.count):
         try:
             result, found = outcome(seed)

@@ -7,6 +7,11 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.device_arrays import upload
 
+# Standard errors of means of six that are allowed; seeds are fixed.
+ERRORS = 4
+# A standard error beside the value, or beside what scaling changes: else agreement would mean nothing.
+MEANS_SOMETHING = 0.03
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -32,15 +37,7 @@ class Estimate:
 
 
 class Pictures:
-    """Renders of a scene whose parameters move along a direction by so many steps.
-
-    Parameters
-    ----------
-    scene : Scene
-    start, along : dict of str to flat array
-        Values of parameters, and how they change with the step.
-    spp, seeds : int
-    """
+    """Renders of a scene whose parameters move: ``start`` has their values, ``along`` how they change with the step."""
 
     def __init__(self, scene, start, along, spp, seeds=6):
         self.scene, self.parameters = scene, mi.traverse(scene)
@@ -76,10 +73,7 @@ class Pictures:
 def gradients(scene, key, spp, seeds=6, kept=()):
     """``(seeds, n, 3)`` gradients of the mean by flat points, one for each seed.
 
-    Parameters
-    ----------
-    kept : sequence of str
-        Parameters that are assigned as well, unchanged: Mitsuba's own meshes make new normals when only positions are.
+    Parameters that are ``kept`` are assigned as well: Mitsuba's own meshes make new normals when only positions are.
     """
     parameters = mi.traverse(scene)
     start, found = mi.Float(parameters[key]), []

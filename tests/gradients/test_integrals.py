@@ -36,27 +36,18 @@ def surface(request):
 
 @pytest.fixture
 def types():
-    problem = llvm_problem()
-    if problem:
+    if problem := llvm_problem():
         pytest.skip(problem)
     return ArrayTypes.of(sys.modules["drjit.llvm.ad"].Float64)
 
 
-def symmetric(products):
-    """Matrix of the second moments."""
-    matrix = np.empty((3, 3))
-    for value, (i, j) in zip(products, solids.PAIRS, strict=True):
-        matrix[i, j] = matrix[j, i] = value
-    return matrix
-
-
 def expected_of(linear, shift, volume, first, second):
     """Derivatives of volume and moments by an affine motion of everything, a field ``linear x + shift``."""
-    growth, matrix = np.trace(linear), symmetric(second)
+    growth, matrix, (i, j) = np.trace(linear), np.empty((3, 3)), np.transpose(solids.PAIRS)
+    matrix[i, j] = matrix[j, i] = second
     change = linear @ matrix + np.outer(shift, first)
     change = change + change.T + growth * matrix
-    of_first, of_second = linear @ first + shift * volume + growth * first, [change[i, j] for i, j in solids.PAIRS]
-    return np.concatenate([growth * volume, of_first, of_second])
+    return np.concatenate([growth * volume, linear @ first + shift * volume + growth * first, change[i, j]])
 
 
 AFFINE = {
@@ -78,16 +69,15 @@ def test_affine_motions_change_volume_and_moments_as_they_must(surface):
 
 
 def test_scaling_turning_and_shifting_change_the_area_as_they_must(surface):
-    gradient, positions = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions, surface.cage.positions
-    area = surface.area()
+    positions, area = surface.cage.positions, surface.area()
+    gradient = surface.stiffness(solids.STIFFNESS_ORDER) @ positions
     assert abs((gradient * positions).sum() - 2 * area) <= AREA * area
     assert np.abs(gradient.sum(axis=0)).max() <= ROUNDING * area
     assert np.abs(np.cross(positions, gradient).sum(axis=0)).max() <= ROUNDING * area
 
 
 def test_hadamards_formula_is_the_derivative_of_volume_and_moments(surface):
-    positions = surface.cage.positions
-    direction = motions(surface)["all"]
+    positions, direction = surface.cage.positions, motions(surface)["all"]
     (found,) = solids.derivatives_of_surface(surface, [direction])
 
     def integrals(step):
@@ -122,13 +112,11 @@ def test_gradients_of_triangles_converge_to_those_of_the_surface(surface, types)
 def test_the_derivative_of_volume_by_the_placement_is_that_of_the_determinant(surface, types, np_rng):
     table = surface.sampling(2)
     matrix = np.eye(4) + np.vstack([np_rng.uniform(-0.2, 0.2, (3, 4)), np.zeros(4)])
-    arrays = sys.modules["drjit.llvm.ad"]
-    to_world = arrays.Matrix4f64(matrix)
+    to_world = sys.modules["drjit.llvm.ad"].Matrix4f64(matrix)
     dr.enable_grad(to_world)
     vertices = VertexKernel(table, types.float)(types.floats(surface.cage.positions.ravel()))
     positions, _ = placed(*vertices, to_world, types.vector3)
-    found = solids.of_triangles(types, positions, table.triangles)
-    volume = found["volume"][0]
+    volume = solids.of_triangles(types, positions, table.triangles)["volume"][0]
     dr.backward(volume)
     gradient, volume = np.array(dr.grad(to_world)).reshape(4, 4), np.array(volume).item()
     expected = np.zeros((4, 4))
@@ -150,10 +138,10 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     right = (positions[:, :1] == 4) * np.array([1.0, 0, 0])
     fields = ((inner, 0), (upwards, 0), (stretch, 12), (shear, 0), (right, 3))
     exact = surface.stiffness(solids.STIFFNESS_ORDER) @ positions
-    kernel, table = VertexKernel(surface.sampling(3), types.float), surface.sampling(3)
-    points = types.floats(positions.ravel())
+    table, points = surface.sampling(3), types.floats(positions.ravel())
     dr.enable_grad(points)
-    dr.backward(solids.of_triangles(types, kernel(points)[0], table.triangles)["area"][0])
+    vertices, _ = VertexKernel(table, types.float)(points)
+    dr.backward(solids.of_triangles(types, vertices, table.triangles)["area"][0])
     found = np.array(dr.grad(points)).reshape(-1, 3)
     for gradient, tolerance in ((exact, AREA), (found, ROUNDING)):
         for field, expected in fields:

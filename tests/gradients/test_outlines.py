@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradients.estimates import Estimate, Pictures, along, gradients
+from gradients.estimates import ERRORS, MEANS_SOMETHING, Estimate, Pictures, along, gradients
 from gradients.outlines import RATE, SURFACES, change, covered, properties
 from gradients.scenes import POINTS, outline
 from gradients.surfaces import motions
@@ -14,10 +14,6 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
 SAMPLES = 64
-# Standard errors of means of six that are allowed; seeds are fixed.
-ERRORS = 4
-# A standard error beside the value, or beside what scaling changes: else agreement would mean nothing.
-MEANS_SOMETHING = 0.03
 # Differences of areas are of second order in the step, and scan lines have some distance.
 LINES = 1e-3
 # Threads add what samples give in any order, in single precision.

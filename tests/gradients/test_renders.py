@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradients.estimates import Pictures
+from gradients.estimates import ERRORS, MEANS_SOMETHING, Pictures
 from gradients.scenes import POINTS, inside, textured_cube, tilt
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
@@ -13,10 +13,6 @@ exact = pytest.mark.skipif(bool(hook_problem()), reason=str(hook_problem()))
 
 # More where what gradients leave out is to be seen.
 SAMPLES, SAMPLES_OF_SHADOWS, STEP = 128, 256, 5e-3
-# Standard errors of means of six that are allowed; seeds are fixed.
-ERRORS = 4
-# A standard error beside the value: else agreement would mean nothing.
-MEANS_SOMETHING = 0.03
 # Differences have an error of second order in the step, and the sky and the texture have kinks.
 BENT = 2e-3
 # Forward and reverse derivatives of the same samples, summed in another order in float32.

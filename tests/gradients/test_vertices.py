@@ -24,11 +24,10 @@ MATRIX = np.array([[1.1, 0.2, -0.3, 4], [0.1, 0.9, 0.25, -5], [-0.2, 0.3, 1.2, 6
 
 
 def table_of(surface, tessellation):
-    return surface.sampling(3) if tessellation == "uniform" else surface.adaptive_sampling(adaptive(surface), 16)
-
-
-def adaptive(surface):
-    return Criterion(Measure.CHORD, CHORD * np.ptp(surface.cage.positions, axis=0).max())
+    if tessellation == "uniform":
+        return surface.sampling(3)
+    chord = CHORD * np.ptp(surface.cage.positions, axis=0).max()
+    return surface.adaptive_sampling(Criterion(Measure.CHORD, chord), 16)
 
 
 def on_host(table, positions, matrix):
@@ -54,8 +53,7 @@ def extrapolated(function):
 def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rng):
     arrays = sys.modules["drjit.llvm.ad"]
     surface, start = ALL[name](), MATRIX @ np.diag([mirror, 1, 1, 1])
-    table = table_of(surface, tessellation)
-    positions = surface.cage.positions
+    table, positions = table_of(surface, tessellation), surface.cage.positions
     kernel = VertexKernel(table, arrays.Float64)
 
     def vertices(points, matrix):
@@ -74,8 +72,7 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     points, matrix = given()
     dr.set_grad(points, arrays.Float64(move.ravel()))
     dr.set_grad(matrix, arrays.Matrix4f64(turn))
-    found = vertices(points, matrix)
-    dr.forward_to(*found)
+    dr.forward_to(*(found := vertices(points, matrix)))
     forward = [np.array(dr.grad(each)).reshape(-1, 3) for each in found]
     for derivative, difference in zip(forward, expected, strict=True):
         assert np.abs(derivative - difference).max() <= DIFFERENCES * np.abs(difference).max()

@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from .peers import PeerCage
 
@@ -18,6 +20,20 @@ def bumpy(cage: PeerCage, seed: int = 1) -> PeerCage:
     """The cage with its vertices moved by a tenth, so that no symmetry hides an error."""
     positions = np.array(cage.positions, dtype=float)
     return replace(cage, positions=positions + np.random.default_rng(seed).uniform(-0.1, 0.1, positions.shape))
+
+
+def circle(count: int) -> np.ndarray:
+    """Points around the origin, counter-clockwise from (1, 0, 0)."""
+    turn = 2 * np.pi * np.arange(count) / count
+    return np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+
+
+def halved(quads: Iterable[list[int]]) -> list[list[int]]:
+    return [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])]
+
+
+def edges_of(face: list[int]) -> list[Edge]:
+    return list(zip(face, [*face[1:], face[0]], strict=True))
 
 
 def cube(**options) -> PeerCage:
@@ -35,22 +51,20 @@ def grid(columns: int, rows: int, triangles: bool = False, **options) -> PeerCag
     positions = [[i, j, 0.1 * i * j] for j in range(rows + 1) for i in range(columns + 1)]
     first = [j * (columns + 1) + i for j in range(rows) for i in range(columns)]
     quads = [[a, a + 1, a + columns + 2, a + columns + 1] for a in first]
-    if not triangles:
-        return bumpy(PeerCage(positions, quads, **options))
-    return bumpy(PeerCage(positions, [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])], **options))
+    return bumpy(PeerCage(positions, halved(quads) if triangles else quads, **options))
 
 
 def fan(valence: int, triangles: bool = False, **options) -> PeerCage:
     """Open disc of faces around vertex 0; its spokes end at vertices 1 to the valence. Quads end at one more vertex."""
     turn = 2 * np.pi * np.arange(valence) / valence
     spokes = np.stack([np.cos(turn), np.sin(turn), 0.2 * np.cos(2 * turn)], axis=1)
-    k = np.arange(valence)
+    ring = edges_of([1 + k for k in range(valence)])
     if triangles:
-        faces = np.stack([0 * k, 1 + k, 1 + (k + 1) % valence], axis=1)
-        return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes]), faces.tolist(), scheme="loop", **options))
+        faces = [[0, here, ahead] for here, ahead in ring]
+        return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes]), faces, scheme="loop", **options))
     between = 0.7 * (spokes + np.roll(spokes, -1, axis=0))
-    faces = np.stack([0 * k, 1 + k, 1 + valence + k, 1 + (k + 1) % valence], axis=1)
-    return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes, between]), faces.tolist(), **options))
+    faces = [[0, here, here + valence, ahead] for here, ahead in ring]
+    return bumpy(PeerCage(np.vstack([[[0, 0, 0.5]], spokes, between]), faces, **options))
 
 
 def spoked(valence: int, sharpness: dict[int, float], **options) -> PeerCage:
@@ -60,11 +74,9 @@ def spoked(valence: int, sharpness: dict[int, float], **options) -> PeerCage:
 
 def bipyramid(sides: int, **options) -> PeerCage:
     """Closed, of triangles: vertices 0 and 1 are above and below a ring of vertices 2, 3, ..."""
-    turn = 2 * np.pi * np.arange(sides) / sides
-    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-    here, ahead = 2 + np.arange(sides), 2 + (np.arange(sides) + 1) % sides
-    faces = np.concatenate([np.stack([0 * here, here, ahead], axis=1), np.stack([0 * here + 1, ahead, here], axis=1)])
-    return bumpy(PeerCage(np.vstack([[[0, 0, 1.2], [0, 0, -0.9]], ring]), faces.tolist(), **options))
+    ring = edges_of([2 + k for k in range(sides)])
+    faces = [*([0, here, ahead] for here, ahead in ring), *([1, ahead, here] for here, ahead in ring)]
+    return bumpy(PeerCage(np.vstack([[[0, 0, 1.2], [0, 0, -0.9]], circle(sides)]), faces, **options))
 
 
 # Radius and height along the outline of something like a pawn.
@@ -76,49 +88,32 @@ def lathe(ring_sharpness: Iterable[tuple[int, float]] = (), **options) -> PeerCa
     """Chess piece: rings of vertices along `OUTLINE`, closed by a polygon at each end; some rings are creases."""
     turn = 2 * np.pi * np.arange(LATHE_COLUMNS) / LATHE_COLUMNS
     positions = [[r * np.cos(a), r * np.sin(a), z] for r, z in OUTLINE for a in turn]
-    n = LATHE_COLUMNS
-    faces = [
-        [j * n + i, j * n + (i + 1) % n, (j + 1) * n + (i + 1) % n, (j + 1) * n + i]
-        for j in range(len(OUTLINE) - 1)
-        for i in range(n)
-    ]
-    faces += [list(range(n))[::-1], list(range((len(OUTLINE) - 1) * n, len(OUTLINE) * n))]
+    top = len(OUTLINE) - 1
+    faces = [[a, b, b + LATHE_COLUMNS, a + LATHE_COLUMNS] for ring in range(top) for a, b in lathe_ring(ring)]
+    faces += [[a for a, _ in lathe_ring(0)][::-1], [a for a, _ in lathe_ring(top)]]
     creases = [(a, b, s) for ring, s in ring_sharpness for a, b in lathe_ring(ring)]
     return bumpy(PeerCage(positions, faces, creases=creases, **options))
 
 
 def lathe_ring(ring: int) -> list[Edge]:
-    n = LATHE_COLUMNS
-    return [(ring * n + i, ring * n + (i + 1) % n) for i in range(n)]
+    return edges_of(list(range(ring * LATHE_COLUMNS, (ring + 1) * LATHE_COLUMNS)))
 
 
 def with_islands(cage: PeerCage, seams: Iterable[Edge], mode: str) -> PeerCage:
     """The cage with face-varying values that are discontinuous across some edges, and random."""
+    # The corners at which each half-edge begins and ends, counted over all faces.
+    first = np.cumsum([0, *map(len, cage.faces)])
+    corners = {
+        edge: (first[f] + k, first[f] + (k + 1) % len(face))
+        for f, face in enumerate(cage.faces)
+        for k, edge in enumerate(edges_of(face))
+    }
     cut = {frozenset(edge) for edge in seams}
-    corners = [(f, k) for f, face in enumerate(cage.faces) for k in range(len(face))]
-    number = {corner: i for i, corner in enumerate(corners)}
-    island = list(range(len(corners)))
-
-    def root(i: int) -> int:
-        while island[i] != i:
-            i = island[i]
-        return i
-
-    owner: dict[Edge, tuple[int, int]] = {}
-    for f, face in enumerate(cage.faces):
-        for k, (a, b) in enumerate(zip(face, [*face[1:], face[0]], strict=True)):
-            owner[a, b] = f, k
-    for (a, b), (f, k) in owner.items():
-        if (b, a) not in owner or frozenset((a, b)) in cut:
-            continue
-        g, m = owner[b, a]
-        # The corner at a is corner k of f and the one after m of g; that at b is the one after k, and m.
-        ends = ((f, k), (g, (m + 1) % len(cage.faces[g]))), ((f, (k + 1) % len(cage.faces[f])), (g, m))
-        for here, there in ends:
-            island[root(number[here])] = root(number[there])
-    roots = [root(i) for i in range(len(corners))]
-    _, indices = np.unique(roots, return_inverse=True)
-    values = np.random.default_rng(7).uniform(0, 1, (indices.max() + 1, 2))
+    whole = [edge for edge in corners if edge[::-1] in corners and frozenset(edge) not in cut]
+    pairs = [pair for edge in whole for pair in zip(corners[edge], corners[edge[::-1]][::-1], strict=True)]
+    here, there = np.array(pairs, dtype=int).reshape(-1, 2).T
+    count, indices = connected_components(coo_array((here >= 0, (here, there)), shape=(first[-1], first[-1])))
+    values = np.random.default_rng(7).uniform(0, 1, (count, 2))
     return replace(cage, fvar=(values, indices), fvar_linear=mode)
 
 
@@ -243,8 +238,7 @@ def book(pages: int, triangles: bool = False, **options) -> PeerCage:
             faces += [[before[i], before[i + 1], here[i + 1], here[i]] for i in range(3)]
             before = here
     if triangles:
-        faces = [half for a, b, c, d in faces for half in ([a, b, c], [a, c, d])]
-        options["scheme"] = "loop"
+        faces, options["scheme"] = halved(faces), "loop"
     return bumpy(PeerCage(positions, faces, **options))
 
 
@@ -263,7 +257,7 @@ def strip(twists: int, **options) -> PeerCage:
     """Ring of seven quads between vertices 0, 2, ... and 1, 3, ..., closed with a number of half turns."""
     turn = 2 * np.pi * np.arange(7) / 7
     across = np.stack([np.cos(turn) * np.cos(turn / 2), np.sin(turn) * np.cos(turn / 2), np.sin(turn / 2)], axis=1)
-    middle = 3 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+    middle = 3 * circle(7)
     ahead = [(2 * i + 2, 2 * i + 3) for i in range(6)] + [(0, 1) if twists % 2 == 0 else (1, 0)]
     faces = [[2 * i, a, b, 2 * i + 1] for i, (a, b) in enumerate(ahead)]
     return bumpy(PeerCage(np.stack([middle - across, middle + across], axis=1).reshape(-1, 3), faces, **options))
@@ -271,30 +265,24 @@ def strip(twists: int, **options) -> PeerCage:
 
 def pole(count: int, triangles: bool = False, **options) -> PeerCage:
     """Cone whose faces have its tip, vertex 0, twice, with a second ring of quads, or of triangles, below."""
-    turn = 2 * np.pi * np.arange(count) / count
-    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-    here, ahead = 1 + np.arange(count), 1 + (np.arange(count) + 1) % count
-    quads = np.stack([here, here + count, ahead + count, ahead], axis=1).tolist()
-    tip = [[0, 0, a, b] for a, b in zip(here.tolist(), ahead.tolist(), strict=True)]
+    ring = edges_of([1 + k for k in range(count)])
+    quads = [[here, here + count, ahead + count, ahead] for here, ahead in ring]
+    tip = [[0, 0, here, ahead] for here, ahead in ring]
     if triangles:
-        quads = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])]
-        tip = [half for a, _, b, c in tip for half in ([a, a, b], [a, b, c])]
-        options["scheme"] = "loop"
-    return bumpy(PeerCage(np.vstack([[[0, 0, 1]], ring, 2 * ring - [0, 0, 1]]), [*quads, *tip], **options))
+        quads, tip, options["scheme"] = halved(quads), halved(tip), "loop"
+    positions = np.vstack([[[0, 0, 1]], circle(count), 2 * circle(count) - [0, 0, 1]])
+    return bumpy(PeerCage(positions, [*quads, *tip], **options))
 
 
 def _non_manifold() -> dict[str, PeerCage]:
     """Cages that are no manifold. Faces agree in orientation, or cannot, as OpenSubdiv does not turn them."""
+    pages, squares, far = book(4), grid(5, 5), [[1.5, -1, 1], [1, -1, 1], [2, -2, 2]]
+    page = [1, 2, len(pages.positions), len(pages.positions) + 1]
+    with_hair = [face if k != 12 else [face[0], 36, *face] for k, face in enumerate(squares.faces)]
+    haired = PeerCage(np.vstack([squares.positions, [[2, 2, 3]]]), with_hair, boundary="none")
     found = {
-        "book, a page from its spine to nowhere": PeerCage(
-            np.vstack([book(4).positions, [[1.5, -1, 1], [1, -1, 1], [2, -2, 2]]]),
-            [*book(4).faces, [1, 2, len(book(4).positions), len(book(4).positions) + 1]],
-        ),
-        "sheet with a hair, nothing interpolated": PeerCage(
-            np.vstack([grid(5, 5).positions, [[2, 2, 3]]]),
-            [face if k != 12 else [face[0], 36, *face] for k, face in enumerate(grid(5, 5).faces)],
-            boundary="none",
-        ),
+        "book, a page from its spine to nowhere": PeerCage(np.vstack([pages.positions, far]), [*pages.faces, page]),
+        "sheet with a hair, nothing interpolated": haired,
         "three quads at an edge": PeerCage(
             [[0, 0, 0], [1, 0, 0.1], [1, 1, 0], [0, 1.2, 0], [1, -0.5, 1], [0, -0.6, 1], [1, -0.7, -1], [0, -0.5, -1]],
             [[0, 1, 2, 3], [1, 0, 5, 4], [0, 1, 6, 7]],
@@ -388,8 +376,7 @@ def _face_varying() -> dict[str, PeerCage]:
 
 
 def _edges(cage: PeerCage) -> list[Edge]:
-    edges = {tuple(sorted(edge)) for face in cage.faces for edge in zip(face, [*face[1:], face[0]], strict=True)}
-    return sorted(edges)
+    return sorted({tuple(sorted(edge)) for face in cage.faces for edge in edges_of(face)})
 
 
 SURFACES: dict[str, PeerCage] = {**_catmull_clark(), **_chaikin(), **_loop(), **_non_manifold()}

@@ -65,95 +65,53 @@ def find(name: str) -> Path | str:
             wrong = [line for line in done.stderr.splitlines() if "error" in line or "cannot find" in line]
             return f"{name}_peer.cpp does not compile: {(wrong or ['g++ failed'])[0]}"
         new.replace(program)
-    _set_link(cache / program.name, program)
+    # A name that figures know leads to the program that was compiled last.
+    with tempfile.TemporaryDirectory(dir=cache) as beside:
+        link = Path(beside) / program.name
+        link.symlink_to(program)
+        link.replace(cache / program.name)
     return program
 
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Let other processes that run tests wait for what this one compiles."""
-    if fcntl is None:
-        yield
-        return
     with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        if fcntl is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
         yield
-
-
-def _set_link(link: Path, program: Path) -> None:
-    """Let a name that figures know lead to the program that was compiled last."""
-    with tempfile.TemporaryDirectory(dir=link.parent) as beside:
-        new = Path(beside) / link.name
-        new.symlink_to(program)
-        new.replace(link)
-
-
-def build(name: str) -> Path | None:
-    """Path of the program of "osd" or "embree", compiled if it is not yet; None where that fails (see `find`)."""
-    found = find(name)
-    return found if isinstance(found, Path) else None
 
 
 @dataclass(frozen=True, eq=False)
 class PeerCage:
-    """A control cage with the names that OpenSubdiv has for its options.
+    """A control cage with the names that OpenSubdiv has for its options."""
 
-    Attributes
-    ----------
-    positions : (n_v, 3)
-    faces : sequence of int sequences
-    scheme : "catmark" | "loop" | "bilinear"
-    boundary : "none" | "edge_only" | "edge_and_corner"
-    creases : sequence of (vertex, vertex, sharpness)
-    corners : sequence of (vertex, sharpness)
-    holes : sequence of face
-    creasing : "uniform" | "chaikin"
-    triangles : "catmark" | "smooth"
-    vertex_data : (n_v, k), optional
-        Values that follow the surface as positions do; OpenSubdiv only.
-    fvar : (values, indices), optional
-        ``(n, width)`` values, and one index of them per corner of all faces, one after the other.
-    fvar_linear : "all" | "none" | "boundaries" | "corners_only" | "corners_plus1" | "corners_plus2"
-    """
-
-    positions: ArrayLike
+    positions: ArrayLike  # (n_v, 3)
     faces: Sequence[Sequence[int]]
-    scheme: str = "catmark"
-    boundary: str = "edge_and_corner"
-    creases: Sequence[tuple[int, int, float]] = ()
-    corners: Sequence[tuple[int, float]] = ()
-    holes: Sequence[int] = ()
-    creasing: str = "uniform"
-    triangles: str = "catmark"
-    vertex_data: ArrayLike | None = None
+    scheme: str = "catmark"  # | "loop" | "bilinear"
+    boundary: str = "edge_and_corner"  # | "edge_only" | "none"
+    creases: Sequence[tuple[int, int, float]] = ()  # (vertex, vertex, sharpness)
+    corners: Sequence[tuple[int, float]] = ()  # (vertex, sharpness)
+    holes: Sequence[int] = ()  # Faces.
+    creasing: str = "uniform"  # | "chaikin"
+    triangles: str = "catmark"  # | "smooth"
+    # (n, width) values, and one index of them per corner of all faces, one after the other.
     fvar: tuple[ArrayLike, ArrayLike] | None = None
-    fvar_linear: str = "all"
+    fvar_linear: str = "all"  # | "none" | "boundaries" | "corners_only" | "corners_plus1" | "corners_plus2"
 
 
 class PeerSamples(NamedTuple):
-    """Samples of a peer's surface; not a number where it has none.
+    """Samples of a peer's surface; not a number where it has none."""
 
-    Attributes
-    ----------
-    p, du, dv : (s, 3)
-        Points, and derivatives by the sample's own (u, v); by "refine", two tangents of other directions.
-    vertex_data : (s, k)
-    fvar : (s, width)
-        Face-varying values.
-    vertex, rule : (s,) int
-        By "refine", the refined vertex at the sample, and its rule: 1 smooth, 2 dart, 4 crease, 8 corner.
-    times : dict
-        ``setup_ms`` and ``evaluation_ms``.
-    """
-
-    p: NDArray[np.float64]
+    p: NDArray[np.float64]  # (s, 3)
+    # (s, 3) derivatives by the sample's own (u, v); by "refine", two tangents of other directions.
     du: NDArray[np.float64]
     dv: NDArray[np.float64]
-    vertex_data: NDArray[np.float64]
-    fvar: NDArray[np.float64]
+    fvar: NDArray[np.float64]  # (s, width)
+    # (s,); by "refine", the refined vertex at the sample, and its rule: 1 smooth, 2 dart, 4 crease, 8 corner.
     vertex: NDArray[np.int32]
     rule: NDArray[np.int32]
-    times: dict[str, float]
+    times: dict[str, float]  # ``setup_ms`` and ``evaluation_ms``.
 
     @property
     def n(self) -> NDArray[np.float64]:
@@ -175,50 +133,32 @@ def evaluate(
     repetitions: int = 1,
     threads: int = 1,
 ) -> PeerSamples:
-    """Samples of a cage's limit surface by a peer.
+    """Samples of a cage's limit surface by a peer; ``element``, ``uv`` and ``corner`` as for `LimitSurface.evaluate`.
 
-    Parameters
-    ----------
-    cage : PeerCage
-    element, uv, corner
-        As for `mitsuba_subdivision.LimitSurface.evaluate`.
-    method : "far" | "bfr" | "refine" | "embree"
-        OpenSubdiv's patch tables after adaptive refinement; its `Bfr` surfaces; uniform refinement and limit masks,
-        which know vertices of the level only; or Embree, which knows Catmull-Clark without face-varying values only.
-        Embree agrees with OpenSubdiv to single precision but for semi-sharp features (5e-2 of the cage's box), holes,
-        which it leaves out of the neighbourhood, and border vertices with one face and no corner (9e-3).
-    level : int, optional
-        Of refinement. 10 for "far", which can no more, 2 for "bfr", its own default, and 6 for "refine".
-    real : "float" | "double"
-        Precision of OpenSubdiv; Embree's is float.
-    repetitions, threads : int
-        For timing: the median of so many runs, evaluated by so many threads.
+    The method is "far", OpenSubdiv's patch tables after adaptive refinement; "bfr", its `Bfr` surfaces; "refine",
+    uniform refinement and limit masks, which know vertices of the level only; or "embree", which knows Catmull-Clark
+    without face-varying values only. Embree agrees with OpenSubdiv to single precision but for semi-sharp features
+    (5e-2 of the cage's box), holes, which it leaves out of the neighbourhood, and border vertices with one face and no
+    corner (9e-3). It is always in single precision.
 
-    Raises
-    ------
-    PeerError
-        If the peer is missing or fails.
+    Levels of refinement are 10 for "far", which can no more, 2 for "bfr", its own default, and 6 for "refine", unless
+    given. For timing, ``repetitions`` and ``threads``: the median of so many runs, evaluated by so many threads.
     """
     program = find("embree" if method == "embree" else "osd")
     if not isinstance(program, Path):
         raise PeerError(program)
     sizes = np.array([len(face) for face in cage.faces])
-    element, corner, u, v = np.broadcast_arrays(
-        element, corner, np.asarray(uv, dtype=float)[..., 0], np.asarray(uv, dtype=float)[..., 1]
-    )
+    element, corner, u, v = np.broadcast_arrays(element, corner, *np.moveaxis(np.asarray(uv, dtype=float), -1, 0))
     element, corner, uv = element.ravel(), corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
     size = REGULAR_SIZE[cage.scheme]
     is_whole = sizes[element] == size
     turned, back = _from_corner_0(size, uv, np.where(is_whole, corner, 0))
 
     values, indices = cage.fvar if cage.fvar is not None else (np.zeros((0, 0)), [])
-    values = np.asarray(values, dtype=float)
-    rows = np.asarray(cage.positions, dtype=float)
-    if cage.vertex_data is not None:
-        rows = np.hstack([rows, np.asarray(cage.vertex_data, dtype=float)])
+    values, positions = np.asarray(values, dtype=float), np.asarray(cage.positions, dtype=float)
     records = {
-        "widths": np.array([rows.shape[1], values.shape[1]], dtype=np.int32),
-        "values": rows,
+        "widths": np.array([3, values.shape[1]], dtype=np.int32),
+        "values": positions,
         "sizes": sizes.astype(np.int32),
         "corners": np.concatenate([np.asarray(face, dtype=np.int32) for face in cage.faces]),
         "creases": np.array([crease[:2] for crease in cage.creases], dtype=np.int32),
@@ -245,20 +185,16 @@ def evaluate(
         if done.returncode:
             raise PeerError(f"{program.name} fails: {done.stderr.strip() or done.returncode}")
         found = read_records(answers)
-    rows, du, dv = (found[name].reshape(len(element), -1) for name in ("p", "du", "dv"))
-    du, dv = du[:, :3], dv[:, :3]
+    p, du, dv = (found[name].reshape(-1, 3) for name in ("p", "du", "dv"))
     if method != "refine":
         du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))
     fvar = found["fvar"].reshape(len(element), values.shape[1])
-    return PeerSamples(rows[:, :3], du, dv, rows[:, 3:], fvar, found["vertex"], found["rule"], json.loads(done.stdout))
+    return PeerSamples(p, du, dv, fvar, found["vertex"], found["rule"], json.loads(done.stdout))
 
 
 def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, NDArray]:
     """Parameters counted from a face's corner 0, and their derivatives by the given ones: ``(s, 2, 2)``, row by u."""
-    if size == 4:
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
-    else:
-        corners = np.array([[0, 0], [1, 0], [0, 1]], dtype=float)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]] if size == 4 else [[0, 0], [1, 0], [0, 1]], dtype=float)
     origin, along_u, along_v = corners[corner], corners[(corner + 1) % size], corners[corner - 1]
     matrix = np.stack([along_u - origin, along_v - origin], axis=1)
     return origin + np.einsum("si,sij->sj", uv, matrix), matrix

@@ -32,10 +32,11 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 
+from . import fidelity_cages
 from .fidelity_cages import ISLANDS, SURFACES, bipyramid, book, cube, fan, grid, joined, lattice, scattered, strip
 from .peers import PeerCage, evaluate, find
 
-pytestmark = [
+pytestmark = AGAINST_OSD = [
     pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd"))),
     # Cages that are no manifold.
     pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
@@ -71,18 +72,13 @@ REGULAR_VALENCE = {"catmark": 4, "loop": 6}
 
 def surface_of(cage: PeerCage) -> msub.LimitSurface:
     """This project's surface of a peer's cage."""
-    options = {"crease_method": cage.creasing} if cage.creasing != "uniform" else {}
-    if cage.triangles != "catmark":
-        options["triangle_rule"] = cage.triangles
-    if cage.holes:
-        options["holes"] = cage.holes
+    ours = {"catmark": "catmull_clark", "loop": "loop", "smooth": "smooth"}
+    options = {"creases": cage.creases, "corners": cage.corners, "boundary": cage.boundary, "holes": cage.holes}
+    options |= {"crease_method": cage.creasing, "triangle_rule": ours[cage.triangles]}
     if cage.fvar is not None:
         values, indices = cage.fvar
-        options["texcoords"] = msub.Attribute(values, "face_varying", indices)
-        options["face_varying"] = cage.fvar_linear
-    tags = {"creases": cage.creases, "corners": cage.corners, "boundary": cage.boundary}
-    scheme = {"catmark": "catmull_clark", "loop": "loop"}[cage.scheme]
-    return msub.LimitSurface(msub.ControlCage(cage.positions, cage.faces, **tags, **options), scheme)
+        options |= {"texcoords": msub.Attribute(values, "face_varying", indices), "face_varying": cage.fvar_linear}
+    return msub.LimitSurface(msub.ControlCage(cage.positions, cage.faces, **options), ours[cage.scheme])
 
 
 EVERY_SURFACE = pytest.mark.parametrize("cage", SURFACES.values(), ids=SURFACES)
@@ -185,12 +181,10 @@ DARTS = {
 def test_refinement_approaches_the_surface_at_darts(cage):
     element, uv, corner = lattice(cage, 1)
     ours = surface_of(cage).evaluate(element, uv, corner).p
-    errors = {}
-    for level in (4, 6):
-        theirs = evaluate(cage, element, uv, corner, method="refine", level=level)
-        errors[level] = distance(ours, theirs.p)[theirs.rule == DART].max() / box(cage)
+    coarse, fine = (evaluate(cage, element, uv, corner, method="refine", level=level) for level in (4, 6))
+    before, after = (distance(ours, each.p)[each.rule == DART].max() / box(cage) for each in (coarse, fine))
     # The mask's error goes with a non-dominant eigenvalue a level, 0.63 and less at these valences.
-    assert POINT < errors[6] <= APPROACH * errors[4]
+    assert POINT < after <= APPROACH * before
 
 
 @pytest.mark.parametrize("triangles", [False, True])
@@ -199,11 +193,8 @@ def test_tangents_of_refinement_approach_the_plane_beside_creases(triangles, sid
     cage = fan(2 * side, triangles=triangles, creases=[(0, 1, 10), (0, 1 + side, 10)])
     elements = np.arange(len(cage.faces))
     ours = surface_of(cage).evaluate(elements, [[0.0, 0.0]])
-    errors = {}
-    for level in (4, 6):
-        theirs = evaluate(cage, elements, [[0.0, 0.0]], method="refine", level=level)
-        errors[level] = angle(ours.n, theirs.n).min()
-    assert errors[6] <= APPROACH * errors[4] + NORMAL
+    coarse, fine = (evaluate(cage, elements, [[0.0, 0.0]], method="refine", level=level) for level in (4, 6))
+    assert angle(ours.n, fine.n).min() <= APPROACH * angle(ours.n, coarse.n).min() + NORMAL
 
 
 @EVERY_ISLAND
@@ -242,7 +233,7 @@ def _apart(ours, theirs, element):
 
 
 def _triangles(cage):
-    return replace(cage, faces=[half for a, b, c, d in cage.faces for half in ([a, b, c], [a, c, d])], scheme="loop")
+    return replace(cage, faces=fidelity_cages.halved(cage.faces), scheme="loop")
 
 
 @pytest.mark.parametrize(
@@ -269,7 +260,7 @@ def test_faces_against_their_neighbours_differ_by_one_rule(cage, against):
     assert not _apart(ours, evaluate(cage, element, uv, method="refine", level=LEVEL), element)
 
     others = [{*face} for k, face in enumerate(cage.faces) if k not in against]
-    around = [edge for k in against for edge in zip(cage.faces[k], np.roll(cage.faces[k], -1), strict=True)]
+    around = [edge for k in against for edge in fidelity_cages.edges_of(cage.faces[k])]
     edges = [edge for edge in around if any({*edge} <= face for face in others)]
     ends = {vertex for edge in edges for vertex in edge}
     assert _apart(ours, explicit, element) == {k for k, face in enumerate(cage.faces) if ends & {*face}}

@@ -1,17 +1,16 @@
 """Faces thrown together at random, which share edges and vertices in every way, against OpenSubdiv (3.5.0)."""
 
+from dataclasses import replace
+
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 
-from .fidelity_cages import MODES, book, scattered
-from .peers import PeerCage, evaluate, find
-from .test_fidelity import POINT, box, distance, rounding, surface_of
+from .fidelity_cages import MODES, book, edges_of, scattered
+from .peers import PeerCage, evaluate
+from .test_fidelity import AGAINST_OSD, POINT, box, distance, rounding, surface_of
 
-pytestmark = [
-    pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd"))),
-    pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
-]
+pytestmark = AGAINST_OSD
 
 COUNT = 30
 SAMPLES = 60
@@ -31,8 +30,7 @@ def soup(rng: np.random.Generator) -> PeerCage:
             rng.choice(count, 3 if scheme == "loop" else rng.integers(3, 6), replace=rng.random() < 0.15).tolist()
             for _ in range(rng.integers(2, 9))
         ]
-    corners = np.concatenate(faces)
-    ends = {tuple(sorted((a, b))) for face in faces for a, b in zip(face, [*face[1:], face[0]], strict=True) if a != b}
+    ends = {tuple(sorted(edge)) for face in faces for edge in edges_of(face) if edge[0] != edge[1]}
 
     def sharpness() -> float:
         return float(rng.choice([0.5, 1.5, 2.25, 10, 10]))
@@ -44,7 +42,7 @@ def soup(rng: np.random.Generator) -> PeerCage:
         "boundary": str(rng.choice(["edge_and_corner", "edge_only", "none"], p=[0.45, 0.45, 0.1])),
     }
     # Values of one face may differ from those of all others at their vertices.
-    indices = corners.copy()
+    indices = np.concatenate(faces)
     face = int(rng.integers(len(faces)))
     begin = sum(len(f) for f in faces[:face])
     indices[begin : begin + len(faces[face])] += len(positions)
@@ -56,16 +54,7 @@ def as_kept(cage: PeerCage) -> PeerCage:
     """The cage with the faces that are turned here turned for OpenSubdiv, too."""
     kept = surface_of(cage).cage
     faces = [face.tolist() for face in np.split(kept.face_vertices, np.cumsum(kept.face_sizes)[:-1])]
-    return PeerCage(
-        cage.positions,
-        faces,
-        cage.scheme,
-        cage.boundary,
-        cage.creases,
-        cage.corners,
-        fvar=(kept.texcoords.values, kept.texcoords.indices),
-        fvar_linear=cage.fvar_linear,
-    )
+    return replace(cage, faces=faces, fvar=(kept.texcoords.values, kept.texcoords.indices))
 
 
 def has_fans_beside_a_crease(cage: msub.ControlCage) -> bool:

@@ -7,13 +7,10 @@ import pytest
 from patches.closed_cages import polygons
 
 from .fidelity_cages import ISLANDS, SURFACES
-from .peers import evaluate, find
-from .test_fidelity import POINT, box, rounding, surface_of
+from .peers import evaluate
+from .test_fidelity import AGAINST_OSD, POINT, box, rounding, surface_of
 
-pytestmark = [
-    pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd"))),
-    pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
-]
+pytestmark = AGAINST_OSD
 
 SAMPLES = 100
 # Far from corners, where OpenSubdiv's patches are exact.
@@ -26,8 +23,7 @@ NAMES = [name for name in (*SURFACES, *list(ISLANDS)[::5]) if name != NO_CAGE]
 
 def peer_of(cage, before):
     """A refined cage for OpenSubdiv, with the options of the one before."""
-    t = cage.topology
-    values = cage.texcoords
+    t, values = cage.topology, cage.texcoords
     return replace(
         before,
         positions=cage.positions,
@@ -53,6 +49,5 @@ def test_opensubdiv_makes_the_same_surface_of_the_refined_cage(name, np_rng):
     old_uv = scale[:, None] * uv + np.where(is_middle, 0.5, 0)[:, None]
     here = evaluate(before, old, old_uv, np.maximum(corner, 0))
     there = evaluate(peer_of(refinement.cage, before), element, uv, is_middle.astype(int))
-    bar = POINT * rounding(before)
-    assert np.abs(here.p - there.p).max() <= bar * box(before)
-    assert np.abs(here.fvar - there.fvar).max(initial=0) <= bar
+    assert np.abs(here.p - there.p).max() <= POINT * rounding(before) * box(before)
+    assert np.abs(here.fvar - there.fvar).max(initial=0) <= POINT * rounding(before)

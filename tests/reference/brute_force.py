@@ -25,10 +25,7 @@ TRIANGLE_CORNERS = ((0, 0), (1, 0), (0, 1))
 
 @dataclass(frozen=True)
 class Sample:
-    """Point and derivatives of the limit surface with respect to the element's own (u, v).
-
-    ``n`` is the unit normal (None where positions are not three-dimensional), ``level`` the number of refinements.
-    """
+    """Point and derivatives of the limit surface with respect to the element's own (u, v)."""
 
     p: Vector
     dp_du: Vector
@@ -36,8 +33,8 @@ class Sample:
     d2p_duu: Vector | None
     d2p_duv: Vector | None
     d2p_dvv: Vector | None
-    n: Vector | None
-    level: int
+    n: Vector | None  # Unit normal; None where positions are not three-dimensional.
+    level: int  # Number of refinements.
 
 
 @dataclass(frozen=True)
@@ -123,9 +120,8 @@ class BruteForce:
         grid = self._grid(node)
         degree = 3 if self.scheme == "catmull_clark" else 2
         weight = box_weights(u, v) if self.scheme == "loop" else tensor_weights(degree, u, v)
-        weights = zip(*(weight(*place) for place in grid), strict=True)
         controls = [node.points[vertex] for vertex in grid.values()]
-        rows = [combine(row, controls) for row in weights]
+        rows = [combine(row, controls) for row in zip(*(weight(*place) for place in grid), strict=True)]
         factors = (1, scale, scale, scale**2, scale**2, scale**2)
         rows = [tuple(c * factor for c in row) for row, factor in zip(rows, factors, strict=True)]
         second = rows[3:] if derivatives > 1 else [None] * 3
@@ -262,13 +258,3 @@ def ring(vertex: Hashable, faces: Sequence[Face]) -> list[Face]:
             raise ValueError(f"vertex {vertex} is on the boundary; the reference wants closed one-rings")
         fan.append(by_spoke[fan[-1][-1]])
     return fan
-
-
-def evaluate(scheme: str, positions, faces, element: int, corner: int, u, v, derivatives: int = 1) -> Sample:
-    """One sample; see `BruteForce.evaluate`."""
-    return BruteForce(scheme, positions, faces).evaluate(element, corner, u, v, derivatives)
-
-
-def limit(scheme: str, positions, faces, vertex: int | None = None, face: int | None = None) -> Limit:
-    """Limit at one vertex or face centre; see `BruteForce.limit`."""
-    return BruteForce(scheme, positions, faces).limit(vertex, face)

@@ -97,9 +97,7 @@ def _torus_with_valence_2() -> ControlCage:
 
 def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles between unit vectors in degrees, accurate for tiny ones; nan where a vector is."""
-    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
-    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    a, b = (np.asarray(c, dtype=float) / np.linalg.norm(c, axis=-1, keepdims=True) for c in (a, b))
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
@@ -133,9 +131,8 @@ def uv_towards_corner(scheme: str, seed: int, levels: tuple[int, ...] = LEVELS) 
         borders[0] = 0.5, 0.5
         beyond = inside.sum(axis=2) > 1
         inside[beyond] = 1 - inside[beyond]
-    return np.concatenate(
-        [np.concatenate([here, borders]) * 2.0**-level for here, level in zip(inside, levels, strict=True)]
-    )
+    places = [np.concatenate([here, borders]) for here in inside]
+    return np.concatenate([place * 2.0**-level for place, level in zip(places, levels, strict=True)])
 
 
 @lru_cache(maxsize=64)

@@ -4,6 +4,7 @@ Nothing of `mitsuba_subdivision` is used. A mesh is a list of faces (tuples of v
 tuples of the same lengths and a dict of values by (vertex, index): the same index at two vertices is two values.
 """
 
+from collections import defaultdict
 from dataclasses import dataclass
 from math import cos, pi
 
@@ -41,16 +42,16 @@ class _Around:
 
     def __init__(self, channel):
         self.c = channel
-        self.at_edge, self.at_vertex = {}, {}
+        self.at_edge, self.at_vertex, self.edges_at = defaultdict(list), defaultdict(list), defaultdict(set)
         for f, face in enumerate(channel.faces):
             for i, vertex in enumerate(face):
-                self.at_edge.setdefault(frozenset((vertex, face[(i + 1) % len(face)])), []).append((f, i))
-                self.at_vertex.setdefault(vertex, []).append((f, i))
-        self.edges_at = {}
-        for edge in self.at_edge:
-            for vertex in edge:
-                self.edges_at.setdefault(vertex, set()).add(edge)
-        self.face_means = [self._mean_of_face(f) for f in range(len(channel.faces))]
+                edge = frozenset((vertex, face[(i + 1) % len(face)]))
+                self.at_vertex[vertex].append((f, i))
+                self.at_edge[edge].append((f, i))
+                for end in edge:
+                    self.edges_at[end].add(edge)
+        sizes = map(len, channel.faces)
+        self.face_means = [sum(self.value(f, i) for i in range(size)) / size for f, size in enumerate(sizes)]
         if channel.followed is None:
             channel.followed = self._followed()
 
@@ -61,10 +62,6 @@ class _Around:
 
     def index_at(self, f, vertex):
         return self.c.indices[f][self.c.faces[f].index(vertex)]
-
-    def _mean_of_face(self, f):
-        size = len(self.c.faces[f])
-        return sum(self.value(f, i) for i in range(size)) / size
 
     def is_boundary(self, edge):
         return len(self.at_edge[edge]) == 1
@@ -111,13 +108,8 @@ class _Around:
     def semi_sharp_within(self, vertex, index):
         """Semi-sharp edges between the faces with an index at a vertex."""
         faces = set(self.faces_with(vertex, index))
-        return [
-            edge
-            for edge in self.edges_at[vertex]
-            if 0 < self.sharpness(edge) < INFINITE
-            and not self.is_seam(edge)
-            and faces.issuperset(f for f, _ in self.at_edge[edge])
-        ]
+        inner = [edge for edge in self.edges_at[vertex] if faces.issuperset(f for f, _ in self.at_edge[edge])]
+        return [edge for edge in inner if 0 < self.sharpness(edge) < INFINITE and not self.is_seam(edge)]
 
     def _followed(self):
         """Where one of two values at a vertex, not sharp itself, has semi-sharp edges, the other follows it."""
@@ -139,8 +131,7 @@ class _Around:
         torn = {other: self.pieces(vertex, other) > 1 for other in indices}
         single = {other: len(self.faces_with(vertex, other)) == 1 for other in indices}
         sharp = self.vertex_sharpness(vertex) >= INFINITE or torn[index] or mode == "boundaries"
-        if mode != "none" and single[index]:
-            sharp = True
+        sharp |= mode != "none" and single[index]
         if mode.startswith("corners_plus"):
             two = len(indices) == 2
             sharp |= len(indices) > 2 or (two and any(torn.values()))
@@ -156,8 +147,7 @@ class _Around:
             return False
         if not any(map(self.is_boundary, edges)):
             return True
-        single = len(self.at_vertex[vertex]) == 1
-        return self.c.mode != "boundaries" and (self.c.mode == "none" or not single)
+        return self.c.mode == "none" or (self.c.mode != "boundaries" and len(self.at_vertex[vertex]) > 1)
 
 
 def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
@@ -172,8 +162,7 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
     def edge_value(edge, f):
         i = next(i for g, i in around.at_edge[edge] if g == f)
         own = (around.value(f, i) + around.value(f, i + 1)) / 2
-        key = ("edge", edge)
-        cut = around.is_seam(edge)
+        key, cut = ("edge", edge), around.is_seam(edge)
         side = f if cut else None
         if (key, side) in values:
             return key, side
@@ -189,7 +178,7 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
 
     def vertex_value(f, i):
         vertex, index = c.faces[f][i], c.indices[f][i]
-        key = ("vertex", vertex)
+        key = "vertex", vertex
         return (key, index) if (key, index) in values else add(key, index, _moved(around, vertex, index, scheme))
 
     for f, face in enumerate(c.faces):
@@ -213,8 +202,7 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
 
 
 def _moved(around, vertex, index, scheme):
-    c = around.c
-    own = c.values[vertex, index]
+    c, own = around.c, around.c.values[vertex, index]
     if c.mode == "all":
         return own
     edges = around.edges_at[vertex]
@@ -255,12 +243,11 @@ def _moved(around, vertex, index, scheme):
 
 def _along(around, vertex, index, own, sharp):
     """The rule of a crease, along its two edges."""
-    c = around.c
     # The first edge of a face at the vertex ends in the next corner, the last in the one before.
     ends = []
     for f, i in around.at_vertex[vertex]:
         if around.index_at(f, vertex) == index:
-            face = c.faces[f]
+            face = around.c.faces[f]
             ends += [(frozenset((vertex, face[(i + 1) % len(face)])), around.value(f, i + 1))]
             ends += [(frozenset((vertex, face[i - 1])), around.value(f, i - 1))]
     beyond = [value for edge, value in ends if edge in sharp]

@@ -6,15 +6,7 @@ face by face, as the corners at which they begin.
 
 
 class NonManifoldParts:
-    """Non-manifold edges, vertices and creases of a mesh, as sets; see `mitsuba_subdivision.mesh.manifold`.
-
-    Attributes
-    ----------
-    edges, own_edges : set of half-edges
-    vertices, creases : set of vertices
-    closed_fans : set of half-edges
-        The lowest of each closed fan at a vertex of several.
-    """
+    """Non-manifold edges, vertices and creases of a mesh, as sets; see `mitsuba_subdivision.mesh.manifold`."""
 
     def __init__(self, faces):
         corners = [(face, i) for face in range(len(faces)) for i in range(len(faces[face]))]
@@ -29,13 +21,9 @@ class NonManifoldParts:
         ends = {vertex for h in self.edges for vertex in self._ends(h)}
         self.vertices = {vertex for vertex in fans if vertex in ends or len(fans[vertex]) > 1}
         self.creases = {vertex for vertex in self.vertices if self._is_crease(fans[vertex])}
-        self.closed_fans = {
-            min(fan)
-            for vertex in self.vertices
-            if len(fans[vertex]) > 1
-            for fan in fans[vertex]
-            if not self._borders(fan)
-        }
+        # The lowest half-edge of each closed fan at a vertex of several.
+        several = [fan for vertex in self.vertices if len(fans[vertex]) > 1 for fan in fans[vertex]]
+        self.closed_fans = {min(fan) for fan in several if not self._borders(fan)}
 
     def _ends(self, h):
         return frozenset((self.start[h], self.start[self.following[h]]))
@@ -66,9 +54,7 @@ class NonManifoldParts:
             fan, reached = {h}, [h]
             while reached:
                 corner = reached.pop()
-                beside = []
-                if corner in self.twin:
-                    beside.append(self.following[self.twin[corner]])
+                beside = [self.following[self.twin[corner]]] if corner in self.twin else []
                 if self.preceding[corner] in self.twin:
                     beside.append(self.twin[self.preceding[corner]])
                 reached += [other for other in beside if other not in fan]
@@ -84,9 +70,5 @@ class NonManifoldParts:
         """Whether three fans or more run from one to the other of two edges, which are nobody's own."""
         borders = [{self._ends(h) for h in self._borders(fan)} for fan in fans]
         beside = {h for fan in fans for h in self._borders(fan)}
-        return (
-            len(fans) > 2
-            and beside <= self.edges - self.own_edges
-            and len(borders[0]) == 2
-            and all(border == borders[0] for border in borders)
-        )
+        run = len(borders[0]) == 2 and all(border == borders[0] for border in borders)
+        return run and len(fans) > 2 and beside <= self.edges - self.own_edges

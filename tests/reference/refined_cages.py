@@ -16,10 +16,8 @@ from reference.exact_samples import angle, bumpy
 def sheet(columns, rows, *, triangles=False, **options):
     """Flat sheet of squares, or of triangles."""
     positions = [[i, j, 0.0] for j in range(rows + 1) for i in range(columns + 1)]
-    quads = [
-        [a, a + 1, a + columns + 2, a + columns + 1]
-        for a in (j * (columns + 1) + i for j in range(rows) for i in range(columns))
-    ]
+    first = [j * (columns + 1) + i for j in range(rows) for i in range(columns)]
+    quads = [[a, a + 1, a + columns + 2, a + columns + 1] for a in first]
     faces = [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])] if triangles else quads
     return ControlCage(positions, faces, **options)
 

@@ -74,8 +74,7 @@ def loop_rules(faces: Sequence[Face], points: dict) -> tuple[list, Callable]:
         kind, of = key
         if kind == "edge":
             (_, (a, b, c)), (_, (_, _, d)) = at_edge[of]
-            weights = [Decimal(w) / 8 for w in (3, 3, 1, 1)]
-            return combine(weights, [points[x] for x in (a, b, c, d)])
+            return combine([Decimal(w) / 8 for w in (3, 3, 1, 1)], [points[x] for x in (a, b, c, d)])
         neighbours = [points[face[1]] for _, face in at_vertex[of]]
         n = len(neighbours)
         beta = loop_beta(n)
@@ -93,10 +92,8 @@ def doo_sabin_rules(faces: Sequence[Face], points: dict) -> tuple[list, Callable
 
     ``faces`` go counter-clockwise about one vertex and begin with it; so do the new ones.
     """
-    m = len(faces)
-    centre = faces[0][0]
+    m, centre, refined = len(faces), faces[0][0], []
     about_vertex = [(centre, k) for k in range(m)]
-    refined = []
     for k, face in enumerate(faces):
         before, after = (k - 1) % m, (k + 1) % m
         refined += [
@@ -128,8 +125,7 @@ def limit_masks(scheme: str, valence: int) -> tuple[list[Decimal], list[Decimal]
     n = valence
     if n < 3:
         raise ValueError(f"no limit masks for valence {n}")
-    cos = [cos_of_turn(i, n) for i in range(n)]
-    sin = [sin_of_turn(i, n) for i in range(n)]
+    cos, sin = ([turn(i, n) for i in range(n)] for turn in (cos_of_turn, sin_of_turn))
     if scheme == "doo_sabin":
         return [Decimal(1) / n] * n, cos, sin
     if scheme == "loop":

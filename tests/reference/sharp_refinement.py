@@ -59,7 +59,7 @@ class SharpMesh:
         if self.scheme == "catmull_clark":
             for index, face in enumerate(self.faces):
                 add(("face", index), centres[face])
-        new_faces, middles, new_edges = [], [], {}
+        new_faces, middles = [], []
         for index, face in enumerate(self.faces):
             ends = [frozenset(pair) for pair in zip(face, face[1:] + face[:1], strict=True)]
             for k, vertex in enumerate(face):
@@ -68,8 +68,7 @@ class SharpMesh:
                 new_faces.append(tuple(number[key] for key in kept))
             if self.scheme == "loop":
                 middles.append(tuple(number[edge] for edge in ends))
-        for (vertex, far), value in left.items():
-            new_edges[frozenset((vertex, number[frozenset((vertex, far))]))] = value
+        new_edges = {frozenset((v, number[frozenset((v, far))])): value for (v, far), value in left.items()}
         vertices = {v: self._less(s) for v, s in self.vertices.items()}
         return SharpMesh(self.scheme, np.array(points), new_faces + middles, new_edges, vertices, self.method)
 

@@ -48,9 +48,8 @@ def _cone_spline(x: Decimal, y: Decimal) -> list[Decimal]:
     if y > x:
         f, fy, fx, fyy, fxy, fxx = _cone_spline(y, x)
         return [f, fx, fy, fxx, fxy, fyy]
-    return [
-        c / 12 for c in (y**3 * (2 * x - y), 2 * y**3, 6 * x * y**2 - 4 * y**3, Decimal(0), 6 * y**2, 12 * y * (x - y))
-    ]
+    rows = y**3 * (2 * x - y), 2 * y**3, 6 * x * y**2 - 4 * y**3, Decimal(0), 6 * y**2, 12 * y * (x - y)
+    return [c / 12 for c in rows]
 
 
 def box_weights(u: Decimal, v: Decimal) -> Callable:

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reference.brute_force import BruteForce, evaluate, limit, ring
+from reference.brute_force import BruteForce, ring
 from reference.decimals import precision
 from reference.rules import RULES, limit_masks, rotate
 from reference.splines import box_weights
 
-SCHEMES = ("catmull_clark", "loop", "doo_sabin")
 LIMIT_STENCILS = json.loads((Path(__file__).parents[1] / "data" / "limit_stencils.json").read_text())
 # At 80 digits and less than 15 levels no test below loses more than 25 digits.
 EXACT = Decimal("1e-55")
@@ -147,7 +146,7 @@ def test_regular_patches_are_b_splines(scheme, basis, i, j):
     u, v, k = 0.3, 0.8, np.arange(len(basis))
     bu, bv, dv = u**k @ basis, v**k @ basis, k * v ** (k - 1.0) @ basis
     grid = np.array(points).reshape(5, 6, 3)[np.ix_((i - 1 + k) % 5, (j - 1 + k) % 6)]
-    sample = evaluate(scheme, points, faces, i * 6 + j, 0, u, v)
+    sample = BruteForce(scheme, points, faces).evaluate(i * 6 + j, 0, u, v)
     assert sample.level == 0
     np.testing.assert_allclose(np.array(sample.p, float), np.einsum("i,j,ijk", bu, bv, grid), atol=1e-14)
     np.testing.assert_allclose(np.array(sample.dp_dv, float), np.einsum("i,j,ijk", bu, dv, grid), atol=1e-14)
@@ -179,13 +178,11 @@ def test_one_more_level_changes_nothing(cage):
 @pytest.mark.parametrize("cage", CAGES, ids=IDS)
 def test_derivatives_are_finite_differences(cage):
     evaluator = BruteForce(*cage)
-    h = Fraction(1, 10**16)
-    step = Decimal(h.numerator) / Decimal(h.denominator)
-    for element, corner, u, v in some_samples(*cage, 3):
-        place = Fraction(u), Fraction(v)
-        sample = evaluator.evaluate(element, corner, *place, derivatives=2)
+    h, step = Fraction(1, 10**16), Decimal("1e-16")
+    for *place, u, v in some_samples(*cage, 3):
+        sample = evaluator.evaluate(*place, Fraction(u), Fraction(v), derivatives=2)
         near = {
-            (a, b): np.array(evaluator.evaluate(element, corner, place[0] + a * h, place[1] + b * h).p)
+            (a, b): np.array(evaluator.evaluate(*place, Fraction(u) + a * h, Fraction(v) + b * h).p)
             for a, b in product((-1, 0, 1), repeat=2)
         }
         # Errors are h^2 times third and fourth derivatives, of size 1e8 at most here.
@@ -221,8 +218,7 @@ def test_refining_the_whole_cage_keeps_the_limit_surface(scheme, cage):
     with precision(80):
         fine = BruteForce(scheme, [point(key) for key in names], [[names[key] for key in f] for f in keyed])
     coarse = BruteForce(scheme, points, faces)
-    u, v = 0.4, 0.375
-    child = 0
+    u, v, child = 0.4, 0.375, 0
     for element, face in enumerate(faces):
         for corner in range(len(face)):
             factor = 2 if scheme == "loop" or len(face) == 4 else 1
@@ -246,11 +242,11 @@ def test_refining_the_whole_doo_sabin_cage_keeps_the_limit_surface():
                 fine_points.append(point((face[0], k)))
     fine_faces = [[names[v, frozenset(f)] for v in f] for f in faces]
     fine_faces += [[names[fan[0][0], frozenset(f)] for f in fan] for fan in rings]
-    for v, fan in enumerate(rings):
-        for f, g in zip(fan, rotate(fan, 1), strict=True):
-            w = f[-1]
-            if v < w:
-                fine_faces.append([names[x, frozenset(y)] for x, y in ((v, f), (w, f), (w, g), (v, g))])
+    # Of each edge, between two faces.
+    edges = [(v, f[-1], f, g) for v, fan in enumerate(rings) for f, g in zip(fan, rotate(fan, 1), strict=True)]
+    for v, w, f, g in edges:
+        if v < w:
+            fine_faces.append([names[x, frozenset(y)] for x, y in ((v, f), (w, f), (w, g), (v, g))])
     fine, coarse = BruteForce("doo_sabin", fine_points, fine_faces), BruteForce("doo_sabin", points, faces)
     for v, fan in enumerate(rings):
         factor = 2 if len(fan) == 4 else 1
@@ -263,7 +259,7 @@ def test_refining_the_whole_doo_sabin_cage_keeps_the_limit_surface():
 
 
 @pytest.mark.core
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", RULES)
 @pytest.mark.parametrize("valence", range(3, 9))
 def test_limit_masks_equal_the_stored_ones(scheme, valence):
     stored = LIMIT_STENCILS[scheme][str(valence)]
@@ -304,11 +300,10 @@ LIMITS = [
 
 @pytest.mark.parametrize(("scheme", "cage", "at", "element", "corner"), LIMITS)
 def test_samples_tend_to_the_limit(scheme, cage, at, element, corner):
-    expected = limit(scheme, *cage, **at)
-    corner_of_face = corner
     if scheme == "doo_sabin":
-        corner_of_face = [sorted(f) for f in ring(element, cage[1])].index(sorted(cage[1][at["face"]]))
-    near = evaluate(scheme, *cage, element, corner_of_face, 2.0**-200, 2.0**-200)
+        corner = [sorted(f) for f in ring(element, cage[1])].index(sorted(cage[1][at["face"]]))
+    expected = BruteForce(scheme, *cage).limit(**at)
+    near = BruteForce(scheme, *cage).evaluate(element, corner, 2.0**-200, 2.0**-200)
     # Normals differ by (lambda_4 / lambda_2)^n, which is 2^-n or less for all of these but Catmull-Clark and Loop above
     # valence 4; positions by lambda_2^n.
     assert gap(near.p, expected.p) < Decimal(2) ** -99
@@ -327,11 +322,11 @@ def test_digits_are_enough(scheme, cage, element, corner):
 
 def test_refuses_what_it_cannot_evaluate():
     points, faces = double_pole(5)
-    with pytest.raises(ValueError, match="extraordinary"):
-        evaluate("catmull_clark", points, faces, 0, 0, 0, 0)
-    with pytest.raises(ValueError, match="outside the domain"):
-        evaluate("catmull_clark", points, faces, 0, 0, 1.5, 0)
-    with pytest.raises(ValueError, match="boundary"):
-        evaluate("catmull_clark", points, faces[1:], 0, 0, 0.5, 0.5)
-    with pytest.raises(ValueError, match="outside the domain"):
-        evaluate("loop", *bipyramid(3), 0, 0, 0.75, 0.5)
+    for scheme, cage, uv, message in (
+        ("catmull_clark", (points, faces), (0, 0), "extraordinary"),
+        ("catmull_clark", (points, faces), (1.5, 0), "outside the domain"),
+        ("catmull_clark", (points, faces[1:]), (0.5, 0.5), "boundary"),
+        ("loop", bipyramid(3), (0.75, 0.5), "outside the domain"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            BruteForce(scheme, *cage).evaluate(0, 0, *uv)
