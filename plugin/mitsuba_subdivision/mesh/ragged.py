@@ -41,8 +41,8 @@ def offsets(lengths: ArrayLike, dtype: type[np.signedinteger] = np.int64) -> NDA
 
 def index_in_row(lengths: IntArray) -> NDArray[np.int64]:
     """``(lengths.sum(),)`` the index of each entry in its row, from 0 on."""
-    begins = np.repeat(starts(lengths), lengths)
-    return np.arange(len(begins)) - begins
+    found = np.repeat(starts(lengths), lengths)
+    return np.subtract(np.arange(len(found)), found, out=found)
 
 
 def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
@@ -67,7 +67,8 @@ def sorted_order(keys: IntArray) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) < 1 << (63 - bits):
         # A key and its place fit into 63 bits. Numbers sort several times faster than indices into them.
-        in_order: IntArray = keys.astype(np.int64) << bits | np.arange(len(keys))
+        in_order: IntArray = np.left_shift(keys, bits, dtype=np.int64)
+        in_order |= np.arange(len(keys))
         in_order.sort()
         order = (in_order & ((1 << bits) - 1)).astype(np.int32)
         in_order >>= bits

@@ -73,10 +73,13 @@ class AdaptiveGrid:
     def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Numbers of the samples on sides, and the first of each number; of the same points, as `PatchFrames.names`."""
         name, at = np.empty(len(self.side), dtype=np.int64), np.empty((2, len(self.side)), dtype=np.int32)
-        points = self._on_sides(self.side, self.along)
+        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
         for block in chunks_of(len(self.side)):
-            corner, own = self.tiles["corner"][self.side[block] // self._corner_count], points[:, block]
-            name[block], at[:, block] = self.frames.names(corner, own.astype(np.int32), edge, vertex)
+            side = self.side[block]
+            points = self._on_sides(corners, side, self.along[block]).astype(np.int32)
+            corner = self.tiles["corner"][side // self._corner_count]
+            name[block], at[:, block] = self.frames.names(corner, points, edge, vertex)
+        del corners
         shift = _unused_bits(at)
         (x, y), bits = at >> shift, BITS - shift
         return _ranked(_joined(name, x.astype(np.int64) << bits | y, 2 * bits))
@@ -152,15 +155,11 @@ class AdaptiveGrid:
             found[begin[own.start] : begin[own.stop]] = triangles
         return found
 
-    def _on_sides(self, side: IntArray, along: FloatArray) -> FloatArray:
-        """``(2, n)`` points on sides of tiles, in their patches, in parts of `UNIT`."""
-        found, m = np.empty((2, len(side))), self._corner_count
-        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
-        for block in chunks_of(len(side)):
-            own = side[block]
-            begin, end = corners[:, own], corners[:, own + np.where(own % m == m - 1, 1 - m, 1)]
-            found[:, block] = begin + (end - begin) * along[block]
-        return found
+    def _on_sides(self, corners: IndexArray, side: IntArray, along: FloatArray) -> FloatArray:
+        """``(2, n)`` points on sides of tiles with some corners ``(2, m t)``, in their patches, in parts of `UNIT`."""
+        m = self._corner_count
+        begin, end = corners[:, side], corners[:, side + np.where(side % m == m - 1, 1 - m, 1)]
+        return begin + (end - begin) * along
 
     def _inner_parameters(self) -> tuple[IndexArray, FloatArray]:
         """The tile of each inner sample, and its parameters ``(2, n)`` in the tile's patch, in parts of `UNIT`."""
@@ -186,7 +185,8 @@ class AdaptiveGrid:
         """
         _, first = self._numbers
         tile, parameters = self._inner_parameters()
-        on_sides = self._on_sides(self.side[first], self.along[first])
+        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
+        on_sides = self._on_sides(corners, self.side[first], self.along[first])
         tile = np.concatenate([self.side[first] // self._corner_count, tile])
         return tile, np.concatenate([on_sides, parameters], axis=1)
 
@@ -226,7 +226,9 @@ class AdaptiveGrid:
         tile, triangles = self._tile(), self._sample_triangles()
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
-        samples = np.concatenate([self._on_sides(self.side, self.along), self._inner_parameters()[1]], axis=1)
+        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
+        on_sides = self._on_sides(corners, self.side, self.along)
+        samples = np.concatenate([on_sides, self._inner_parameters()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, triangles[:, i]]) for i in range(3)]
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
@@ -256,21 +258,26 @@ def _samples_on_sides(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, Fl
     counts = 1 << np.ceil(np.log2(wanted.ravel())).astype(np.int32)
     step = way // counts
     shift = _unused_bits(begin | step)
-    keys = line.astype(np.int64) << (BITS - shift) | begin >> shift
+    keys = np.left_shift(line, BITS - shift, dtype=np.int64)
+    keys |= begin >> shift
     points = ragged.index_in_row(counts + 1)
     points *= np.repeat(step >> shift, counts + 1)
     points += np.repeat(keys, counts + 1)
+    del line, begin, step, wanted
     # Where the samples of each side begin and end in those of its line.
     number, first = _ranked(points)
     end = np.cumsum(counts + 1, dtype=np.int32) - 1
     begin, end, points = number[end - counts], number[end], points[first]
+    del number, first
     counts = np.abs(end - begin)
     side = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-    at = ragged.index_in_row(counts) * np.repeat(np.sign(way), counts)
-    at += np.repeat(begin, counts)
+    at = ragged.index_in_row(counts)
+    at *= np.sign(way)[side]
+    at += begin[side]
     along = points[at]
-    along -= np.repeat(keys, counts)
-    return side, along / np.repeat(way >> shift, counts)
+    along -= keys[side]
+    del at, keys, points
+    return side, along / (way >> shift)[side]
 
 
 def _unused_bits(positions: IndexArray) -> int:
