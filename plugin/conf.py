@@ -36,8 +36,6 @@ numpydoc_show_class_members = False
 default_role = "py:obj"
 
 _TOP = Path(__file__).resolve().parents[1]
-# Names between backticks are links where the reference has them.
-default_role = "py:obj"
 
 
 def setup(app):

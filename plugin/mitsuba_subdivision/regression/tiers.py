@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import ImageError
 
-# Names, and what each compares. The functions are in `compare.COMPARED_BY`.
+# Names, and what each compares. The functions are in `compare`.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
     "paired": "pixels from the same samples, which must be the same",

@@ -471,9 +471,8 @@ class LimitSurface:
         Parameters
         ----------
         variant : module or str
-            ``mitsuba`` with a variant set,
-            a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb".
-            It determines backend, precision and derivatives; in scalar variants each call evaluates one point.
+            ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb". It
+            determines backend, precision and derivatives.
         evaluator : "stabilized" or "stam"
 
         Returns
@@ -484,7 +483,7 @@ class LimitSurface:
         Raises
         ------
         ValueError
-            If the variant is unknown or none is set, or the evaluator is another one.
+            If the variant is unknown or scalar, or none is set, or the evaluator is another one.
         SchemeError
             As `pieces`.
         """
