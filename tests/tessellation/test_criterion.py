@@ -297,3 +297,18 @@ def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():
             return len(surface.adaptive_sampling(criterion, 64).triangles)
 
     assert triangles(1.0) > 2 * triangles(0.0)
+
+
+def test_a_displaced_border_has_what_the_displacement_leaves_of_the_limit():
+    """On a flat sheet with a curved border, heights that take most of the limit leave the border a tenth."""
+    surface, error = FLAT, 1e-2
+
+    def triangles(taken):
+        def heights(_, uv):
+            return np.where(uv[:, 0] > 0.5, taken * error, 0.0)
+
+        criterion = Criterion(Measure.CHORD, error, displacement=DisplacementBound(heights, error))
+        with without_warnings():
+            return len(surface.adaptive_sampling(criterion, 64).triangles)
+
+    assert triangles(0.9) > triangles(0.0)

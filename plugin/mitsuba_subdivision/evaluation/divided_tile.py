@@ -1,4 +1,4 @@
-"""Tiles that hold several pieces, and how they are divided: for bounds, before there are samples.
+"""Tiles that hold one piece or several, and how they are divided: for bounds, before there are samples.
 
 A *tile* is the domain of a patch, or one of the four copies of a tile's domain. Tiles are never turned: their
 parameters run as those of the patch, but for the middle copies of triangles, whose run backwards.
@@ -31,7 +31,7 @@ DIVISIONS_OF_NORMALS = 4
 
 
 class DividedTile:
-    """A tile that holds several pieces."""
+    """A tile of one piece or several."""
 
     def __init__(
         self,

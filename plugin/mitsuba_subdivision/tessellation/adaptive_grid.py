@@ -1,8 +1,8 @@
 """Numbering, locations and triangles of an adaptive tessellation.
 
 Tiles of different sizes and rates meet along lines: edges of elements, spokes of polygons, and lines inside patches. A
-side of a tile has a power of two of segments, so that of two rows of samples on a line one contains the other. Each
-tile has all samples that lie on its sides, whichever tiles they come from: there are no cracks.
+side of a tile asks for a power of two of segments, so that of two rows of samples on a line one contains the other.
+Each tile has all samples that lie on its sides, whichever tiles they come from: there are no cracks.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class AdaptiveGrid:
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
         """The grid of some tiles; tiles of elements that meet more than once get more segments."""
         t, m = frames.topology, frames.domain.corner_count
-        is_pair = (t.vertex_face_count <= 2) & ~t.is_border_vertex
+        is_pair = (t.vertex_face_count > 0) & (t.vertex_face_count <= 2) & ~t.is_border_vertex
         # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and both
         # would have the same triangle.
         keeps = _at_vertices(is_pair, tiles, frames) if is_pair.any() else None
@@ -48,7 +48,7 @@ class AdaptiveGrid:
         if keeps is not None:
             has_more |= keeps.any(axis=1)
         if has_more.any():
-            # Enough segments that no inner edge joins two points of the sides.
+            # Enough segments that no inner edge joins two points of the sides, but for those that cut corners off.
             least = np.where(has_more, 3 if m == 3 else 2, 1).astype(np.int32)
             tiles = tiles.copy()
             tiles["rates"] = np.maximum(tiles["rates"], least[:, None])
@@ -255,7 +255,8 @@ def _samples_on_sides(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, Fl
     wanted = np.maximum(
         tiles["rates"][:, [0, 1, 0, 1] if frames.domain.corner_count == 4 else [0, 0, 0]], tiles["sides"]
     )
-    counts = 1 << np.ceil(np.log2(wanted.ravel())).astype(np.int32)
+    # Powers of two, rounded up.
+    counts = 1 << np.frexp(wanted.ravel() - 0.5)[1]
     step = way // counts
     shift = _unused_bits(begin | step)
     keys = np.left_shift(line, BITS - shift, dtype=np.int64)

@@ -193,9 +193,7 @@ class Criterion:
         return SQUARE_ERROR * (len(heights) - 1) ** 2 * np.stack([np.abs(each).max(axis=(0, 1)) for each in second])
 
     def segments(self, second: FloatArray, limit: FloatArray) -> IntArray:
-        """``(t,)`` segments that keep curves to a limit, by their second derivatives ``(b, 3, t)``; one for edges."""
-        if self.measure is Measure.EDGE:
-            return np.ones(len(limit), dtype=np.int64)
+        """``(t,)`` segments that keep curves to a limit, by their second derivatives ``(b, 3, t)``."""
         furthest = SQUARE_ERROR * np.sqrt(dot(second, second).max(axis=0))
         return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
 

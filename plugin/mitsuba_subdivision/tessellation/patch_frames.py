@@ -12,7 +12,8 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 
-# Parameters of patches in integers are multiples of this part of a patch: corners of tiles are divided by 16 at most.
+# Parameters of patches in integers are multiples of this part of a patch: a side of the smallest tile that is divided,
+# of a depth of 22, has 64 parts, and at most 32 segments, as tiles have triangles.
 UNIT = 1 << 28
 # An edge of an element, along which a patch of a polygon reaches half way, in the same parts.
 EDGE = 2 * UNIT
@@ -71,7 +72,9 @@ class PatchFrames:
         """Names of points: equal where points are the same, and lie on edges and vertices of equal numbers.
 
         A point lies inside a patch, on an edge of its element, at the end of one, or on a spoke of a polygon, which
-        joins the middle of an edge to the centre: two patches at corners of the polygon meet there.
+        joins the middle of an edge to the centre: two patches at corners of the polygon meet there. By the numbers of
+        these frames, both sides of a crease are the same; by those of a topology, each is by itself. Vertices of one
+        that is cut further may have the numbers of edges, but only they have the position zero.
 
         Returns
         -------
@@ -100,14 +103,15 @@ class PatchFrames:
             u, v, own, before = u[others], v[others], corner[others], t.prev[corner[others]]
             for beyond, along, spoke in ((u, v, own), (v, u, before)):
                 on = np.flatnonzero(beyond == UNIT)
-                name[others[on]], at[0, others[on]], at[1, others[on]] = on_spoke + spoke[on], along[on], 0
+                name[others[on]] = on_spoke + spoke[on].astype(np.int64)
+                at[0, others[on]], at[1, others[on]] = along[on], 0
             on = np.flatnonzero((u == UNIT) & (v == UNIT))
-            name[others[on]], at[:, others[on]] = at_centre + t.face[own[on]], 0
+            name[others[on]], at[:, others[on]] = at_centre + t.face[own[on]].astype(np.int64), 0
             for distance, position, line in ((v, u, own), (u, EDGE - v, before)):
                 on = np.flatnonzero(distance == 0)
                 found.append((others[on], line[on], position[on]))
         for on, half_edge, position in found:
-            name[on], at[1, on] = on_edge + edge[half_edge], 0
+            name[on], at[1, on] = on_edge + edge[half_edge].astype(np.int64), 0
             at[0, on] = np.where(self.is_backward[half_edge], EDGE - position, position)
         # The end of each edge is the beginning of the next one.
         for on, half_edge, position in found:
@@ -119,7 +123,7 @@ class PatchFrames:
     def first_inside(self) -> int:
         """Names of points inside patches begin here, after those of vertices, edges, spokes and centres."""
         t = self.topology
-        return max(self.vertex.max(initial=-1), t.vertex_count - 1) + 1 + 2 * t.half_edge_count + t.face_count
+        return max(int(self.vertex.max(initial=-1)), t.vertex_count - 1) + 1 + 2 * t.half_edge_count + t.face_count
 
     @classmethod
     def of(

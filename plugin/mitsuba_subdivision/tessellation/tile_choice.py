@@ -32,7 +32,7 @@ TILES_AT_ONCE, MOST_WAITING = 1 << 10, 1 << 15
 # for outlines, which few of the parts may have.
 MOST_TRIANGLES, MOST_TRIANGLES_AT_OUTLINE = 32, 18
 # Cosine of the angle by which elements beside a fold differ in their normals, at most.
-FOLDED = -0.1
+FOLD_COSINE = -0.1
 
 
 class _Part(NamedTuple):
@@ -217,7 +217,7 @@ def feature_edges(
         return np.zeros(t.half_edge_count, dtype=bool)
     # Of the elements beside each edge.
     squares = sum(np.square(np.bincount(names, x.take(t.face))) for x in _normals(patches, points))
-    is_fold = (np.bincount(names) != 2) | (squares < 2 + 2 * FOLDED)
+    is_fold = (np.bincount(names) != 2) | (squares < 2 + 2 * FOLD_COSINE)
     return is_fold[names] | ((t.twin < 0) & (criterion.outline is not None))
 
 

@@ -71,12 +71,14 @@ class TileRates:
         moved = np.zeros(len(tiles))
         if self.criterion.displacement is not None:
             moved = np.ptp(self._heights(tiles), axis=(0, 1))
+        # What a displacement takes of it.
+        limit = limit - moved
         # A tile that is folded, or has no normal, is tested by its size only.
-        fits = (np.linalg.norm(upper - lower, axis=0) <= limit - moved) & self.scheme.has_convex_rules
+        fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & self.scheme.has_convex_rules
         axis, extent = axis_across(corners), np.full(len(tiles), np.inf)
         at = np.flatnonzero(~fits & axis.any(axis=0))
         extent[at] = _extent(kind, values.take(at, axis=2), axis[None].take(at, axis=2))
-        found = fits | (extent <= limit - moved)
+        found = fits | (extent <= limit)
         at = np.flatnonzero(found & ~fits)
         at = at[_are_folded(kind, ring.take(at, axis=2), axis.take(at, axis=1))]
         found[at] = self._normal_sines(kind, values.take(at, axis=2), axis.take(at, axis=1)) < 1
@@ -178,7 +180,8 @@ class TileRates:
         limit = criterion.limit(points.min(axis=0), points.max(axis=0), cone)
         form = criterion.form(derivatives, tangents, cone, self.domain.corner_count)
         # For the same limit a copy, which is half as large, needs half as many segments: its form is a quarter.
-        return 4 * (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
+        with np.errstate(over="ignore"):
+            return 4 * (form / np.maximum(criterion.bound(limit), TINY)).swapaxes(0, 1)
 
 
 def _extent(kind: DividedTile, values: FloatArray, axes: FloatArray) -> FloatArray:

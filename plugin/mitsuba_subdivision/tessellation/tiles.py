@@ -30,21 +30,20 @@ def tile_type(corner_count: int) -> np.dtype[np.void]:
             # Whether its parameters run backwards, as those of the middle copies of triangles do. Its corner (0, 0) is
             # then at ``origin + 1``.
             ("is_flipped", np.bool_),
-            # How often an edge of the cage is halved to a tile's side; around extraordinary points, an edge of a ring
+            # How often an edge of the patch is halved to a tile's side; around extraordinary points, an edge of a ring
             ("halvings", np.int32),
             # Segments along u and v; over triangles both are the same
             ("rates", np.int32, 2),
-            # Least segments on each side: more than the rates where an outline may run along a border of the mesh,
-            # which the boundary of the cage and the sides of creases are. 0 inside.
+            # Least segments on each side that lies on a feature edge, see `feature_edges`; 0 elsewhere
             ("sides", np.int32, corner_count),
         ]
     )
 
 
-def whole_patches(corners: IntArray, is_border: NDArray[np.bool_]) -> Tiles:
-    """One tile for each patch that begins at these corners; and which sides ``(t, m)`` are borders."""
-    found = np.zeros(len(corners), dtype=tile_type(is_border.shape[1]))
-    found["corner"], found["rates"], found["sides"] = corners, 1, is_border
+def whole_patches(corners: IntArray, is_feature: NDArray[np.bool_]) -> Tiles:
+    """One tile for each patch that begins at these corners, of which some sides ``(t, m)`` lie on feature edges."""
+    found = np.zeros(len(corners), dtype=tile_type(is_feature.shape[1]))
+    found["corner"], found["rates"], found["sides"] = corners, 1, is_feature
     return found
 
 
