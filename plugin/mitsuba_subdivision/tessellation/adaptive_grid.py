@@ -73,7 +73,7 @@ class AdaptiveGrid:
     def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Numbers of the samples on sides, and the first of each number; of the same points, as `PatchFrames.names`."""
         name, at = np.empty(len(self.side), dtype=np.int64), np.empty((2, len(self.side)), dtype=np.int32)
-        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
+        corners = self._corners()
         for block in chunks_of(len(self.side)):
             side = self.side[block]
             points = self._on_sides(corners, side, self.along[block]).astype(np.int32)
@@ -155,8 +155,12 @@ class AdaptiveGrid:
             found[begin[own.start] : begin[own.stop]] = triangles
         return found
 
+    def _corners(self) -> IndexArray:
+        """``(2, m t)`` where the sides of all tiles begin, in their patches, in parts of `UNIT`."""
+        return corner_points(self.tiles, self.frames.domain).reshape(2, -1)
+
     def _on_sides(self, corners: IndexArray, side: IntArray, along: FloatArray) -> FloatArray:
-        """``(2, n)`` points on sides of tiles with some corners ``(2, m t)``, in their patches, in parts of `UNIT`."""
+        """``(2, n)`` points on sides of tiles with these `_corners`, in their patches, in parts of `UNIT`."""
         m = self._corner_count
         begin, end = corners[:, side], corners[:, side + np.where(side % m == m - 1, 1 - m, 1)]
         return begin + (end - begin) * along
@@ -185,7 +189,7 @@ class AdaptiveGrid:
         """
         _, first = self._numbers
         tile, parameters = self._inner_parameters()
-        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
+        corners = self._corners()
         on_sides = self._on_sides(corners, self.side[first], self.along[first])
         tile = np.concatenate([self.side[first] // self._corner_count, tile])
         return tile, np.concatenate([on_sides, parameters], axis=1)
@@ -226,7 +230,7 @@ class AdaptiveGrid:
         tile, triangles = self._tile(), self._sample_triangles()
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
         turn, corner = self._nearest_corner(tile, middle)
-        corners = corner_points(self.tiles, self.frames.domain).reshape(2, -1)
+        corners = self._corners()
         on_sides = self._on_sides(corners, self.side, self.along)
         samples = np.concatenate([on_sides, self._inner_parameters()[1]], axis=1)
         uv = [self._seen(tile, turn, samples[:, triangles[:, i]]) for i in range(3)]

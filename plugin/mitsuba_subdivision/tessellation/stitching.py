@@ -56,6 +56,12 @@ class SideSamples:
         found[(self.first + self.counts).ravel() - 1] = 1
         return found
 
+    @cached_property
+    def middles(self) -> FloatArray:
+        """``(n,)`` middle of the segment that begins at each sample, along its side."""
+        found: FloatArray = (self.along + self.following) / 2
+        return found
+
     def around(self, tile: IntArray, place: IntArray) -> IntArray:
         """The samples so many places after the first one of tiles, in a circle."""
         found: IntArray = self.first[tile, 0] + place % self.totals[tile]
@@ -171,8 +177,9 @@ def _around_inner(
     # Each row of inner samples along a side, but for its last one, with which the next row begins.
     n = rates[tiles][:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]]
     lengths = n - (2 if m == 4 else 3)
+    rim_counts = lengths.sum(axis=1)
     side = np.repeat(np.tile(np.arange(m), len(tiles)), lengths.ravel())
-    own, k = np.repeat(tiles, lengths.sum(axis=1)), ragged.index_in_row(lengths.ravel()) + 1
+    own, k = np.repeat(tiles, rim_counts), ragged.index_in_row(lengths.ravel()) + 1
     n_u, n_v = rates[own].T
     if m == 4:
         u, v = np.choose(side, [k, n_u - 1, n_u - k, 1]), np.choose(side, [1, k, n_v - 1, n_v - k])
@@ -180,9 +187,9 @@ def _around_inner(
     else:
         u, v = np.choose(side, [k, n_u - 1 - k, 1]), np.choose(side, [1, k, n_u - 1 - k])
         middle = side + (k + 1) / n_u
-    rim = _closed(first_inner[own] + _inner_sample(rates[own], u, v, m), lengths.sum(axis=1), first_inner[tiles])
-    passed = _passed((position + following) / 2, outer_counts, middle, lengths.sum(axis=1))
-    found = _strips(tiles, _closed(outer, outer_counts, outer[begins]), outer_counts, rim, lengths.sum(axis=1), passed)
+    rim = _closed(first_inner[own] + _inner_sample(rates[own], u, v, m), rim_counts, first_inner[tiles])
+    passed = _passed((position + following) / 2, outer_counts, middle, rim_counts)
+    found = _strips(tiles, _closed(outer, outer_counts, outer[begins]), outer_counts, rim, rim_counts, passed)
     return found + _corners(sides, is_first, is_last, np.argwhere(is_cut))
 
 
@@ -204,11 +211,10 @@ def _corners(
     left_counts = near[1][end] - near[1][sides.first[tile, previous]]
     right = ragged.ranges(begin, counts + 1)
     left = np.repeat(end - 1, left_counts + 1) - ragged.index_in_row(left_counts + 1)
-    middles = (sides.along + sides.following) / 2
     passed = _passed(
-        middles[ragged.ranges(begin, counts)],
+        sides.middles[ragged.ranges(begin, counts)],
         counts,
-        1 - middles[np.repeat(end - 2, left_counts) - ragged.index_in_row(left_counts)],
+        1 - sides.middles[np.repeat(end - 2, left_counts) - ragged.index_in_row(left_counts)],
         left_counts,
     )
     return _strips(tile, right, counts, left, left_counts, np.maximum(passed, 1))
@@ -238,7 +244,7 @@ def _across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> list[tuple[
     else:
         position = np.choose(turn, [along, 1.0, 1 - along, 0.0])
     segment = np.flatnonzero(place < across[strip])
-    middles = ((sides.along + sides.following) / 2)[ragged.ranges(sides.first[tiles, base], length)]
+    middles = sides.middles[ragged.ranges(sides.first[tiles, base], length)]
     passed = _passed(middles, length, (position[segment] + position[segment + 1]) / 2, across)
     # Where the neighbouring side has samples of its own, triangles with the base's end would be flat.
     strip = strip[segment]

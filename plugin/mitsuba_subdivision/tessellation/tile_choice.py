@@ -161,13 +161,14 @@ def _taken(parts: list[_Part]) -> _Part:
 def _decided(rates: TileRates, part: _Part) -> tuple[Tiles, _Part]:
     """Tiles that are not to be divided, with their rates; and all others."""
     kind, tiles, values = part
+    heights = rates.heights(tiles)
     # Single precision resolves nothing nearer to an extraordinary point. Elsewhere rates decrease.
-    is_flat = rates.are_flat(kind, tiles, values) | (tiles["depth"] >= DEEPEST - 1)
+    is_flat = rates.are_flat(kind, tiles, values, heights) | (tiles["depth"] >= DEEPEST - 1)
     flat, tiles, values = tiles[is_flat], tiles[~is_flat], values[..., ~is_flat]
     if not len(tiles):
         return flat, _Part(kind, tiles, values)
     if kind.is_piece:
-        tiles = rates.rated(tiles, values)
+        tiles = rates.rated(tiles, values, None if heights is None else heights[..., ~is_flat])
         along_sides = np.minimum(tiles["sides"].max(axis=1), rates.most(tiles))
         most = MOST_TRIANGLES if rates.criterion.outline is None else MOST_TRIANGLES_AT_OUTLINE
         is_done = np.maximum(rates.triangle_counts(tiles), along_sides) <= most

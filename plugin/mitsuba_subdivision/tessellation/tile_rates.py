@@ -61,16 +61,16 @@ class TileRates:
         cells: IntArray = np.minimum(tiles["rates"], self.most(tiles)[:, None]).prod(axis=1, dtype=np.int64)
         return cells * (self.domain.corner_count - 2)
 
-    def are_flat(self, kind: DividedTile, tiles: Tiles, values: FloatArray) -> NDArray[np.bool_]:
+    def are_flat(
+        self, kind: DividedTile, tiles: Tiles, values: FloatArray, heights: FloatArray | None = None
+    ) -> NDArray[np.bool_]:
         """``(t,)`` whether one pair of triangles is near enough to the surface over each tile, and along features."""
         corners, ring = times(kind.corners, values), kind.one_ring_points(values)
         lower, upper = ring.min(axis=0), ring.max(axis=0)
         limit = self.criterion.limit(lower, upper, NormalCone.of_any(len(tiles)))
         if self.criterion.measure is Measure.EDGE:
             return _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles))) <= limit
-        moved = np.zeros(len(tiles))
-        if self.criterion.displacement is not None:
-            moved = np.ptp(self._heights(tiles), axis=(0, 1))
+        moved = np.zeros(len(tiles)) if heights is None else np.ptp(heights, axis=(0, 1))
         # What a displacement takes of it.
         limit = limit - moved
         # A tile that is folded, or has no normal, is tested by its size only.
@@ -100,11 +100,11 @@ class TileRates:
                 found[at] = np.hypot(*(np.ptp(dot(curve, way), axis=0) for way in across)) <= limit[at]
         return found
 
-    def rated(self, tiles: Tiles, coefficients: FloatArray) -> Tiles:
+    def rated(self, tiles: Tiles, coefficients: FloatArray, heights: FloatArray | None) -> Tiles:
         """Pieces with the rates that the limit needs, which may exceed the highest; see `clipped`."""
         forms = self._forms(coefficients)
-        if self.criterion.displacement is not None:
-            forms += self._form_of_displacement(tiles, coefficients)
+        if heights is not None:
+            forms += self._form_of_displacement(heights, coefficients)
         if self.domain.corner_count == 3:
             rates = np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
         else:
@@ -126,11 +126,11 @@ class TileRates:
         found: FloatArray = NormalCone.of(*map(TangentCone.of, derivatives)).around(axis).sine.max(axis=0)
         return found
 
-    def _heights(self, tiles: Tiles) -> FloatArray:
-        """``(n, n, t)`` heights of the displacement over tiles, by v and by u."""
+    def heights(self, tiles: Tiles) -> FloatArray | None:
+        """``(n, n, t)`` heights of the displacement over tiles, by v and by u; None without one."""
         displacement = self.criterion.displacement
         if displacement is None:
-            raise ValueError("heights were asked for without a displacement")
+            return None
         v, u = np.indices((HEIGHT_SAMPLES,) * 2).reshape(2, -1, 1) / (HEIGHT_SAMPLES - 1)
         if self.domain.corner_count == 3:
             # What is outside lies in the next element; the samples are mirrored at the diagonal.
@@ -144,13 +144,11 @@ class TileRates:
         found = displacement.heights(corner, np.stack([(u * scale).ravel(), (v * scale).ravel()], axis=1))
         return found.reshape(HEIGHT_SAMPLES, HEIGHT_SAMPLES, -1)
 
-    def _form_of_displacement(self, tiles: Tiles, coefficients: FloatArray) -> FloatArray:
+    def _form_of_displacement(self, heights: FloatArray, coefficients: FloatArray) -> FloatArray:
         """``(1, 3, t)`` what the displacement adds to the forms of tiles."""
-        any_normal = NormalCone.of_any(len(tiles))
+        any_normal = NormalCone.of_any(heights.shape[2])
         limit = self.criterion.limit(coefficients.min(axis=0), coefficients.max(axis=0), any_normal)
-        a, b, c = self.criterion.form_of_displacement(self._heights(tiles)) / np.maximum(
-            self.criterion.bound(limit), TINY
-        )
+        a, b, c = self.criterion.form_of_displacement(heights) / np.maximum(self.criterion.bound(limit), TINY)
         if self.domain.corner_count == 3:
             return np.stack([a + 2 * b + c, 0 * b, 0 * c])[None]
         return np.stack([a, b, c])[None]
@@ -166,8 +164,7 @@ class TileRates:
                 continue
             of_tile = coefficients[..., on]
             limit = self.criterion.limit(of_tile.min(axis=0), of_tile.max(axis=0), NormalCone.of_any(len(on)))
-            needed = self.criterion.segments(times(second[own], of_tile), limit)
-            sides[on, side] = needed
+            sides[on, side] = self.criterion.segments(times(second[own], of_tile), limit)
         return sides
 
     def _forms(self, coefficients: FloatArray) -> FloatArray:
