@@ -7,10 +7,10 @@ from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements, element_of
+from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows, transition
 from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
 from mitsuba_subdivision.evaluation.refined_rings import refined_ring
-from mitsuba_subdivision.evaluation.sampled_polynomials import sampled_polynomials
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
 from mitsuba_subdivision.schemes.domain import AffineMap
@@ -153,7 +153,7 @@ def test_children_that_are_no_copies_of_the_domain_are_an_error():
     "use",
     [
         lambda scheme, signature: divided_elements(scheme, [signature]),
-        lambda *own: sampled_polynomials(element_of(*own), np.array([[0.0, 1e-30]]), {}),
+        lambda *own: element_stencils(*own, np.array([[0.0, 1e-30]])),
     ],
     ids=["divided", "sampled"],
 )

@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 from evaluation.common import classes
-from kernels.surfaces import RING, SURFACES, surface_named
-from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube
+from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
 from mitsuba_subdivision.evaluation.sampled_polynomials import PLANE_POWERS, sampled_polynomials
-from reference.refined_cages import tagged
 
 pytestmark = pytest.mark.core
 
@@ -28,15 +25,19 @@ def grid(scheme, rate):
     return uv[scheme.domain.inside(uv) >= 0]
 
 
-def weights_of(scheme, forms, count):
-    """Weights of points and two tangents, and how many polynomials hold each sample."""
-    found, held = np.zeros((3, count, forms[0].rows.shape[2])), np.zeros(count, dtype=int)
-    for powers, form in zip((PLANE_POWERS, polynomial_basis(scheme).powers), forms, strict=True):
-        held += np.bincount(form.sample, minlength=count)
-        if len(form.sample):
-            (s, t), (a, b) = form.st.T[:, :, None], powers.T
+def weights_of(forms, which, own):
+    """Weights of points and two tangents of an element's samples, and how many polynomials hold each of them."""
+    held = np.zeros(own.stop - own.start, dtype=int)
+    found = np.zeros((3, len(held), forms[0][1].rows[which].shape[2]))
+    for powers, polynomials in forms:
+        at = np.flatnonzero(polynomials.polynomial[own] >= 0)
+        held[at] += 1
+        if len(at):
+            (s, t), (a, b) = polynomials.st[own][at].T[:, :, None], powers.T
             factors = s**a * t**b, a * s ** np.maximum(a - 1, 0) * t**b, b * s**a * t ** np.maximum(b - 1, 0)
-            found[:, form.sample] = np.einsum("dnm,nmk->dnk", np.stack(factors), form.rows[form.polynomial])
+            first = sum(map(len, polynomials.rows[:which]))
+            rows = polynomials.rows[which][polynomials.polynomial[own][at] - first]
+            found[:, at] = np.einsum("dnm,nmk->dnk", np.stack(factors), rows)
     return found, held
 
 
@@ -44,10 +45,12 @@ def weights_of(scheme, forms, count):
 @pytest.mark.parametrize("rate", [1, 4, 7])
 def test_polynomials_are_limit_stencils(name, rate):
     scheme, signatures = classes(surface_named(name))
-    uv, known = grid(scheme, rate), {}
-    for signature in signatures:
+    uv, elements = grid(scheme, rate), [element_of(scheme, signature) for signature in signatures]
+    both = sampled_polynomials(scheme, elements, [uv] * len(elements))
+    forms = list(zip((PLANE_POWERS, polynomial_basis(scheme).powers), both, strict=True))
+    for which, signature in enumerate(signatures):
         expected = element_stencils(scheme, signature, uv)
-        found, held = weights_of(scheme, sampled_polynomials(element_of(scheme, signature), uv, known), len(uv))
+        found, held = weights_of(forms, which, slice(which * len(uv), (which + 1) * len(uv)))
         assert (held == 1).all()
         np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=ROUNDED * np.abs(expected[0]).max())
         np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
@@ -61,22 +64,12 @@ def test_polynomials_are_limit_stencils(name, rate):
 
 def test_few_samples_have_planes_and_many_a_polynomial():
     scheme, signatures = classes(surface_named("cube"))
-    element = element_of(scheme, signatures[0])
+    elements = [element_of(scheme, signatures[0])]
     # An extraordinary point at each corner: four children, with three regular pieces at each level.
-    planes, others = sampled_polynomials(element, grid(scheme, 2), {})
-    assert (len(planes.rows), len(others.rows)) == (9, 0)
-    planes, others = sampled_polynomials(element, grid(scheme, 16), {})
-    assert len(planes.sample) + len(others.sample) == 17**2
-    assert len(others.sample) > 0.8 * 17**2
-    assert len(others.rows) < len(others.sample) / 4
-
-
-def test_equal_parts_are_found_once():
-    scheme, signatures = classes(LimitSurface(tagged(cube(), creases=[(a, b, 5.5) for a, b in RING])))
-    uv, together, alone = grid(scheme, 8), {}, 0
-    for signature in signatures:
-        own = {}
-        for known in (together, own):
-            sampled_polynomials(element_of(scheme, signature), uv, known)
-        alone += len(own)
-    assert len(together) < alone
+    planes, others = sampled_polynomials(scheme, elements, [grid(scheme, 2)])
+    assert (len(planes.rows[0]), len(others.rows[0])) == (9, 0)
+    planes, others = sampled_polynomials(scheme, elements, [grid(scheme, 16)])
+    in_planes, in_others = (np.count_nonzero(each.polynomial >= 0) for each in (planes, others))
+    assert in_planes + in_others == 17**2
+    assert in_others > 0.8 * 17**2
+    assert len(others.rows[0]) < in_others / 4

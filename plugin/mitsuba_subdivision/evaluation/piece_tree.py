@@ -29,7 +29,6 @@ from ..schemes.scheme import Scheme
 from .divided_element import DividedElement, PartKind, divided_elements
 from .equations import times_powers
 from .irregular_patch import IrregularPatch, float32_levels
-from .patch_pieces import Piece
 from .polynomial_basis import polynomial_basis
 
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
@@ -103,12 +102,15 @@ def piece_tree(
     block_count = 0
     # Nodes come in another order than tips.
     is_tip = np.flatnonzero(kinds == PartKind.TIP)
-    for node, tip in zip(is_tip[np.argsort(first[is_tip])].tolist(), _tips(element, piece_levels), strict=True):
+    for node, piece in zip(is_tip[np.argsort(first[is_tip])].tolist(), element.tips, strict=True):
+        tip = _tip(scheme, piece.irregular_patch, piece_levels)
         frames[node], levels[node] = tip.frame, tip.level_count
         first[node], first_block[node] = piece_count, block_count
-        maps.append(PieceMap(piece_count, None, tip.pieces))
-        blocks.append(tip.blocks)
-        piece_count, block_count = piece_count + len(tip.pieces), block_count + len(tip.blocks)
+        maps.append(PieceMap(piece_count, None, tip.pieces @ piece.coordinates))
+        own = (tip.blocks @ piece.coordinates).swapaxes(1, 2).copy()
+        own[: len(tip.second_eigenvector), 0] = tip.second_eigenvector
+        blocks.append(own)
+        piece_count, block_count = piece_count + len(tip.pieces), block_count + len(own)
     return PieceTree(
         kinds,
         turns,
@@ -123,52 +125,26 @@ def piece_tree(
 
 
 class _Tip(NamedTuple):
-    """What makes the polynomials of a tip."""
+    """The polynomials of a tip over the eigen-coordinates."""
 
-    rows: FloatArray  # (n, m, K) float64: over control points: those of its pieces, then blocks
+    pieces: FloatArray  # (n, m, K) float64
+    blocks: FloatArray  # (b, m, K) float64
     # (l, m) float64: what stands in the first blocks in place of weights of the first control point
     second_eigenvector: FloatArray
-    piece_count: int  # Number of pieces
     frame: FrameKind
     level_count: int  # At which level it ends
 
-    @property
-    def pieces(self) -> FloatArray:
-        """As `PieceMap` has them; copied, as blocks are far larger."""
-        return self.rows[: self.piece_count].copy()
 
-    @property
-    def blocks(self) -> FloatArray:
-        """As `PieceTree` has them."""
-        found = self.rows[self.piece_count :].swapaxes(1, 2).copy()
-        found[: len(self.second_eigenvector), 0] = self.second_eigenvector
-        return found
-
-
-def _tips(element: DividedElement, piece_levels: int) -> list[_Tip]:
-    """All tips of an element, over its control points."""
-    if element.piece is not None:
-        return [] if element.piece.patch is None else [_tip(element.scheme, element.piece, piece_levels)]
-    return [
-        tip._replace(rows=tip.rows @ element.child(number)[1])
-        for number, child in enumerate(element.child_elements)
-        if child.tip_count
-        for tip in _tips(child, piece_levels)
-    ]
-
-
-# Around vertices of high valence, tips take some megabytes, and many elements have the same.
+# Around vertices of high valence, tips take some megabytes.
 @lru_cache(maxsize=16)
-def _tip(scheme: Scheme, piece: Piece, piece_levels: int) -> _Tip:
-    """The tip that a piece is, over the control points of its element."""
-    patch, coordinates = piece.irregular_patch, piece.coordinates
+def _tip(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> _Tip:
     basis, polynomials = patch.basis, polynomial_basis(scheme)
     # The regular children's polynomials over the eigen-coordinates.
     rows: FloatArray = polynomials.matrix @ patch.eigen_children
     level_count = float32_levels(patch)
     by_level = level_polynomials(scheme, patch, level_count)
     piece_count = piece_levels * len(rows)
-    rest: FloatArray = np.zeros((2, len(polynomials.powers), len(coordinates)))
+    rest: FloatArray = np.zeros((2, len(polynomials.powers), len(basis.eigenvalues)))
     u, v = (int(np.flatnonzero((polynomials.powers == each).all(axis=1))[0]) for each in ((1, 0), (0, 1)))
     rest[0, [u, v]], rest[1, [u, v]] = basis.subdominant**level_count * patch.edge_tangents, patch.limit_frame
     # Polynomials are about the middle of the domain, and the point itself is at its corner.
@@ -180,8 +156,8 @@ def _tip(scheme: Scheme, piece: Piece, piece_levels: int) -> _Tip:
     if patch.contracts_unevenly:
         blocks.append(_by_level(rows, patch, float(basis.moduli[2]), levels))
         frame, second_eigenvector = FrameKind.UNEVEN, rows[:, :, 1]
-    found = np.concatenate([by_level[:piece_count], *blocks]) @ coordinates
-    return _Tip(found, np.tile(second_eigenvector, (len(levels), 1)), piece_count, frame, level_count)
+    second_eigenvector = np.tile(second_eigenvector, (len(levels), 1))
+    return _Tip(by_level[:piece_count], np.concatenate(blocks), second_eigenvector, frame, level_count)
 
 
 def level_polynomials(scheme: Scheme, patch: IrregularPatch, level_count: int) -> FloatArray:

@@ -74,6 +74,9 @@ class LocatedSamples:
     ----------
     leaf_sample : (s,) int64
         Number of each sample among those of all leaves.
+    path : (s,) int64
+        Of each sample the numbers of the children that it lies in: the digits of base four after a one, the last of
+        them first. Two samples of an element lie in the same leaf if they have the same path.
     jacobian : (2, 2, s) float64
         Derivatives of the parameters in the leaf by the sample's own.
     """
@@ -90,7 +93,7 @@ class LocatedSamples:
         self.leaves: list[Leaves] = []
         self._depths: list[_Depth] = []
         found = self._descend(list(elements), element, uv, corner)
-        self.leaf_sample, self.jacobian = self._ascend(found, len(uv))
+        self.leaf_sample, self.path, self.jacobian = self._ascend(found, len(uv))
 
     def _descend(
         self, elements: list[DividedElement], element: IntArray, uv: FloatArray, turn: IntArray
@@ -147,11 +150,11 @@ class LocatedSamples:
             begin += end
         return found
 
-    def _ascend(self, found: list[tuple[int, IntArray, IntArray]], count: int) -> tuple[IntArray, FloatArray]:
-        """``leaf_sample`` and ``jacobian``."""
+    def _ascend(self, found: list[tuple[int, IntArray, IntArray]], count: int) -> tuple[IntArray, IntArray, FloatArray]:
+        """``leaf_sample``, ``path`` and ``jacobian``."""
         domain = self.scheme.domain
         numbers = [np.empty(int(depth.first[-1]), dtype=np.int64) for depth in self._depths]
-        speeds = [np.ones(len(each)) for each in numbers]
+        paths, speeds = ([np.ones(len(each), dtype=dtype) for each in numbers] for dtype in (np.int64, np.float64))
         begin = 0
         for depth, samples, _ in found:
             numbers[depth][samples] = np.arange(begin, begin + len(samples))
@@ -160,11 +163,12 @@ class LocatedSamples:
             for element, number, samples, _, below in self._depths[depth].groups:
                 speed = self._depths[depth].elements[element].domains[number].matrix[0, 0]
                 numbers[depth][samples] = numbers[depth + 1][below]
+                paths[depth][samples] = 4 * paths[depth + 1][below] + number
                 speeds[depth][samples] = speed * speeds[depth + 1][below]
         turns = np.concatenate([turn for *_, turn in found]) if found else np.empty(0, dtype=np.int64)
         matrices = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)])
         rotations = matrices[turns[numbers[0]]] if count else np.empty((0, 2, 2))
-        return numbers[0], np.moveaxis(rotations * speeds[0][:, None, None], 0, -1)
+        return numbers[0], paths[0], np.moveaxis(rotations * speeds[0][:, None, None], 0, -1)
 
     def chosen(self, which: IntArray) -> LocatedSamples:
         """Some of the samples, in increasing order."""

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from ..evaluation.divided_element import element_of
 from ..evaluation.normals import LEAST_EXTENT, unit_normals
 from ..evaluation.polynomial_basis import monomial_values, polynomial_basis
-from ..evaluation.sampled_polynomials import PLANE_POWERS, Known, Polynomials, sampled_polynomials
+from ..evaluation.sampled_polynomials import PLANE_POWERS, Polynomials, sampled_polynomials
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchClass
-from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
@@ -151,48 +150,31 @@ def vertex_polynomials(
     number = np.empty(len(classes), dtype=np.int64)
     number[used] = np.arange(len(used))
     classes, uv = [classes[index] for index in used], [uv[index] for index in used]
-    known: Known = {}
-    found = [
-        sampled_polynomials(element_of(scheme, each.signature), own, known)
-        for each, own in counted(list(zip(classes, uv, strict=True)), "Polynomials of patch classes")
-    ]
+    elements = [element_of(scheme, each.signature) for each in classes]
+    forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), sampled_polynomials(scheme, elements, uv), strict=True)
     # Samples are counted through all classes from now on.
     first_sample = ragged.offsets([len(own) for own in uv])
     runs = runs._replace(
         patch_class=number[runs.patch_class],
         samples=np.repeat(first_sample[number[runs.patch_class]], runs.counts) + runs.samples,
     )
-    forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), zip(*found, strict=True), strict=True)
-    return tuple(
-        _of_form(powers, classes, parts, first_sample, runs)
-        for powers, parts in forms
-        if any(len(part.rows) for part in parts)
-    )
+    return tuple(_of_form(powers, classes, found, runs) for powers, found in forms if (found.polynomial >= 0).any())
 
 
 def _of_form(
-    powers: IntArray,
-    classes: Sequence[PatchClass],
-    parts: Sequence[Polynomials],
-    first_sample: IntArray,
-    runs: VertexRuns,
+    powers: IntArray, classes: Sequence[PatchClass], polynomials: Polynomials, runs: VertexRuns
 ) -> VertexPolynomials:
     """Polynomials of the same monomials of all classes."""
-    block_counts = np.array([len(part.rows) for part in parts])
-    class_of_block = np.repeat(np.arange(len(parts)), block_counts)
+    class_of_block = np.repeat(np.arange(len(classes)), [len(rows) for rows in polynomials.rows])
     blocks = np.array([(each.first_control, *each.controls.shape) for each in classes])[class_of_block]
     of_size: dict[int, list[FloatArray]] = {}
-    for part in parts:
-        if len(part.rows):
-            of_size.setdefault(part.rows.shape[2], []).append(part.rows)
+    for rows in polynomials.rows:
+        if len(rows):
+            of_size.setdefault(rows.shape[2], []).append(rows)
     weights = tuple(map(np.concatenate, of_size.values()))
-    block_of_sample, st = np.full(int(first_sample[-1]), -1), np.zeros((int(first_sample[-1]), 2))
-    for part, block, start in zip(parts, ragged.starts(block_counts), first_sample[:-1], strict=True):
-        block_of_sample[start + part.sample] = block + part.polynomial
-        st[start + part.sample] = part.st
-    kind, entry, first_entry = _divided_kinds(runs, block_of_sample)
+    kind, entry, first_entry = _divided_kinds(runs, polynomials.polynomial)
     sample = runs.samples[entry]
-    st, block = st[sample], block_of_sample[sample]
+    st, block = polynomials.st[sample], polynomials.polynomial[sample]
     run, own_kind = _divided_runs(runs, kind[first_entry])
     run_block, patch = block[first_entry][own_kind], runs.patch[run]
     # Polynomials of some neighbouring patches are neighbours, block by block: their vertices stay in a core's cache.
