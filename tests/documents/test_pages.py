@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, regular_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, regular_signature
 from mitsuba_subdivision.mesh.signature import Signature
 from mitsuba_subdivision.schemes import scheme_named
 

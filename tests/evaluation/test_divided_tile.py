@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from evaluation.common import classes, patch_table_of
 from kernels.surfaces import SURFACES, surface_named
-from mitsuba_subdivision.evaluation.bernstein import regular_bernstein
-from mitsuba_subdivision.evaluation.divided_element import divided_elements
 from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.evaluation.patch_tree import patch_trees
+from mitsuba_subdivision.evaluation.polynomials import regular_bernstein
 from mitsuba_subdivision.schemes.domain import IDENTITY
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
@@ -29,7 +29,7 @@ def points_of_patches(surface):
 
 def parts(scheme, signature):
     """Of all parts that divisions lead to, the map to the element's parameters, and what they are."""
-    (element,) = divided_elements(scheme, [signature])
+    (element,) = patch_trees(scheme, [signature])
     waiting = [(IDENTITY, part_of_tile(element, np.eye(element.control_count)))]
     for _ in range(DEPTH if signature.is_semi_sharp else SMOOTH_DEPTH):
         yield from waiting
@@ -74,7 +74,7 @@ def test_control_points_of_convex_rules_contain_the_surface(name):
 
 @pytest.mark.core
 def test_tiles_that_are_divided_alike_are_the_same():
-    (element,) = divided_elements(*classes(surface_named("cube")))
+    (element,) = patch_trees(*classes(surface_named("cube")))
     tile, again = (part_of_tile(element, np.eye(element.control_count))[0] for _ in range(2))
     assert tile is again
     tips = [tip for tip, _ in tile.children]

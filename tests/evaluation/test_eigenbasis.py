@@ -6,7 +6,7 @@ import pytest
 from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
 from mitsuba_subdivision.evaluation.equations import times_powers
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, isolated_signature
 from mitsuba_subdivision.schemes import CatmullClark
 from reference.exact_samples import subdominant
 from scipy.linalg import block_diag

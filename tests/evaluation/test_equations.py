@@ -12,7 +12,7 @@ from mitsuba_subdivision.evaluation.equations import (
     stam_rows,
 )
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, isolated_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, isolated_signature
 from mitsuba_subdivision.schemes import scheme_named
 
 # Sums of some twenty terms whose size is about one; derivatives and points are divided by their own factors.

@@ -9,7 +9,7 @@ from evaluation.common import assert_exact, evaluate_from
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
 from mitsuba_subdivision.evaluation.equations import times_powers
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure
 from mitsuba_subdivision.mesh.signature import signature_at
 from patches.closed_cages import cube_with_valence_2
 from reference.bars import DERIVATIVE, NORMAL, POINT

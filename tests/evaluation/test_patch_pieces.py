@@ -4,9 +4,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from evaluation.common import ChangedCatmullClark
-from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, lattice_stencils, rotation_order
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, lattice_stencils, patch_tree, rotation_order
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Signature, signature_at
@@ -31,7 +30,7 @@ def isolated(valence, corner=0):
 @lru_cache
 def pieces(signature, scheme=SCHEME):
     """All pieces of an element."""
-    element = element_of(scheme, signature)
+    element = patch_tree(scheme, signature)
     if element.piece is not None:
         return [element.piece]
     return [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from evaluation.common import EVERY_SCHEME_OBJECT, inside
 from mitsuba_subdivision import SchemeError
-from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis
 from mitsuba_subdivision.schemes import CatmullClark
 
 pytestmark = pytest.mark.core

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from evaluation.common import classes
 from kernels.surfaces import SURFACES, surface_named
-from mitsuba_subdivision.evaluation.divided_element import element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
-from mitsuba_subdivision.evaluation.sampled_polynomials import PLANE_POWERS, sampled_polynomials
+from mitsuba_subdivision.evaluation.located_samples import PLANE_POWERS, sampled_polynomials
+from mitsuba_subdivision.evaluation.patch_tree import patch_tree
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis
 
 pytestmark = pytest.mark.core
 
@@ -45,7 +45,7 @@ def weights_of(forms, which, own):
 @pytest.mark.parametrize("rate", [1, 4, 7])
 def test_polynomials_are_limit_stencils(name, rate):
     scheme, signatures = classes(surface_named(name))
-    uv, elements = grid(scheme, rate), [element_of(scheme, signature) for signature in signatures]
+    uv, elements = grid(scheme, rate), [patch_tree(scheme, signature) for signature in signatures]
     both = sampled_polynomials(scheme, elements, [uv] * len(elements))
     forms = list(zip((PLANE_POWERS, polynomial_basis(scheme).powers), both, strict=True))
     for which, signature in enumerate(signatures):
@@ -64,7 +64,7 @@ def test_polynomials_are_limit_stencils(name, rate):
 
 def test_few_samples_have_planes_and_many_a_polynomial():
     scheme, signatures = classes(surface_named("cube"))
-    elements = [element_of(scheme, signatures[0])]
+    elements = [patch_tree(scheme, signatures[0])]
     # An extraordinary point at each corner: four children, with three regular pieces at each level.
     planes, others = sampled_polynomials(scheme, elements, [grid(scheme, 2)])
     assert (len(planes.rows[0]), len(others.rows[0])) == (9, 0)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, eigenbasis
-from mitsuba_subdivision.evaluation.patch_pieces import irregular_structure, regular_signature
-from mitsuba_subdivision.evaluation.tangent_frame import limit_frame
+from mitsuba_subdivision.evaluation.normals import limit_frame
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, regular_signature
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
 from mitsuba_subdivision.schemes import scheme_named

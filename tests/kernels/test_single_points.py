@@ -12,7 +12,7 @@ from mitsuba_subdivision.kernels import line_intersection
 from mitsuba_subdivision.kernels.affine_map import AffineMap
 from mitsuba_subdivision.kernels.line_intersection import ON_LINE
 from mitsuba_subdivision.kernels.triangle_locations import UniformLocations
-from mitsuba_subdivision.kernels.unit_normal import UnitNormal
+from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal
 from reference.refined_cages import tagged
 
 pytestmark = pytest.mark.core

@@ -14,7 +14,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, tetrahedron, torus
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
-from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS
+from mitsuba_subdivision.evaluation.tree_arrays import PIECE_LEVELS
 from mitsuba_subdivision.kernels.line_intersection import ON_NORMAL
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 from mitsuba_subdivision.patches import PieceTable

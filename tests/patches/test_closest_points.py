@@ -9,8 +9,7 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.patches import closest_points, polynomial_pieces
-from mitsuba_subdivision.patches.nearest_in_piece import nearest_in_pieces
-from mitsuba_subdivision.patches.turned_boxes import TurnedBoxes
+from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
 from patches.closed_cages import bumpy, cage_of, creased
 from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.evaluation.divided_element import PartKind
-from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, piece_tree
-from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
+from mitsuba_subdivision.evaluation.patch_tree import PartKind
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis
+from mitsuba_subdivision.evaluation.tree_arrays import PIECE_LEVELS, tree_arrays
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.patches import piece_table as layout
 from patches.closed_cages import SURFACES, bumpy, cage_of, mixed_torus
@@ -73,7 +73,7 @@ def test_patches_have_the_trees_of_their_classes_and_pieces_of_their_own(surface
     ring_end = packets * int(table.classes[:, 1] @ table.classes[:, 4])
     for columns, patch_class in zip(table.classes.tolist(), surface.patches.classes, strict=True):
         _, count, control_count, first_piece, size, first_ring, ring = columns
-        tree = piece_tree(surface.scheme, patch_class.signature)
+        tree = tree_arrays(surface.scheme, patch_class.signature)
         assert ring == (control_count if len(tree.blocks) else 0)
         assert (first_piece, size) == (end, tree.piece_count)
         start, begins = table.patch_starts[patch : patch + count].T.astype(int)

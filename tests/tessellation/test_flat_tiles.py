@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from mitsuba_subdivision.evaluation.divided_element import divided_elements
 from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
+from mitsuba_subdivision.evaluation.patch_tree import patch_trees
 from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.stencil_table import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
@@ -44,7 +44,7 @@ def tiles_of(surface, scheme, side=None):
     if side is not None:
         begin, end = scheme.domain.corners[side], scheme.domain.corners[(side + 1) % scheme.domain.corner_count]
         uv = begin + np.linspace(0, 1, 4 * SAMPLES)[:, None] * (end - begin)
-    elements = divided_elements(scheme, [each.signature for each in patches.classes])
+    elements = patch_trees(scheme, [each.signature for each in patches.classes])
     for each, element in zip(patches.classes, elements, strict=True):
         tile, rows = part_of_tile(element, np.eye(element.control_count))
         if not tile.is_piece:

@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..device_arrays import mapped
 from ..mesh.connectivity import IndexArray, IntArray, Topology
-from ..mesh.cuts import CutMesh, SharpMesh
+from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
-from ..mesh.semi_sharpness import CreaseMethod
-from ..mesh.sharpness import Sharpness
+from ..mesh.sharpness import CreaseMethod
 from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import CageContents

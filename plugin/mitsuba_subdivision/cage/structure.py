@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
-from ..mesh.cuts import CutMesh, SharpMesh
+from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
-from ..mesh.semi_sharpness import CreaseMethod
 from ..mesh.shared import Content, Shared
-from ..mesh.sharpness import Sharpness
+from ..mesh.sharpness import CreaseMethod
 from .rules import boundary_corners, boundary_holes
 from .validation import read_only
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import INFINITE, Sharpness
+from ..mesh.cuts import Sharpness
+from ..mesh.sharpness import INFINITE
 from .errors import CageError, in_digits, number_of_such, warn
 from .source import CageSource
 from .validation import read_only

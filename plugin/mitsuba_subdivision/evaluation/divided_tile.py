@@ -19,9 +19,9 @@ from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
-from .bernstein import regular_bernstein, times
-from .divided_element import DividedElement, PartKind
 from .irregular_patch import IrregularPatch, level_rows, rest_rows, transition
+from .patch_tree import PartKind, PatchTree
+from .polynomials import regular_bernstein, times
 
 # Divisions after which a tile is bounded by its pieces and by what is left: of surfaces, by whether rules are convex,
 # as others bound what is left some ten times worse; and of the curves along sides, which have few coefficients.
@@ -38,7 +38,7 @@ class DividedTile:
         scheme: Scheme,
         # The element that it covers; or the patch around an extraordinary point, from any level on, whose
         # control points here are its eigen-coordinates; None for a piece
-        source: DividedElement | IrregularPatch | None,
+        source: PatchTree | IrregularPatch | None,
         # How a patch around an extraordinary point is turned in the tile: `ParameterDomain.rotation` of this.
         # Elements are not turned.
         turn: int,
@@ -70,7 +70,7 @@ class DividedTile:
         scheme, source, turn = self._scheme, self._source, self._turn
         if source is None:
             return tuple((self, rows) for rows in regular_bernstein(scheme).basis.halves)
-        if isinstance(source, DividedElement):
+        if isinstance(source, PatchTree):
             return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
         # The same tile, of the next level, and three pieces.
         found = [(self, transition(source, 1))]
@@ -187,7 +187,7 @@ class DividedTile:
 
 
 def part_of_tile(
-    element: DividedElement,
+    element: PatchTree,
     stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the tile
 ) -> tuple[DividedTile, FloatArray]:
     """The part of a tile that an element covers; the same tile for equal ones.
@@ -211,7 +211,7 @@ def part_of_tile(
 
 # Tiles take some 20 kB each.
 @lru_cache(maxsize=4096)
-def _tile(scheme: Scheme, source: DividedElement | IrregularPatch | None, turn: int) -> DividedTile:
+def _tile(scheme: Scheme, source: PatchTree | IrregularPatch | None, turn: int) -> DividedTile:
     return DividedTile(scheme, source, turn)
 
 

@@ -14,14 +14,13 @@ from ..mesh.signature import Signature
 from ..schemes import SchemeError, scheme_named
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import element_of
 from .eigenbasis import eigenbasis
 from .equations import Evaluator, child_rows, times_powers
 from .irregular_patch import IrregularPatch
+from .located_samples import LocatedSamples, frame_magnitude, without_collapsed
 from .normals import unit_normals
-from .patch_pieces import isolated_signature
+from .patch_tree import isolated_signature, patch_tree
 from .refined_rings import refined_children
-from .sample_weights import LocatedSamples, frame_magnitude, without_collapsed
 
 # Curvature near an extraordinary point goes with (|λ_4| / λ_2²)ⁿ. A ratio nearer to one than this counts as one.
 CONSTANT = 1e-9
@@ -129,7 +128,7 @@ def element_stencils(
     """
     uv = np.asarray(uv, dtype=np.float64)
     corner = np.zeros(len(uv), dtype=np.int64) if corner is None else corner
-    located = LocatedSamples(scheme, [element_of(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
+    located = LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
     rows = located.rows("stabilized", np.float64, 1)
     magnitude = located.per_sample([frame_magnitude(*each) for each in zip(located.leaves, rows, strict=True)])
     (weights,) = located.weights([np.concatenate([each.rows[:1], each.tangents]) for each in rows])
@@ -148,7 +147,7 @@ def derivative_stencils(
     Returns (3 or 6, s, K) float64: the point; derivatives by u and v; those by uu, uv and vv, as `evaluate_samples`
     computes them.
     """
-    located = LocatedSamples(scheme, [element_of(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
+    located = LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
     rows = located.rows("stabilized", np.float64, derivatives)
     (weights,) = located.weights([each.rows for each in rows])
     found, scale = weights.transpose(1, 2, 0), located.per_sample([each.derivative_scale for each in rows])

@@ -15,7 +15,6 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature, TaggedFan
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from .bernstein import regular_bernstein
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .equations import (
     AT_EXTRAORDINARY_POINT,
@@ -29,7 +28,8 @@ from .equations import (
     stam_rows,
     times_powers,
 )
-from .tangent_frame import limit_frame, uneven_frame
+from .normals import limit_frame, uneven_frame
+from .polynomials import regular_bernstein
 
 # Two edge tangents whose determinant is no more than this part of their squared size count as parallel.
 PARALLEL = 1e-6

@@ -11,11 +11,10 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature, TaggedFan
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from .divided_element import element_of
 from .irregular_patch import irregular_patch
-from .patch_pieces import irregular_structure, isolated_signature, lattice_stencils, regular_signature
+from .located_samples import LocatedSamples
+from .patch_tree import irregular_structure, isolated_signature, lattice_stencils, patch_tree, regular_signature
 from .refined_rings import refined_children
-from .sample_weights import LocatedSamples
 
 # Valences, and numbers of corners, at which a scheme is tried where it supports them.
 VALENCES, SIZES = range(3, 9), (3, 4, 5)
@@ -50,7 +49,7 @@ def check_scheme(scheme: Scheme) -> None:
             continue
         for _, _, stencils in refined_children(scheme, signature):
             _check_signs(scheme, stencils)
-        LocatedSamples(scheme, [element_of(scheme, signature)], np.zeros(1, int), inside, np.zeros(1, int))
+        LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(1, int), inside, np.zeros(1, int))
         structure = irregular_structure(scheme, signature)
         if structure is not None:
             irregular_patch(scheme, structure)

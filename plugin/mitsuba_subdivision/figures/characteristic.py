@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.element import element_stencils
 from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
-from ..evaluation.patch_pieces import irregular_structure, isolated_signature
+from ..evaluation.patch_tree import irregular_structure, isolated_signature
 from ..schemes import Scheme
 
 # Points along each side of a polygon, which the map bends.

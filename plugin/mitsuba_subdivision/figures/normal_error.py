@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
-from ..evaluation.patch_pieces import irregular_structure
+from ..evaluation.patch_tree import irregular_structure
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
 from ..regression.probe import normal_angle

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..evaluation.patch_pieces import lattice_stencils
+from ..evaluation.patch_tree import lattice_stencils
 from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from .figure_scenes import load_stage, make_mesh, on_white, render, staged

@@ -19,7 +19,7 @@ from ..cage import CageError, ControlCage
 from ..cage.tags import validated_edges
 from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
-from ..mesh.sharpness import Sharpness
+from ..mesh.cuts import Sharpness
 from ..refinement.adapted_scheme import adapted_scheme
 from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray

@@ -8,7 +8,7 @@ from functools import reduce
 
 import drjit as dr
 
-from .types import Float, FloatBuffer, Matrix4, Vector3
+from .array_types import Float, FloatBuffer, Matrix4, Vector3
 from .vectors import cross, dot, like, unit
 
 

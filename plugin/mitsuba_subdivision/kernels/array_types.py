@@ -1,4 +1,30 @@
-"""The Dr.Jit array types of a backend and a precision, and the layout of arrays of vectors."""
+"""The Dr.Jit array types of a backend and a precision, the layout of arrays of vectors, and names for annotations.
+
+The classes of arrays depend on the backend and the precision, and are known at run time only, see `ArrayTypes`. An
+array has a number or a vector for each lane. In scalar variants there is one lane, and numbers are Python's float, int
+and bool. Annotations name them:
+
+Float
+    A real number: a parameter u or v, a distance, a weight.
+Index
+    An unsigned 32-bit integer, counted from 0: a half-edge, an element, a row of a table.
+Mask
+    A truth value. Inactive lanes read zeros and write nothing.
+Vector2, Vector3, Vector4
+    Parameters (u, v), say; a point, a direction or a normal, in `vectors` also a list of three arrays; a packet of a
+    table that is read by four numbers at once.
+Index4
+    Four indices, such as a row of `PieceTable.half_edges` or `PieceTable.nodes`.
+Matrix4
+    A matrix of four rows and columns, of Dr.Jit or NumPy, which maps points as columns.
+Value
+    A value of a surface or of a channel, or a derivative of it: a number, or a vector of two or three.
+FloatBuffer, IndexBuffer
+    Numbers or indices in memory, one after the other, whatever the lanes: x, y, z of each point, say. NumPy arrays in
+    scalar variants.
+Ray
+    An object with an origin ``o`` and a direction ``d``, such as Mitsuba's rays.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +33,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from types import ModuleType
 from typing import Any
+from typing import Any as Float
+from typing import Any as FloatBuffer
+from typing import Any as Index
+from typing import Any as Index4
+from typing import Any as IndexBuffer
+from typing import Any as Mask
+from typing import Any as Matrix4
+from typing import Any as Ray
+from typing import Any as Value
+from typing import Any as Vector2
+from typing import Any as Vector3
+from typing import Any as Vector4
 
 import drjit as dr
 import numpy as np
@@ -15,7 +53,6 @@ from numpy.typing import NDArray
 from ..device_arrays import mapped
 from ..llvm import require_llvm
 from ..mesh.shared import Content, Shared, SharedArray
-from .types import Float, FloatBuffer, Index, IndexBuffer, Mask, Vector3
 
 # For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
@@ -150,3 +187,19 @@ def float_type_of(
     if "ad" in features:
         arrays = arrays.ad
     return arrays.Float64 if "double" in features else arrays.Float
+
+
+__all__ = [
+    "Float",
+    "FloatBuffer",
+    "Index",
+    "Index4",
+    "IndexBuffer",
+    "Mask",
+    "Matrix4",
+    "Ray",
+    "Value",
+    "Vector2",
+    "Vector3",
+    "Vector4",
+]

@@ -12,12 +12,11 @@ import numpy as np
 
 from ..patches import LinearChannel, PieceTable
 from ..patches.piece_table import CODE, FOLLOWING, PRECEDING, WHOLE
-from .array_types import ArrayTypes
+from .array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, Value
 from .coefficient_map import CoefficientMap
 from .control_values import ControlValues, WeightedValues
 from .piece_kernel import PatchValues, Piece, PieceKernel
 from .polynomial import Monomials
-from .types import Float, FloatBuffer, Index, Mask, Value
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel

@@ -10,8 +10,7 @@ import drjit as dr
 import numpy as np
 
 from ..mesh.shared import Content, LaterArray, Shared
-from .array_types import ArrayTypes
-from .types import FloatBuffer, Index, Mask, Value
+from .array_types import ArrayTypes, FloatBuffer, Index, Mask, Value
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

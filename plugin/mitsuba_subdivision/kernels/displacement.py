@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 
+from .array_types import Float, Index, Mask, Value
 from .piece_kernel import DIFFERENCE, PatchValues, Piece
-from .types import Float, Index, Mask, Value
 from .vectors import added, cross, dot, like, unit
 
 if TYPE_CHECKING:

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from .array_types import ArrayTypes
-from .domain_map import turned
-from .element_walk import ElementWalk, Location
+from .array_types import ArrayTypes, Float, Index, Mask, Vector3
+from .element_walk import ElementWalk, Location, turned
 from .piece_kernel import PatchValues
-from .types import Float, Index, Mask, Vector3
 from .vectors import LONGEST_STEP, STEP_TOLERANCE, dot, over, rounding, step_along
 
 if TYPE_CHECKING:

@@ -8,11 +8,9 @@ from typing import Any
 
 import drjit as dr
 
-from .array_types import ArrayTypes
-from .domain_map import distances
-from .element_walk import ElementWalk, Location
+from .array_types import ArrayTypes, Float, Index, Mask, Vector3
+from .element_walk import ElementWalk, Location, distances
 from .piece_kernel import PatchValues, Piece
-from .types import Float, Index, Mask, Vector3
 from .vectors import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
 
 # Maximum number of steps; about five are usual.

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
-from ..evaluation.divided_element import PartKind
-from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, FrameKind
-from ..evaluation.polynomial_basis import polynomial_basis
+from ..evaluation.patch_tree import PartKind
+from ..evaluation.polynomials import polynomial_basis
+from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, FrameKind
 from ..mesh.shared import Shared
 from ..patches.piece_table import (
     CODE,
@@ -30,11 +30,9 @@ from ..patches.piece_table import (
     TURN,
     WHOLE,
 )
-from .array_types import ArrayTypes
-from .domain_map import distances, doublings, in_child, turn_matrix, turned
-from .element_walk import ElementWalk
+from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
+from .element_walk import ElementWalk, distances, doublings, in_child, turn_matrix, turned
 from .polynomial import Monomials
-from .types import Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
 from .vectors import added, combined, cross, like
 
 if TYPE_CHECKING:
@@ -96,7 +94,7 @@ class PatchValues:
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """What is summed at the deeper levels of a tip, see `PieceTree.blocks`."""
+    """What is summed at the deeper levels of a tip, see `TreeArrays.blocks`."""
 
     control_count: Index  # Of the one-ring; 0 where a sample lies in no tip, or in a piece of it
     ring: Index  # First packet of the control points
@@ -376,7 +374,7 @@ class PieceKernel:
                 dr.select(is_only, scale, scale * inner_scale),
             )
 
-        return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode="symbolic", label="piece_tree")
+        return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode="symbolic", label="tree_arrays")
 
     def _at_level(
         self, is_tip: Mask, level_count: Index, u: Float, v: Float, scale: Float

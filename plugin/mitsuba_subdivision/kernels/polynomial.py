@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import drjit as dr
 
-from .types import Float, Value
+from .array_types import Float, Value
 
 
 class Monomials:

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.shared import Content, LaterArray, Shared
-from .array_types import ArrayTypes
+from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .coefficient_map import CoefficientMap
 from .element_walk import ElementWalk, Location
 from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
-from .types import Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .vectors import cross, over, rounding, unit
 from .vertex_kernel import coordinates_expected
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 
 from .affine_map import AffineMap
+from .array_types import Float, Vector3
 from .element_walk import Location
-from .types import Float, Vector3
 from .vectors import over, unit
 
 

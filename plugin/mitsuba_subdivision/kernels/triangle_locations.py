@@ -8,13 +8,13 @@ import drjit as dr
 import numpy as np
 
 from ..tessellation import UniformGrid
+from .array_types import Float, FloatBuffer, Index, Mask
 from .element_walk import ElementWalk, Location
-from .types import Float, FloatBuffer, Index, Mask
 
 if TYPE_CHECKING:
     from ..mesh.connectivity import IntArray
     from ..tessellation import VertexTable
-    from ..tessellation.adaptive_grid import AdaptiveGrid
+    from ..tessellation.adaptive import AdaptiveGrid
     from .array_types import ArrayTypes
 
 

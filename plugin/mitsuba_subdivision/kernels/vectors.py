@@ -11,8 +11,7 @@ from functools import reduce
 
 import drjit as dr
 
-from .array_types import ArrayTypes
-from .types import Float, Vector3
+from .array_types import ArrayTypes, Float, Vector3
 
 # Longest step, in parameters of an element: outside its element, a polynomial may be far from the surface.
 LONGEST_STEP = 0.5

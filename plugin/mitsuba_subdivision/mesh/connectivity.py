@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .ragged import first_indices, sorted_order
-from .semi_sharpness import SemiSharpness
+from .sharpness import SemiSharpness
 
 # Integers of any width; docstrings name it where it matters.
 IntArray = NDArray[np.integer]

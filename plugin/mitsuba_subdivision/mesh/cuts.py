@@ -11,8 +11,42 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
-from .semi_sharpness import CreaseMethod, SemiSharpness
-from .sharpness import Sharpness
+from .sharpness import INFINITE, CreaseMethod, FloatArray, SemiSharpness
+
+
+@dataclass(frozen=True, eq=False)
+class Sharpness:
+    """Sharpness of edges and vertices: 0 smooth, `INFINITE` or more infinitely sharp, between them semi-sharp."""
+
+    # (n_h,) float64: sharpness of the edge of each half-edge: both half-edges of an edge have the same
+    edges: FloatArray
+    vertices: FloatArray  # (n_v,) float64: sharpness of each vertex
+
+    @property
+    def is_infinite(self) -> NDArray[np.bool_]:
+        """``(n_h,)`` whether each half-edge is infinitely sharp."""
+        return self.edges >= INFINITE
+
+    @property
+    def is_corner(self) -> NDArray[np.bool_]:
+        """``(n_v,)`` whether each vertex is infinitely sharp."""
+        return self.vertices >= INFINITE
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is sharp."""
+        return bool(self.edges.any() or self.vertices.any())
+
+    def creases(self, topology: Topology) -> FloatArray:
+        """Rows (vertex, vertex, sharpness), one for each sharp edge."""
+        t = topology
+        sharp = t.edge_half_edge[self.edges[t.edge_half_edge] > 0]
+        return np.stack([t.face_vertices[sharp], t.face_vertices[t.next[sharp]], self.edges[sharp]], axis=1)
+
+    def corners(self) -> FloatArray:
+        """Rows (vertex, sharpness), one for each sharp vertex."""
+        sharp = np.flatnonzero(self.vertices)
+        return np.stack([sharp, self.vertices[sharp]], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

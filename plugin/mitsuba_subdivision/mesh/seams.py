@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology, VertexRule
-from .cuts import CutMesh, SharpMesh, cut_along_creases, semi_sharpness_of_cut
+from .cuts import CutMesh, SharpMesh, Sharpness, cut_along_creases, semi_sharpness_of_cut
 from .manifold import NonManifold
-from .sharpness import INFINITE, Sharpness
+from .sharpness import INFINITE
 
 
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:

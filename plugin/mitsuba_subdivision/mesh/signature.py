@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 
 from .connectivity import HalfEdges, IndexArray, IntArray, Topology, VertexRule
-from .semi_sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
+from .sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
 
 ElementKind = Literal["face", "vertex"]
 Number = TypeVar("Number", int, IntArray)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, times
 from ..evaluation.irregular_patch import IrregularPatch
+from ..evaluation.polynomials import BernsteinBasis, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces

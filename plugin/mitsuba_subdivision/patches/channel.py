@@ -11,10 +11,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..cage import ControlCage
 from ..cage.attributes import Attribute
-from ..evaluation.divided_element import element_of
 from ..evaluation.element import ElementSamples, evaluate_samples
 from ..evaluation.equations import Evaluator
-from ..evaluation.sample_weights import LocatedSamples
+from ..evaluation.located_samples import LocatedSamples
+from ..evaluation.patch_tree import patch_tree
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.seams import seams, value_mesh
 from ..mesh.shared import Content, Shared
@@ -312,7 +312,7 @@ class PatchSampler:
         for at in counted(runs, "Evaluated patches"):
             used, element = np.unique(class_index[at], return_inverse=True)
             own = [classes[index] for index in used.tolist()]
-            elements = [element_of(scheme, each.signature) for each in own]
+            elements = [patch_tree(scheme, each.signature) for each in own]
             located = LocatedSamples(scheme, elements, element, uv[at], corner[at])
             controls = [
                 each.controls.take(patch[at[of_element]], axis=0)

@@ -13,9 +13,8 @@ from ..evaluation.irregular_patch import level_at_size
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .nearest_in_piece import ROUNDED, nearest_in_pieces, slopes
+from .nearest_in_piece import ROUNDED, TurnedBoxes, nearest_in_pieces, slopes
 from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike
-from .turned_boxes import TurnedBoxes
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

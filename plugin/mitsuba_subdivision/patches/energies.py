@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..evaluation.bernstein import regular_bernstein
-from ..evaluation.divided_element import divided_elements
 from ..evaluation.irregular_patch import IrregularPatch, level_rows
+from ..evaluation.patch_tree import patch_trees
+from ..evaluation.polynomials import regular_bernstein
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..progress import counted
@@ -95,7 +95,7 @@ def _basis_derivatives(
 
     They are by the parameters of the pieces. Integrals over the surface do not depend on parameters.
     """
-    form, (element,) = regular_bernstein(scheme), divided_elements(scheme, [signature])
+    form, (element,) = regular_bernstein(scheme), patch_trees(scheme, [signature])
     coefficients = [element.coefficients(form.of_controls)]
     for tip in element.tips:
         for level in range(_level_count(tip.irregular_patch, derivative)):

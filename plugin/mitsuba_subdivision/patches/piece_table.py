@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.divided_element import PartKind, divided_elements
-from ..evaluation.piece_tree import LEVEL_PIECES, PIECE_LEVELS, PieceMap, PieceTree, piece_tree
-from ..evaluation.polynomial_basis import polynomial_basis
+from ..evaluation.patch_tree import PartKind, patch_trees
+from ..evaluation.polynomials import polynomial_basis
+from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, PieceMap, TreeArrays, tree_arrays
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
@@ -55,11 +55,11 @@ class PieceTable:
     patch_starts: NDArray[np.uint32]  # (p, 2) uint32: of each patch its first piece and its first node
     # (p,) uint32: first packet of the control points of each patch; any number for patches without tips
     rings: NDArray[np.uint32]
-    # (n, 4) uint32: `PieceTree.kinds` plus `TURN` times the turn; first child, or the piece, counted from the patch's
-    # first; first row of ``weights`` of a tip's blocks; `PieceTree.frames` plus `LEVEL` times the levels plus
+    # (n, 4) uint32: `TreeArrays.kinds` plus `TURN` times the turn; first child, or the piece, counted from the patch's
+    # first; first row of ``weights`` of a tip's blocks; `TreeArrays.frames` plus `LEVEL` times the levels plus
     # `CONTROL` times the number of control points in the one-ring
     nodes: NDArray[np.uint32]
-    trees: tuple[PieceTree, ...]  # Of each class
+    trees: tuple[TreeArrays, ...]  # Of each class
     # (c, 7) uint32: of each class the index of its first control in ``controls``, its numbers of patches and of
     # controls, its first piece, how many pieces each patch has, its first packet of control points, and how many of
     # these each patch has
@@ -91,14 +91,14 @@ class PieceTable:
         table = patches if refined is None else refined.table
         counts = np.array([len(each.corners) for each in table.classes])
         # All at once, as they share most of their data.
-        elements = divided_elements(table.scheme, [each.signature for each in table.classes])
+        elements = patch_trees(table.scheme, [each.signature for each in table.classes])
         packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
         tip_counts = np.array([element.tip_count for element in elements])
         bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * int((tip_counts * counts).sum())
         if bytes_of_level:
             piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)
         signatures = counted([each.signature for each in table.classes], "Pieces of patch classes")
-        trees = [piece_tree(table.scheme, signature, piece_levels) for signature in signatures]
+        trees = [tree_arrays(table.scheme, signature, piece_levels) for signature in signatures]
         has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
         rings = has_ring * np.array([each.controls.shape[1] for each in table.classes])
         sizes = np.array([tree.piece_count for tree in trees])
@@ -132,7 +132,7 @@ class PieceTable:
 
     @property
     def maps(self) -> list[tuple[PieceMap, ...]]:
-        """`PieceTree.maps` of each class."""
+        """`TreeArrays.maps` of each class."""
         return [tree.maps for tree in self.trees]
 
     def weights(self, size: int, dtype: DTypeLike = np.float64) -> FloatArray:
@@ -195,7 +195,7 @@ def piece_packets(monomial_count: int) -> int:
     return -(-3 * monomial_count // PACKET)
 
 
-def _joined_nodes(trees: list[PieceTree], control_counts: list[int]) -> NDArray[np.uint32]:
+def _joined_nodes(trees: list[TreeArrays], control_counts: list[int]) -> NDArray[np.uint32]:
     """`PieceTable.nodes`."""
     nodes, first_node, first_row = [], 0, 0
     for tree, control_count in zip(trees, control_counts, strict=True):

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
-from ..evaluation.divided_element import DividedElement, divided_elements
 from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows, transition
+from ..evaluation.patch_tree import PatchTree, patch_trees
+from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IntArray, Topology
 from ..progress import counted
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
@@ -173,7 +173,7 @@ class Tips(PartArrays):
 class ElementParts(PartArrays):
     """Parts of a surface that are divided alike, not yet divided."""
 
-    element: DividedElement
+    element: PatchTree
     # As in `PolynomialPieces`, from the part's parameters
     half_edge: IntArray
     matrices: FloatArray
@@ -233,8 +233,8 @@ class SurfacePieces:
         empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.basis.indices), 3))]
         regular, tips, undivided = [PolynomialPieces(form.basis, np.empty(0, dtype=np.int64), *empty)], [], []
         sizes = np.zeros((len(patches.elements.face_sizes), 3))
-        elements = divided_elements(table.scheme, [each.signature for each in table.classes])
-        known: dict[DividedElement, FloatArray] = {}
+        elements = patch_trees(table.scheme, [each.signature for each in table.classes])
+        known: dict[PatchTree, FloatArray] = {}
         pairs = zip(table.classes, elements, strict=True)
         for patch_class, whole in counted(list(pairs), "Pieces of patch classes"):
             controls = control_points[patch_class.controls]

@@ -21,7 +21,8 @@ from ..cage.rules import RULES
 from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, VertexRule
-from ..mesh.sharpness import INFINITE, Sharpness
+from ..mesh.cuts import Sharpness
+from ..mesh.sharpness import INFINITE
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import adapted_scheme

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.semi_sharpness import CreaseMethod
+from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray

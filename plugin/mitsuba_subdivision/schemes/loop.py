@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.semi_sharpness import CreaseMethod
+from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks
 from .domain import TRIANGLE, AffineMap, FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.semi_sharpness import CreaseMethod, SemiSharpness
+from ..mesh.sharpness import CreaseMethod, SemiSharpness
 from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
 from .stencil_table import StencilTable

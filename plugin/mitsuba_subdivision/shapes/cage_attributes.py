@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import take_over
-from ..kernels.types import FloatBuffer
+from ..kernels.array_types import FloatBuffer
 from ..mesh.shared import SharedArray
 from ..variants import Variant
 from .attribute_parameters import mesh_name

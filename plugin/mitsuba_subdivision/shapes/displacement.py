@@ -21,11 +21,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..device_arrays import mapped
+from ..kernels.array_types import FloatBuffer
 from ..kernels.channel_kernel import channel_kernel
 from ..kernels.control_values import ControlValues
 from ..kernels.displacement import Displacement
 from ..kernels.surface_kernel import SurfaceKernel
-from ..kernels.types import FloatBuffer
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface

@@ -14,8 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..device_arrays import mapped
+from ..kernels.array_types import Float, Mask, Value, Vector2
 from ..kernels.displacement import Heights
-from ..kernels.types import Float, Mask, Value, Vector2
 from ..schemes.domain import FloatArray
 from ..variants import Variant
 

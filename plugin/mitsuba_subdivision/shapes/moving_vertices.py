@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from ..kernels.types import Float, FloatBuffer, Matrix4
+from ..kernels.array_types import Float, FloatBuffer, Matrix4
 from .device_state import is_recording
 from .placement import Placement, RecentredPoints
 from .vertices import Vertices

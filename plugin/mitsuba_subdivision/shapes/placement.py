@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import mapped
-from ..kernels.types import FloatBuffer, Matrix4
+from ..kernels.array_types import FloatBuffer, Matrix4
 
 if TYPE_CHECKING:
     import mitsuba as mi

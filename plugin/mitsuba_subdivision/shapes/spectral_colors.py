@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..device_arrays import upload
-from ..kernels.types import Float, FloatBuffer, Index, Mask, Value
+from ..kernels.array_types import Float, FloatBuffer, Index, Mask, Value
 from ..mesh.shared import Shared
 from ..variants import Variant
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import mapped
-from ..kernels.types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
+from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
 from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
@@ -24,13 +24,11 @@ from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
-from .triangles import Triangles
-from .vertices import require_control_points, vertices_of
+from .vertices import Triangles, require_control_points, vertices_of
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
-    from .exact_shading import ExactShading
-    from .parameterization import Parameterization
+    from .exact_shading import ExactShading, Parameterization
 
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
@@ -425,7 +423,7 @@ def make_subdivision(
                 return super().eval_parameterization(uv, ray_flags, active)
             self._require_at_vertices("eval_parameterization", "texture coordinates", self._has_texcoords)
             if self._parameterization is None and self._exact is not None:
-                from .parameterization import Parameterization
+                from .exact_shading import Parameterization
 
                 self._parameterization = Parameterization(variant, self, self._exact)
             assert self._parameterization is not None

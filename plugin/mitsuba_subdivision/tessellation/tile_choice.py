@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from ..evaluation.bernstein import times
-from ..evaluation.divided_element import divided_elements
 from ..evaluation.divided_tile import DividedTile, part_of_tile
+from ..evaluation.patch_tree import patch_trees
+from ..evaluation.polynomials import times
 from ..mesh.connectivity import IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
-from .cones import dot
-from .criterion import Criterion, Measure
+from .criterion import Criterion, Measure, dot
 from .memory import require_memory_for_triangles
 from .patch_frames import PatchFrames
 from .tile_rates import TileRates
@@ -101,7 +100,7 @@ def _whole_patches(
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
     coordinates = np.ascontiguousarray(points.T)
-    elements = divided_elements(table.scheme, [each.signature for each in table.classes])
+    elements = patch_trees(table.scheme, [each.signature for each in table.classes])
     pairs = list(zip(table.classes, elements, strict=True))
     for patch_class, element in counted(pairs, "Tiles of patch classes"):
         every = np.eye(element.control_count)

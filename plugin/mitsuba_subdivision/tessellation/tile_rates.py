@@ -8,13 +8,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.bernstein import BernsteinBasis, regular_bernstein, times
 from ..evaluation.divided_tile import DividedTile
+from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
-from .cones import NormalCone, TangentCone, cross, dot
-from .criterion import TINY, Criterion, Measure, least_product, rounded_up
+from .criterion import TINY, Criterion, Measure, NormalCone, TangentCone, cross, dot, least_product, rounded_up
 from .patch_frames import UNIT, PatchFrames
 from .tiles import Tiles, sizes
 

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.divided_element import element_of
+from ..evaluation.located_samples import PLANE_POWERS, Polynomials, sampled_polynomials
 from ..evaluation.normals import LEAST_EXTENT, unit_normals
-from ..evaluation.polynomial_basis import monomial_values, polynomial_basis
-from ..evaluation.sampled_polynomials import PLANE_POWERS, Polynomials, sampled_polynomials
+from ..evaluation.patch_tree import patch_tree
+from ..evaluation.polynomials import monomial_values, polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchClass
@@ -150,7 +150,7 @@ def vertex_polynomials(
     number = np.empty(len(classes), dtype=np.int64)
     number[used] = np.arange(len(used))
     classes, uv = [classes[index] for index in used], [uv[index] for index in used]
-    elements = [element_of(scheme, each.signature) for each in classes]
+    elements = [patch_tree(scheme, each.signature) for each in classes]
     forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), sampled_polynomials(scheme, elements, uv), strict=True)
     # Samples are counted through all classes from now on.
     first_sample = ragged.offsets([len(own) for own in uv])

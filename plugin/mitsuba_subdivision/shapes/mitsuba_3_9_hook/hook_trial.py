@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from ...kernels.types import Mask, Value
+from ...kernels.array_types import Mask, Value
 from ...variants import Variant
 
 _ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)

@@ -33,7 +33,7 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import drjit as dr
 import mitsuba as mi
 
-from ...kernels.types import Mask, Value
+from ...kernels.array_types import Mask, Value
 from ...variants import Variant, variant_name
 from ..device_state import paused_collection
 from .hook_trial import TriangleHit, trial_problem

@@ -5,11 +5,11 @@ import pytest
 from kernels.surfaces import SURFACES
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
-from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import FLOAT32_SIZE
-from mitsuba_subdivision.evaluation.piece_tree import PIECE_LEVELS, FrameKind, piece_tree
-from mitsuba_subdivision.evaluation.polynomial_basis import polynomial_basis
+from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_trees
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis
+from mitsuba_subdivision.evaluation.tree_arrays import PIECE_LEVELS, FrameKind, tree_arrays
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark
@@ -45,7 +45,7 @@ def trees(scheme, cage):
     surface = LimitSurface(cage, scheme)
     for each in surface.patches.classes:
         for levels in (0, PIECE_LEVELS):
-            yield surface.scheme, each, piece_tree(surface.scheme, each.signature, levels), levels
+            yield surface.scheme, each, tree_arrays(surface.scheme, each.signature, levels), levels
 
 
 class Walker:
@@ -171,7 +171,7 @@ def followed(runs):
 @EVERY_CAGE
 def test_the_last_level_is_as_near_as_single_precision_tells(scheme, cage):
     for own, patch_class, tree, _ in trees(scheme, cage):
-        (element,) = divided_elements(own, [patch_class.signature])
+        (element,) = patch_trees(own, [patch_class.signature])
         eigenvalues = [tip.irregular_patch.basis.subdominant for tip in element.tips]
         is_tip = np.flatnonzero(tree.kinds == PartKind.TIP)
         in_order = is_tip[np.argsort(tree.first_block[is_tip])]
@@ -201,7 +201,7 @@ def test_parts_that_are_divided_alike_share_their_pieces():
 )
 def test_kinds_of_nodes(cage, allowed):
     patches = PatchTable(cage.cut_mesh.topology, CatmullClark())
-    kinds = [piece_tree(patches.scheme, each.signature).kinds.tolist() for each in patches.classes]
+    kinds = [tree_arrays(patches.scheme, each.signature).kinds.tolist() for each in patches.classes]
     found = {kind for tree in kinds for kind in tree}
     assert found <= allowed
     assert (PartKind.ONLY_CHILD in found) == (PartKind.ONLY_CHILD in allowed)

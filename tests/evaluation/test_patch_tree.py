@@ -6,10 +6,9 @@ from evaluation.common import classes
 from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.evaluation.divided_element import PartKind, divided_elements, element_of
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows, transition
-from mitsuba_subdivision.evaluation.patch_pieces import whole_piece
+from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_tree, patch_trees, whole_piece
 from mitsuba_subdivision.evaluation.refined_rings import refined_ring
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
@@ -24,7 +23,7 @@ ROUNDED = 1 + 1e-9
 
 
 def divided(surface):
-    return divided_elements(*classes(surface))
+    return patch_trees(*classes(surface))
 
 
 def tips(surface):
@@ -89,9 +88,9 @@ def test_equal_one_rings_are_one_object(name):
 @pytest.fixture
 def nothing_divided():
     """Elements of other tests are forgotten, and those of this test after it."""
-    element_of.cache_clear()
+    patch_tree.cache_clear()
     yield
-    element_of.cache_clear()
+    patch_tree.cache_clear()
 
 
 @pytest.mark.usefixtures("nothing_divided")
@@ -102,7 +101,7 @@ def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
         refined.append(signature)
         return refined_ring(scheme, signature)
 
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.refined_ring", counted)
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.patch_tree.refined_ring", counted)
     elements = divided(LimitSurface(tagged(cube(), creases=[(a, b, 8.7) for a, b in RING])))
     inner = [each for each in below(elements) if each.piece is None]
     assert len(refined) == len({*inner})
@@ -145,14 +144,14 @@ class Skewed(CatmullClark):
 def test_children_that_are_no_copies_of_the_domain_are_an_error():
     patches = PatchTable(cube().topology, Skewed())
     with pytest.raises(SchemeError, match="a child's domain is none of"):
-        divided_elements(patches.scheme, [patches.classes[0].signature])
+        patch_trees(patches.scheme, [patches.classes[0].signature])
 
 
 @pytest.mark.usefixtures("nothing_divided")
 @pytest.mark.parametrize(
     "use",
     [
-        lambda scheme, signature: divided_elements(scheme, [signature]),
+        lambda scheme, signature: patch_trees(scheme, [signature]),
         lambda *own: element_stencils(*own, np.array([[0.0, 1e-30]])),
     ],
     ids=["divided", "sampled"],
@@ -162,7 +161,7 @@ def test_patches_that_no_refinement_isolates_are_an_error(use, monkeypatch):
         piece = whole_piece(scheme, signature)
         return None if piece is None or piece.patch is not None else piece
 
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.divided_element.whole_piece", only_regular)
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.patch_tree.whole_piece", only_regular)
     scheme, (signature, *_) = classes(surface_named("cube"))
     with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
         use(scheme, signature)

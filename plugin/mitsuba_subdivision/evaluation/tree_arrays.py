@@ -1,6 +1,6 @@
-"""All pieces of an element as a tree, with the polynomials of each piece: for kernels that evaluate it anywhere.
+"""A patch tree as flat arrays, with the polynomials of each piece: for kernels that evaluate it anywhere.
 
-The samples of a kernel are unknown before it runs. So the element is divided completely (`divided_elements`), and each
+The samples of a kernel are unknown before it runs. So the element is divided completely (`patch_trees`), and each
 part is a node: an inner one, divided into the four copies of its domain or turned only; a regular piece; or a tip, the
 part around an extraordinary point.
 
@@ -26,10 +26,10 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import DividedElement, PartKind, divided_elements
 from .equations import times_powers
 from .irregular_patch import IrregularPatch, float32_levels
-from .polynomial_basis import polynomial_basis
+from .patch_tree import PartKind, PatchTree, patch_trees
+from .polynomials import polynomial_basis
 
 # Levels of a tip that are pieces like others, at most. Their normals need no frames: single precision has enough bits
 # of the cross product of derivatives that become parallel, level by level.
@@ -59,11 +59,11 @@ class PieceMap(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PieceTree:
+class TreeArrays:
     """Pieces of an element."""
 
     kinds: IntArray  # (n,) uint32: `PartKind` of each node. The first node is the element.
-    turns: IntArray  # (n,) uint32: `DividedElement.turn` of each
+    turns: IntArray  # (n,) uint32: `PatchTree.turn` of each
     # (n,) uint32: of an inner node the first child, after which the others follow. Of a leaf the number of its piece;
     # those of a tip follow each other, level by level.
     first: IntArray
@@ -83,13 +83,13 @@ class PieceTree:
 
 # A tree takes up to some megabytes, where valences are high.
 @lru_cache(maxsize=128)
-def piece_tree(
+def tree_arrays(
     scheme: Scheme,
     signature: Signature,
     piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are deeper ones
-) -> PieceTree:
+) -> TreeArrays:
     """Make the tree of an element of a signature."""
-    (element,) = divided_elements(scheme, [signature])
+    (element,) = patch_trees(scheme, [signature])
     kinds, turns, first = element.nodes.T.copy()
     # Regular pieces come first, in their order, then those of tips.
     maps, piece_count = [], 0
@@ -111,7 +111,7 @@ def piece_tree(
         own[: len(tip.second_eigenvector), 0] = tip.second_eigenvector
         blocks.append(own)
         piece_count, block_count = piece_count + len(tip.pieces), block_count + len(own)
-    return PieceTree(
+    return TreeArrays(
         kinds,
         turns,
         first,
@@ -181,7 +181,7 @@ def _by_level(rows: FloatArray, patch: IrregularPatch, base: float, levels: IntA
     return np.moveaxis(found, 2, 0).reshape(-1, *rows.shape[1:])
 
 
-def _shared_parts(element: DividedElement) -> list[tuple[DividedElement, FloatArray | None]]:
+def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None]]:
     """The largest parts of few enough pieces, and their control points over those of the element, if it is not one."""
     if element.piece is not None or element.regular_count <= SHARED_PIECES:
         return [(element, None)]
@@ -193,6 +193,6 @@ def _shared_parts(element: DividedElement) -> list[tuple[DividedElement, FloatAr
 
 
 @lru_cache(maxsize=1024)
-def _regular_pieces(scheme: Scheme, element: DividedElement) -> FloatArray:
+def _regular_pieces(scheme: Scheme, element: PatchTree) -> FloatArray:
     """``(p, m, K)`` coefficients of an element's regular pieces."""
     return element.coefficients(polynomial_basis(scheme).matrix)

@@ -1,9 +1,14 @@
-"""Weights of samples over the one-rings of their elements: the one way from a face and (u, v) to the surface.
+"""Samples in the leaves of patch trees: weights over the one-rings of their elements, and polynomials that hold them.
 
-A sample descends from its element, refinement by refinement, to the leaf that it lies in: a regular patch, or the patch
-around an extraordinary point. There its rows are those of the scheme's regular basis, or of equations (10), (12) and
-(13). On the way back, rows over the one-ring of a child become rows over that of its parent, by one product for each
-child of a signature, whatever elements of a cage it belongs to.
+This is the one way from a face and (u, v) to the surface. A sample descends from its element, refinement by refinement,
+to the leaf that it lies in: a regular patch, or the patch around an extraordinary point. There its rows are those of
+the scheme's regular basis, or of equations (10), (12) and (13). On the way back, rows over the one-ring of a child
+become rows over that of its parent, by one product for each child of a signature, whatever elements it belongs to.
+
+Vertices of a tessellation need polynomials that hold them (`sampled_polynomials`). In a regular piece, or one of the
+regular pieces around an extraordinary point, these are the piece's own. Where few samples lie in a piece, each has a
+polynomial of its own instead, the plane through its point along its two tangents, which has fewer coefficients. So have
+samples at extraordinary points, and near them beyond the levels that are pieces.
 """
 
 from __future__ import annotations
@@ -11,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -20,11 +25,12 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .divided_element import MOST_DEPTH, DividedElement, PartKind, not_isolated
-from .equations import Evaluator, SampleRows, times
+from .equations import Evaluator, SampleRows, locate, times
 from .irregular_patch import IrregularPatch
 from .normals import TANGENT_ROUNDING
-from .patch_pieces import Piece
+from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, not_isolated
+from .polynomials import polynomial_basis
+from .tree_arrays import LEVEL_PIECES, PIECE_LEVELS, level_polynomials
 
 # Weights of control points are sums over eigen-coordinates, in which large terms may cancel. Cancelled terms leave
 # rounding errors. So this part of them counts as weight: times `TANGENT_ROUNDING` that is one rounding error, or more.
@@ -35,7 +41,7 @@ CANCELLED = 1 / 16
 class _Depth:
     """Elements after so many refinements, all different, and the samples in them, sorted by these."""
 
-    elements: list[DividedElement]
+    elements: list[PatchTree]
     first: IntArray  # (n + 1,) the first sample of each element; then the number of samples
     # Samples in the same child of an element, for all but those in leaves: the element, the child's number, the
     # samples; the child's index among the elements of the next depth, and the samples there.
@@ -84,7 +90,7 @@ class LocatedSamples:
     def __init__(
         self,
         scheme: Scheme,
-        elements: Sequence[DividedElement],  # All different
+        elements: Sequence[PatchTree],  # All different
         element: IntArray,  # (s,) int64: index of each sample's element, in increasing order
         uv: FloatArray,  # (s, 2) float64: parameters, with (0, 0) at the sample's corner. They stay exact near it.
         corner: IntArray,  # (s,) int64
@@ -96,7 +102,7 @@ class LocatedSamples:
         self.leaf_sample, self.path, self.jacobian = self._ascend(found, len(uv))
 
     def _descend(
-        self, elements: list[DividedElement], element: IntArray, uv: FloatArray, turn: IntArray
+        self, elements: list[PatchTree], element: IntArray, uv: FloatArray, turn: IntArray
     ) -> list[tuple[int, IntArray, IntArray]]:
         """Fill the depths and the leaves; the depth, the samples and the turns of each part of the leaves, in order."""
         scheme, domain = self.scheme, self.scheme.domain
@@ -122,7 +128,7 @@ class LocatedSamples:
             child = np.where(child < corners, (child + turn[inner]) % corners, child)
             child, in_child = np.where(is_only, 0, child), np.where(is_only, uv[inner].T, in_child).T
             pairs, pair = np.unique(4 * element[inner] + child, return_inverse=True)
-            numbers: dict[DividedElement, int] = {}
+            numbers: dict[PatchTree, int] = {}
             below = [
                 numbers.setdefault(elements[key // 4].child_element(key % 4), len(numbers)) for key in pairs.tolist()
             ]
@@ -154,7 +160,8 @@ class LocatedSamples:
         """``leaf_sample``, ``path`` and ``jacobian``."""
         domain = self.scheme.domain
         numbers = [np.empty(int(depth.first[-1]), dtype=np.int64) for depth in self._depths]
-        paths, speeds = ([np.ones(len(each), dtype=dtype) for each in numbers] for dtype in (np.int64, np.float64))
+        paths = [np.ones(len(each), dtype=np.int64) for each in numbers]
+        speeds = [np.ones(len(each)) for each in numbers]
         begin = 0
         for depth, samples, _ in found:
             numbers[depth][samples] = np.arange(begin, begin + len(samples))
@@ -270,3 +277,90 @@ def _sorted(element: IntArray, turn: IntArray, uv: FloatArray) -> tuple[IntArray
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
     return element[order], turn[order], uv[order], number
+
+
+# Fewer samples of a piece have planes.
+FEW_SAMPLES = 4
+# Exponents of the monomials of a plane.
+PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
+
+
+class Polynomials(NamedTuple):
+    """Polynomials of the same monomials, and the samples that they hold."""
+
+    # list of (p, m, K) float64, for each element: times control points, the coefficients of each of its polynomials
+    rows: list[FloatArray]
+    # (s,) int64: which of them holds each sample, counted through all elements; -1 where none does
+    polynomial: IntArray
+    st: FloatArray  # (s, 2) float64: parameters of each sample there, from the middle of the domain
+
+
+def sampled_polynomials(
+    scheme: Scheme,
+    elements: Sequence[PatchTree],  # All different
+    uv: Sequence[FloatArray],  # (s, 2) float64: samples of each
+) -> tuple[Polynomials, Polynomials]:
+    """Planes, and polynomials of the scheme's `PolynomialBasis`, that hold samples.
+
+    Normals are along the cross product of the derivatives. Those of planes are tangents of any length.
+
+    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or something always stays
+    semi-sharp.
+    """
+    element = np.repeat(np.arange(len(elements)), [len(own) for own in uv])
+    located = LocatedSamples(scheme, elements, element, np.concatenate(uv), 0 * element)
+    numbers, parameters = zip(*(_in_pieces(scheme, leaves) for leaves in located.leaves), strict=True)
+    number, st = located.per_sample(numbers), located.per_sample(parameters).T
+    # Samples of an element that lie in the same piece follow each other.
+    order = np.lexsort((number, located.path, element))
+    keys = np.stack([element, located.path, number])[:, order]
+    begins = np.flatnonzero((np.diff(keys, axis=1, prepend=-2) != 0).any(axis=0))
+    counts = np.diff(begins, append=len(order))
+    has_plane = (number[order[begins]] < 0) | (counts < FEW_SAMPLES)
+    in_planes = np.sort(order[np.repeat(has_plane, counts)])
+    # A piece is found at the first of its samples. The sort is stable, so that these come in the order of elements.
+    in_pieces, first = order[~np.repeat(has_plane, counts)], order[begins[~has_plane]]
+    plane, piece = np.full((2, len(element)), -1)
+    plane[in_planes] = np.arange(len(in_planes))
+    piece[in_pieces] = np.repeat(np.arange(len(first)), counts[~has_plane])
+    return (
+        Polynomials(_planes(located.chosen(in_planes)), plane, 0 * st),
+        Polynomials(_pieces(located.chosen(first)), piece, st),
+    )
+
+
+def _in_pieces(scheme: Scheme, leaves: Leaves) -> tuple[IntArray, FloatArray]:
+    """Of the samples in some leaves, numbers of their pieces, -1 where they have planes; ``(2, n)`` parameters there.
+
+    Parameters are from the middle of the domain.
+    """
+    local, number = leaves.uv, np.zeros(len(leaves.uv), dtype=np.int64)
+    if leaves.patch is not None:
+        level, child, local = locate(scheme.domain, leaves.uv)
+        has_piece = (level < PIECE_LEVELS) & (scheme.domain.extent(leaves.uv) > 0)
+        number = np.where(has_piece, LEVEL_PIECES * level + child, -1)
+    return number, (local - scheme.domain.centre).T
+
+
+def _planes(samples: LocatedSamples) -> list[FloatArray]:
+    """Coefficients ``(p, 3, K)`` of a plane through each sample, for each element."""
+    rows = samples.rows("stabilized", np.float64, 1)
+    found = samples.weights([np.concatenate([each.rows[:1], each.tangents]) for each in rows])
+    if rows:
+        magnitude = samples.per_sample([frame_magnitude(*each) for each in zip(samples.leaves, rows, strict=True)])
+        for own, at in zip(found, samples.slices(), strict=True):
+            without_collapsed(own[:, 1:].swapaxes(0, 1), magnitude[:, at])
+    return found
+
+
+def _pieces(samples: LocatedSamples) -> list[FloatArray]:
+    """Coefficients ``(p, m, K)`` of the piece that each sample lies in, for each element."""
+    scheme, rows = samples.scheme, []
+    for leaves in samples.leaves:
+        if leaves.patch is None:
+            matrix = polynomial_basis(scheme).matrix[:, None]
+            rows.append(np.broadcast_to(matrix, (len(matrix), len(leaves.uv), matrix.shape[2])))
+        else:
+            polynomials = level_polynomials(scheme, leaves.patch, PIECE_LEVELS)
+            rows.append(polynomials[_in_pieces(scheme, leaves)[0]].swapaxes(0, 1))
+    return samples.weights(rows)
