@@ -35,7 +35,7 @@ CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
 KINDS, TURN = 3, 4
 FRAMES, LEVEL, LEVELS, CONTROL = 3, 4, 1023, 4096
 # Levels of tips are left to the deeper ones if their coefficients would take more than this, in single precision.
-COEFFICIENT_BYTES = 1 << 29
+COEFFICIENT_BYTES = 1 << 26
 
 
 @dataclass(frozen=True, eq=False)
