@@ -11,8 +11,8 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.tessellation import Criterion, Measure
-from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from mitsuba_subdivision.tessellation.tile_choice import feature_edges
+from mitsuba_subdivision.tessellation.tiles import PatchFrames
 from patches.closed_cages import bumpy
 from tessellation.distances import distances_of_pairs
 from tessellation.test_attribute_table import EVERY_CAGE, with_seams

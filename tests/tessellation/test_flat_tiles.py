@@ -15,9 +15,8 @@ from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.stencil_table import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation import Criterion, Measure
-from mitsuba_subdivision.tessellation.patch_frames import PatchFrames
 from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to
-from mitsuba_subdivision.tessellation.tiles import whole_patches
+from mitsuba_subdivision.tessellation.tiles import PatchFrames, whole_patches
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth

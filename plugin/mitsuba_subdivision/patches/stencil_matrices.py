@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..evaluation.element import derivative_stencils, element_stencils
 from ..mesh.connectivity import IntArray
+from ..mesh.signature import Signature
 from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.stencil_table import StencilTable
@@ -82,22 +83,12 @@ def sample_matrices(
     derivatives: int = 1,
 ) -> StencilMatrices:
     """Limit stencils of samples, given as for `PatchSampler.evaluate`."""
-    parts = _sample_rows(patches, control_of_vertex, half_edge, uv, derivatives)
-    return StencilMatrices(*joined_matrices(parts, 3 if derivatives == 1 else 6, (len(uv), control_count)))
 
+    def stencils(signature: Signature, uv: FloatArray, corner: IntArray) -> FloatArray:
+        return derivative_stencils(patches.scheme, signature, uv, corner, derivatives)
 
-def _sample_rows(
-    patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray, derivatives: int
-) -> Iterator[StencilRows]:
-    class_index, patch, patch_corner = patches.patch_at(half_edge)
-    order = np.argsort(class_index, kind="stable")
-    begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
-    for of_class in counted(np.split(order, begins[1:]) if len(order) else [], "Weights of patch classes"):
-        patch_class = patches.classes[class_index[of_class[0]]]
-        run = max(1, CHUNK // patch_class.controls.shape[1])
-        for at in np.split(of_class, range(run, len(of_class), run)):
-            weights = derivative_stencils(patches.scheme, patch_class.signature, uv[at], patch_corner[at], derivatives)
-            yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights)
+    rows = _rows(patches, control_of_vertex, half_edge, uv, stencils)
+    return StencilMatrices(*joined_matrices(rows, 3 if derivatives == 1 else 6, (len(uv), control_count)))
 
 
 def vertex_matrices(
@@ -114,13 +105,16 @@ def vertex_matrices(
     """
     from scipy import sparse
 
+    def stencils(signature: Signature, uv: FloatArray, corner: IntArray) -> FloatArray:
+        return element_stencils(patches.scheme, signature, uv, corner)[:count]
+
     refined = patches.refined
     if refined is None:
-        rows = _vertex_rows(patches, control_of_vertex, half_edge, uv, count)
+        rows = _rows(patches, control_of_vertex, half_edge, uv, stencils)
         return joined_matrices(rows, count, (len(uv), control_count))
     # Otherwise there would be too many classes.
     every = np.arange(refined.table.topology.vertex_count)
-    rows = _vertex_rows(refined.table, every, *_in_refined(patches, refined, half_edge, uv), count)
+    rows = _rows(refined.table, every, *_in_refined(patches, refined, half_edge, uv), stencils)
     of_mesh = sparse.csr_array(
         (np.ones(len(control_of_vertex)), (np.arange(len(control_of_vertex)), control_of_vertex)),
         shape=(len(control_of_vertex), control_count),
@@ -129,24 +123,28 @@ def vertex_matrices(
     return [(own @ matrix).tocsr() for own in joined_matrices(rows, count, (len(uv), len(every)))]
 
 
-def _vertex_rows(
-    patches: PatchTable, control_of_vertex: IntArray, half_edge: IntArray, uv: FloatArray, count: int
+def _rows(
+    patches: PatchTable,
+    control_of_vertex: IntArray,
+    half_edge: IntArray,
+    uv: FloatArray,
+    # Of samples of a class, from its signature, their parameters and their corners: ``(d, s, K)`` weights
+    stencils: Callable[[Signature, FloatArray, IntArray], FloatArray],
 ) -> Iterator[StencilRows]:
     class_index, patch, patch_corner = patches.patch_at(half_edge)
-    # Samples of the same class in the same place of their patches have the same weights.
-    keys = np.stack([class_index, patch_corner, *uv.T])
-    order = np.lexsort(keys[::-1])
-    is_new = (np.diff(keys[:, order], axis=1, prepend=-1) != 0).any(axis=0)
+    order = np.lexsort((*uv.T[::-1], patch_corner, class_index))
     begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
-    for own in np.split(np.arange(len(order)), begins)[1:]:
-        patch_class, distinct = patches.classes[class_index[order[own[0]]]], order[own[is_new[own]]]
-        stencils = element_stencils(patches.scheme, patch_class.signature, uv[distinct], patch_corner[distinct])[:count]
-        which = np.cumsum(is_new[own]) - 1
-        run = max(1, CHUNK // stencils.shape[2])
-        for begin in range(0, len(own), run):
-            at = order[own[begin : begin + run]]
-            weights = stencils[:, which[begin : begin + run]]
-            yield StencilRows(at, control_of_vertex[patch_class.controls[patch[at]]], weights)
+    for of_class in counted(np.split(order, begins)[1:], "Weights of patch classes"):
+        patch_class = patches.classes[class_index[of_class[0]]]
+        run = max(1, CHUNK // patch_class.controls.shape[1])
+        for at in np.split(of_class, range(run, len(of_class), run)):
+            # Samples in the same place of their patches have the same weights.
+            places = np.stack([patch_corner[at], *uv[at].T])
+            is_new = (np.diff(places, axis=1, prepend=-1) != 0).any(axis=0)
+            distinct = at[is_new]
+            weights = stencils(patch_class.signature, uv[distinct], patch_corner[distinct])
+            controls = control_of_vertex[patch_class.controls[patch[at]]]
+            yield StencilRows(at, controls, weights[:, np.cumsum(is_new) - 1])
 
 
 def _in_refined(

@@ -20,10 +20,9 @@ from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .criterion import Criterion
-from .patch_frames import EDGE, UNIT, PatchFrames
 from .stitching import SideSamples, inner_counts, inner_steps, stitched
 from .tile_choice import choose_tiles
-from .tiles import Tiles, corner_points, sizes
+from .tiles import EDGE, UNIT, PatchFrames, Tiles, corner_points, sizes
 from .uniform import checked_rate
 from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
 from .vertex_table import VertexTable

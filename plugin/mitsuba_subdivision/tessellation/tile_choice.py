@@ -20,9 +20,8 @@ from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .criterion import Criterion, Measure, dot
 from .memory import require_memory_for_triangles
-from .patch_frames import PatchFrames
 from .tile_rates import TileRates
-from .tiles import DEEPEST, Tiles, child, tile_type, whole_patches
+from .tiles import DEEPEST, PatchFrames, Tiles, child, tile_type, whole_patches
 
 # Tiles of a kind that are looked at together, whose bounds stay in a core's cache; and tiles that wait until there are
 # as many of their kind. They bound temporary memory; fewer would take more time.

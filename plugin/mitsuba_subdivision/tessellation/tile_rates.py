@@ -14,8 +14,7 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .criterion import TINY, Criterion, Measure, NormalCone, TangentCone, cross, dot, least_product, rounded_up
-from .patch_frames import UNIT, PatchFrames
-from .tiles import Tiles, sizes
+from .tiles import UNIT, PatchFrames, Tiles, sizes
 
 # Samples of a displacement along each side of a tile.
 HEIGHT_SAMPLES = 9
