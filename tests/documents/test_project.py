@@ -37,8 +37,9 @@ def classified(topic):
     return {line.removeprefix(topic) for line in PROJECT["classifiers"] if line.startswith(topic)}
 
 
-def requirement(package):
-    (found,) = (line.removeprefix(package) for line in PROJECT["dependencies"] if line.startswith(package))
+def requirement(package, extra=None):
+    lines = PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
+    (found,) = (line.removeprefix(package) for line in lines if line.startswith(package))
     return found
 
 
@@ -188,9 +189,10 @@ def test_the_checks_install_nothing_without_the_right_or_on_other_systems_or_whe
 
 
 def test_checks_before_a_commit_are_those_of_the_script():
-    hooks = yaml.safe_load(read(".pre-commit-config.yaml"))["repos"][0]["hooks"]
+    ruff, local = yaml.safe_load(read(".pre-commit-config.yaml"))["repos"]
     tools = {"ruff check", "ruff format", "mypy"}
-    assert {hook["name"] for hook in hooks} == tools
+    assert {hook["name"] for hook in [*ruff["hooks"], *local["hooks"]]} == tools
+    assert requirement("ruff", "dev") == f"=={ruff['rev'].removeprefix('v')}"
     assert [tool for tool in sorted(tools) if f".venv/bin/{tool}" not in read(".ci/run")] == []
 
 
