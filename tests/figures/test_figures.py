@@ -31,7 +31,7 @@ from scipy.spatial import cKDTree
 
 # Small enough that all together take seconds.
 RESOLUTION, SPP, DPI = 12, 1, 20
-FIGURE_NAMES = ("subdivision", "refinement", "domains", "artifact", "error", "schemes", "creases", "shading",
+FIGURE_NAMES = ("subdivision", "refinement", "tree", "domains", "artifact", "error", "schemes", "creases", "shading",
     "displacement", "zoom", "zebra", "curvature", "fit", "hero")  # fmt: skip
 # These are one picture, wider than those that share a figure, without text.
 STAND_ALONE = ("hero", "displacement")

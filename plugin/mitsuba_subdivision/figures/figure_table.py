@@ -39,6 +39,7 @@ class Figure:
 FIGURES: dict[str, Figure] = {
     "subdivision": Figure("subdivision", "a cage and its refinements, irregular patches grey", ("spp", "cage")),
     "refinement": Figure("refinement", "control points of a patch before and after one refinement", (), COLUMN),
+    "tree": Figure("tree", "a face divided into polynomials, and the matrix that makes them", (), COLUMN),
     "domains": Figure("domains", "parameter domains of the regular patches at each level", ("scheme",), COLUMN),
     "artifact": Figure("artifact", "normals by (11), (12) and (13), rendered", ("spp", "scheme", "cage")),
     "error": Figure("normal_error", "normal error against level by (11), (12), (13)", ("cage",)),
