@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextvars
 import os
 import signal
@@ -29,7 +28,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status; after Ctrl-C, end the process if its work cannot be stopped."""
     with flushed_output():
         try:
-            options = parsed(None if arguments is None else [*arguments])
+            options, unknown = parser().parse_known_args(arguments)
+            if unknown:
+                # The command's own parser reports them, with its usage and exit status.
+                options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
             try:
                 with printed_warnings(CageWarning):
                     return interruptible(lambda: options.run(options)) or 0
@@ -59,7 +61,6 @@ def interruptible(work: Callable[[], T]) -> T:
     """Run a function in another thread, so that this one can be interrupted.
 
     Python notices Ctrl-C only between two of its instructions, and a single one can be a render of hours.
-
     Raises Abandoned if Ctrl-C is pressed before the work is done.
     """
     if threading.current_thread() is not threading.main_thread():
@@ -107,19 +108,6 @@ def parser() -> CommandParser:
     for module in (figure, render, cage, compare, doctor):
         module.add_parser(commands)
     return program
-
-
-def parsed(arguments: list[str] | None) -> argparse.Namespace:
-    """The options of a command line, or of this process.
-
-    Raises SystemExit if they are wrong, or ask for help or the version.
-    """
-    program = parser()
-    options, unknown = program.parse_known_args(arguments)
-    if unknown:
-        # The command's own parser reports them, with its usage and exit status.
-        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
-    return options
 
 
 if __name__ == "__main__":

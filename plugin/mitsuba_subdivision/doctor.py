@@ -89,8 +89,8 @@ class Diagnosis:
         for name, packages in self.extras.items():
             listed = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
             lines.append((f"extra {name}", listed))
-        all_works, some_fails = "everything that this machine should support works", "there are PROBLEMS, listed above"
-        verdict = all_works if self.healthy else some_fails
+        all_works = "everything that this machine should support works"
+        verdict = all_works if self.healthy else "there are PROBLEMS, listed above"
         width = max(len(name) for name, _ in lines)
         return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
 
@@ -151,18 +151,19 @@ def _report(variant: str) -> dict[str, Any]:
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         return {**found, "problem": "Dr.Jit finds no CUDA device or driver"}
     mi.set_variant(variant)
-    try:
-        problem = _wrong_height(_rendered_height(shading="vertex", tessellation_rate=2))
-    except Exception as error:
-        problem = _line(error)
-    if problem:
+    if problem := _problem(shading="vertex", tessellation_rate=2):
         return {**found, "works": False, "problem": problem}
-    try:
-        # The triangles of one segment per edge lie far below the surface.
-        problem = _wrong_height(_rendered_height(shading="exact", tessellation_rate=1))
-    except Exception as error:
-        problem = _line(error)
+    # The triangles of one segment per edge lie far below the surface.
+    problem = _problem(shading="exact", tessellation_rate=1)
     return {**found, "works": True, "exact_shading": problem is None, "exact_problem": problem}
+
+
+def _problem(**parameters: Any) -> str | None:
+    """What is wrong with a render, in one line; None if nothing is."""
+    try:
+        return _wrong_height(_rendered_height(**parameters))
+    except Exception as error:
+        return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
 
 
 def _rendered_height(**parameters: Any) -> float:
@@ -172,29 +173,21 @@ def _rendered_height(**parameters: Any) -> float:
     from .cage.named_cages import cube
 
     camera = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
+    camera = camera @ mi.ScalarTransform4f().scale([_PIXEL, _PIXEL, 1])
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
     scene = {
         "type": "scene",
         "integrator": {"type": "aov", "aovs": "position:position"},
-        "sensor": {
-            "type": "orthographic",
-            "to_world": camera @ mi.ScalarTransform4f().scale([_PIXEL, _PIXEL, 1]),
-            "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}},
-        },
+        "sensor": {"type": "orthographic", "to_world": camera, "film": film},
         "surface": {"type": "subdivision", **cube().as_properties(mi), **parameters},
     }
-    pixel = mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array
-    return float(pixel[2])
+    return float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[2])
 
 
 def _wrong_height(height: float) -> str | None:
     if abs(height - CUBE_HEIGHT) <= TOLERANCE:
         return None
     return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
-
-
-def _line(error: Exception) -> str:
-    """An error in one line."""
-    return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
 
 
 def _signal_name(number: int) -> str:

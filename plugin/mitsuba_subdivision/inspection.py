@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
 from .cage.rules import RULES
-from .mesh.connectivity import IntArray, VertexRule
+from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.seams import seams
 from .surface import LimitSurface
 
@@ -59,12 +59,14 @@ class Inspection:
 
     def __str__(self) -> str:
         counts = f"{self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces"
+        loops = f"{self.boundary_loop_count:,} loop{'s' * (self.boundary_loop_count != 1)}, rule {self.boundary}"
+        boundary = f"{self.boundary_edge_count:,} edges in {loops}"
         rows = [
             ("cage", f"{self.name}: {counts}"),
             ("box", " to ".join("({:g}, {:g}, {:g})".format(*corner) for corner in self.bounding_box)),
             ("faces", _listed(self.face_sizes, "{:,} of {} corners")),
             ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
-            ("boundary", self._boundary_row()),
+            ("boundary", boundary if self.boundary_edge_count else "none, the cage is closed"),
             ("sharp", ", ".join(f"{count:,} {what}" for what, count in self.sharp.items() if count) or "nothing"),
             ("rules", ", ".join(f"{name} {rule}" for name, rule in self.rules.items()) or "the default"),
             ("attributes", ", ".join(f"{name}: {what}" for name, what in self.attributes.items()) or "none"),
@@ -75,12 +77,6 @@ class Inspection:
         if self.component_count > 1:
             rows.insert(1, ("pieces", f"{self.component_count:,} that share no vertex"))
         return "\n".join(f"{title + ':':<16}{text}" for title, text in rows)
-
-    def _boundary_row(self) -> str:
-        if not self.boundary_edge_count:
-            return "none, the cage is closed"
-        loops = "loop" if self.boundary_loop_count == 1 else "loops"
-        return f"{self.boundary_edge_count:,} edges in {self.boundary_loop_count:,} {loops}, rule {self.boundary}"
 
 
 def inspect(
@@ -93,8 +89,7 @@ def inspect(
     cage = surface.cage
     t = cage.topology
     used = cage.positions[t.face_vertices]
-    inner = _inner_vertices(cage)
-    border = np.flatnonzero(cage.is_boundary)
+    rules = {name: getattr(cage, name) for name in RULES}
     triangle_count, vertex_count = _tessellation_size(surface, rate)
     vertex_bytes = VERTEX_BYTES + (TEXCOORD_BYTES if cage.texcoords else 0)
     return Inspection(
@@ -103,20 +98,14 @@ def inspect(
         vertex_count=cage.vertex_count,
         edge_count=_edge_count(cage),
         face_count=cage.face_count,
-        component_count=_piece_count(t.vertex_count, t.face_vertices, t.face_vertices[t.next], t.face_vertices),
+        component_count=_piece_count(t, np.arange(t.half_edge_count)),
         bounding_box=(tuple(used.min(axis=0).tolist()), tuple(used.max(axis=0).tolist())),
         face_sizes=_histogram(cage.face_sizes),
-        valences=_histogram(t.vertex_face_count[inner]),
-        boundary_edge_count=len(border),
-        boundary_loop_count=_piece_count(
-            t.vertex_count, t.face_vertices[border], t.face_vertices[t.next[border]], t.face_vertices[border]
-        ),
+        valences=_histogram(t.vertex_face_count[_inner_vertices(cage)]),
+        boundary_edge_count=int(cage.is_boundary.sum()),
+        boundary_loop_count=_piece_count(t, np.flatnonzero(cage.is_boundary)),
         boundary=cage.boundary,
-        rules={
-            name: getattr(cage, name)
-            for name, known in RULES.items()
-            if name != "boundary" and getattr(cage, name) != known[0]
-        },
+        rules={name: rule for name, rule in rules.items() if name != "boundary" and rule != RULES[name][0]},
         sharp=_sharp_features(cage),
         attributes=_attributes(cage),
         patch_count=surface.patches.patch_count,
@@ -156,11 +145,11 @@ def _listed(counts: dict[int, int], form: str, shown: int = 8) -> str:
     return ", ".join(parts) or "none"
 
 
-def _piece_count(vertex_count: int, starts: NDArray, ends: NDArray, used: NDArray) -> int:
-    """Number of connected components of a graph on the used vertices."""
-    graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(vertex_count, vertex_count))
-    _, labels = connected_components(graph, directed=False)
-    return len(np.unique(labels[used]))
+def _piece_count(t: Topology, half_edges: IntArray) -> int:
+    """Number of connected components of some half-edges."""
+    ends = t.face_vertices[half_edges], t.face_vertices[t.next[half_edges]]
+    graph = sparse.coo_array((np.ones(len(half_edges), dtype=bool), ends), shape=(t.vertex_count, t.vertex_count))
+    return len(np.unique(connected_components(graph, directed=False)[1][ends[0]]))
 
 
 def _sharp_features(cage: ControlCage) -> dict[str, int]:
@@ -194,8 +183,7 @@ def _attributes(cage: ControlCage) -> dict[str, str]:
 
 def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
     """Triangles and vertices of a tessellation."""
-    elements = surface.patches.elements
-    sizes = elements.face_sizes
+    sizes = surface.patches.elements.face_sizes
     if surface.scheme.domain.corner_count == 3:
         triangles = len(sizes) * rate**2
     else:

@@ -156,18 +156,18 @@ def best_variant() -> str:
 
 def _search() -> LlvmChoice:
     """Newest usable library of the first location that has one: the Python environment, the wheel, the system."""
-    newest_old = None
+    newest_old, loader_folders = 0, os.environ.get("LD_LIBRARY_PATH", "").split(":")
     for reason, libraries in (
         ("found in the Python environment", lambda: _libraries(_python_folders())),
         (f"found through {_WHEEL}", _wheel_libraries),
-        ("newest of the system", lambda: _libraries([*_loader_folders(), *_SYSTEM_FOLDERS])),
+        ("newest of the system", lambda: _libraries([*filter(None, loader_folders), *_SYSTEM_FOLDERS])),
     ):
         versions = [(_known_version(path), path) for path in libraries()]
         usable = [(version, path) for version, path in versions if version >= lowest_version()]
         if usable:
             version, path = max(usable)
             return LlvmChoice(path, version, reason)
-        newest_old = max([newest_old or 0, *(version for version, _ in versions)])
+        newest_old = max([newest_old, *(version for version, _ in versions)])
     if newest_old:
         return LlvmChoice(None, newest_old, f"no LLVM {lowest_version()} or newer was found")
     return LlvmChoice(None, None, "no LLVM library was found; Dr.Jit searches by its own rules")
@@ -231,7 +231,3 @@ def _wheel_libraries() -> list[str]:
 
 def _python_folders() -> list[str]:
     return [f"{prefix}/lib" for prefix in dict.fromkeys([sys.prefix, sys.base_prefix, site.getuserbase()])]
-
-
-def _loader_folders() -> list[str]:
-    return [folder for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]

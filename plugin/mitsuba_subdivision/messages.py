@@ -39,14 +39,7 @@ def print_remark(text: str) -> None:
 def printed_warnings(category: type[Warning]) -> Iterator[None]:
     """Print each warning of a category, however often it is issued, and print no warning with a line of code."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],  # noqa: ARG001 - as `warnings.showwarning` has it
-        filename: str,  # noqa: ARG001
-        lineno: int,  # noqa: ARG001
-        file: TextIO | None = None,  # noqa: ARG001
-        line: str | None = None,  # noqa: ARG001
-    ) -> None:
+    def show(message: Warning | str, *_place: object, **_more: object) -> None:
         print_remark(f"warning: {message}")
 
     with warnings.catch_warnings():

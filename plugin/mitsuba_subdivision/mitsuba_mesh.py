@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from .device_arrays import upload
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 # Buffers that a mesh has without adding them as attributes.
 OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords")
@@ -31,8 +28,6 @@ def mitsuba_mesh(
     averages_normals: bool = False,
 ) -> mi.Mesh:
     """Make a mesh of the current variant."""
-    import mitsuba as mi
-
     properties = mi.Properties()
     for key, part in (("bsdf", bsdf), ("emitter", emitter), ("interior", interior)):
         if part is not None:

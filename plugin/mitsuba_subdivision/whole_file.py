@@ -21,7 +21,6 @@ def whole_file(path: Path) -> Iterator[Path]:
     The temporary name has the suffix of ``path``. If writing fails, nothing stays behind, and a file that was there
     before is as it was. A process that is killed leaves its temporary file, ".NAME.NUMBER.part.SUFFIX". If several
     processes write one file, the last to end wins. Links are followed. Pipes and devices are written to directly.
-
     Raises FileNotFoundError if the folder does not exist. Raises OSError if the file cannot be written; the message
     names ``path``.
     """
@@ -35,7 +34,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     _unfinished.add(beside)
     try:
         yield beside
-        _to_disk(beside)
+        # Wait until it is on its disk: some systems notice only then that the disk is full.
+        with beside.open("r+b") as stream:
+            os.fsync(stream.fileno())
         beside.replace(path)
     except (OSError, RuntimeError) as error:
         renamed = _about(path, beside, error)
@@ -43,9 +44,13 @@ def whole_file(path: Path) -> Iterator[Path]:
             raise
         raise renamed from error
     finally:
-        with suppress(OSError):
-            beside.unlink(missing_ok=True)
-        _unfinished.discard(beside)
+        _remove(beside)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file in UTF-8, as `whole_file` does."""
+    with whole_file(path) as beside:
+        beside.write_text(text, encoding="utf-8")
 
 
 def require_writable(
@@ -67,17 +72,14 @@ def require_writable(
         raise PermissionError(f'output "{path}" is protected from writing')
     if path.exists() and not path.is_file():
         return
-    target = Path(os.path.realpath(path))
-    probe = _beside(target)
+    probe = _beside(Path(os.path.realpath(path)))
     _unfinished.add(probe)
     try:
         probe.touch()
     except OSError as error:
         raise type(error)(f'output "{path}": {error.strerror}') from None
     finally:
-        with suppress(OSError):
-            probe.unlink(missing_ok=True)
-        _unfinished.discard(probe)
+        _remove(probe)
 
 
 def require_folder(folder: Path) -> None:
@@ -93,18 +95,17 @@ def require_folder(folder: Path) -> None:
 def remove_unfinished() -> None:
     """Remove the unfinished files of this process before it ends."""
     for beside in _unfinished.copy():
-        with suppress(OSError):
-            beside.unlink(missing_ok=True)
+        _remove(beside)
+
+
+def _remove(unfinished: Path) -> None:
+    with suppress(OSError):
+        unfinished.unlink(missing_ok=True)
+    _unfinished.discard(unfinished)
 
 
 def _beside(path: Path) -> Path:
     return path.with_name(f".{path.stem[:_LONGEST_STEM]}.{uuid.uuid4().hex}.part{path.suffix}")
-
-
-def _to_disk(path: Path) -> None:
-    """Wait until a file is on its disk: some systems notice only then that the disk is full."""
-    with path.open("r+b") as stream:
-        os.fsync(stream.fileno())
 
 
 def _about(path: Path, beside: Path, error: Exception) -> Exception:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .contents import NodeContents, TextureContents, leaves
+from .contents import NodeContents, TextureContents, leaves, parts
 from .materialx_nodes import Values, evaluate
 
 # Pixels along the unit square of what has no picture, and of what has large ones, many times.
@@ -26,43 +26,39 @@ class Baked:
     wrap: str  # Mitsuba's name
 
 
-# Values (h, w, k) of a picture's channel, and from texture coordinates to those of the picture; or None.
-Source = Callable[[TextureContents], tuple[Values, NDArray[np.float64]] | None]
+# Values (h, w, k) of a picture's channel, and the transform (3, 3) from texture coordinates to those of the picture.
+Picture = tuple[Values, NDArray[np.float64]]
 
 
-def baked(
-    expression: NodeContents,
-    source: Source,  # Reads pictures; where there is none, its fallback is taken
-) -> Baked:
-    """Values of an expression.
+def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]) -> Baked:
+    """Values of an expression; where there is no picture of a texture, its fallback is taken.
 
     Where all pictures lie in one place of the plane, at the resolution of the largest; else over the unit square, which
     repeats.
     """
     found = leaves(expression)
     textures = [each for each in found if isinstance(each, TextureContents)]
-    pictures = {id(each): source(each) for each in textures}
+    pictures = {id(each): picture_of(each) for each in textures}
     maps = [picture[1] @ each.to_uv for each in textures if (picture := pictures[id(each)]) is not None]
     sizes = [picture[0].shape[:2] for picture in pictures.values() if picture is not None]
     wraps = {each.wrap for each in textures}
     is_direct = len(textures) == len(found) and not samples_elsewhere(expression)
     if is_direct and maps and len(wraps) == 1 and all(np.allclose(each, maps[0]) for each in maps):
         height, width = np.max(sizes, axis=0)
-        sampling = _Grid(int(height), int(width), maps[0], pictures, is_shared=True)
+        sampling = _Grid((int(height), int(width)), maps[0], pictures, is_shared=True)
         return Baked(_filled(expression, sampling), maps[0], wraps.pop())
     wanted = [LEAST_PROCEDURAL] if not is_direct or not sizes else []
     for size, to_uv in zip(sizes, maps, strict=True):
         wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
     edge = min(max(wanted, default=1), MOST)
-    sampling = _Grid(edge, edge, np.eye(3), pictures, is_shared=False)
+    sampling = _Grid((edge, edge), np.eye(3), pictures, is_shared=False)
     # Only ramps do not repeat: they continue with their last value.
     return Baked(_filled(expression, sampling), np.eye(3), "repeat" if textures else _procedural_wrap(expression))
 
 
 def _filled(expression: NodeContents, grid: _Grid) -> NDArray[np.float32]:
     """Values at all pixels, some rows at a time, as an expression has many arrays at once."""
-    has_slopes = any(each.category == "heighttonormal" for each in _nodes(expression))
-    count = grid.height if has_slopes else max(1, _PIXELS_AT_ONCE // grid.width)
+    count = grid.height if "heighttonormal" in _categories(expression) else max(1, _PIXELS_AT_ONCE // grid.width)
     found: list[Values] = []
     for first in range(0, grid.height, count):
         grid.rows = np.arange(first, min(first + count, grid.height))
@@ -72,42 +68,29 @@ def _filled(expression: NodeContents, grid: _Grid) -> NDArray[np.float32]:
     return np.concatenate(found)
 
 
-def _nodes(expression: NodeContents) -> list[NodeContents]:
-    found: dict[int, NodeContents] = {}
-    rest = [expression]
-    while rest:
-        each = rest.pop()
-        if id(each) not in found:
-            found[id(each)] = each
-            rest.extend(value for value in each.inputs.values() if isinstance(value, NodeContents))
-    return list(found.values())
+def _categories(expression: NodeContents) -> set[str]:
+    return {each.category for each in parts(expression) if isinstance(each, NodeContents)}
 
 
 def samples_elsewhere(expression: NodeContents) -> bool:
     """Whether an expression computes the texture coordinates of a picture."""
-    return any(each.category == "image" for each in _nodes(expression))
+    return "image" in _categories(expression)
 
 
 def _procedural_wrap(expression: NodeContents) -> str:
-    ramps = {"ramplr", "ramptb", "splitlr", "splittb"}
-    names = {each.category for each in _nodes(expression)}
+    names = _categories(expression)
     is_noise = any("noise" in each or "fractal" in each for each in names)
-    return "clamp" if names & ramps and not is_noise else "repeat"
+    return "clamp" if names & {"ramplr", "ramptb", "splitlr", "splittb"} and not is_noise else "repeat"
 
 
 class _Grid:
     """Centres of pixels of some rows, in the part of the plane that all pictures share or over the unit square."""
 
     def __init__(
-        self,
-        height: int,
-        width: int,
-        to_uv: NDArray[np.float64],
-        pictures: dict[int, tuple[Values, NDArray[np.float64]] | None],
-        is_shared: bool,
+        self, size: tuple[int, int], to_uv: NDArray[np.float64], pictures: dict[int, Picture | None], is_shared: bool
     ) -> None:
-        self.height, self.width = height, width
-        self.rows = np.arange(height)
+        self.height, self.width = size
+        self.rows = np.arange(self.height)
         self._to_uv, self._pictures, self._is_shared = to_uv, pictures, is_shared
 
     def texcoords(self) -> Values:
@@ -118,8 +101,7 @@ class _Grid:
     def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
         picture = self._pictures[id(texture)]
         if picture is None:
-            channels = ["rgba".index(each) for each in texture.channel]
-            return np.asarray(texture.fallback, dtype=np.float32)[channels]
+            return np.asarray(texture.fallback, dtype=np.float32)[texture.channels]
         values, to_uv = picture
         if texcoords is None and self._is_shared:
             if values.shape[:2] == (self.height, self.width):

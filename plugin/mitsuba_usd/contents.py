@@ -5,6 +5,7 @@ Matrices are ``(4, 4)`` float64 for column vectors. Colours are linear, with the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +27,11 @@ class TextureContents:
     texcoords: str  # Name of the primvar that has the texture coordinates
     fallback: list[float]  # Four numbers, where there is no such file
 
+    @property
+    def channels(self) -> list[int]:
+        """Indices of the channel's letters among "rgba"."""
+        return ["rgba".index(each) for each in self.channel]
+
 
 @dataclass(frozen=True, eq=False)
 class PrimvarContents:
@@ -46,25 +52,26 @@ class NodeContents:
     inputs: dict[str, Input]
 
 
+Source = TextureContents | PrimvarContents | NodeContents
 # A number or a colour, or where it comes from.
-Input = float | list[float] | str | TextureContents | PrimvarContents | NodeContents
+Input = float | list[float] | str | Source
 
 
-def leaves(given: Input) -> list[TextureContents | PrimvarContents | NodeContents]:
-    """Pictures, attributes and texture coordinates that an input depends on."""
-    found: list[TextureContents | PrimvarContents | NodeContents] = []
-    seen: set[int] = set()
+def parts(given: Input) -> list[Source]:
+    """An input itself, unless it is constant, and all that it depends on, each once."""
+    found: dict[int, Source] = {}
     rest = [given]
     while rest:
         each = rest.pop()
-        if isinstance(each, (float, int, list, str)) or id(each) in seen:
-            continue
-        seen.add(id(each))
-        if isinstance(each, NodeContents) and each.category != "texcoord":
-            rest.extend(each.inputs.values())
-        else:
-            found.append(each)
-    return found
+        if not isinstance(each, (float, int, list, str)) and id(each) not in found:
+            found[id(each)] = each
+            rest.extend(each.inputs.values() if isinstance(each, NodeContents) else ())
+    return list(found.values())
+
+
+def leaves(given: Input) -> list[Source]:
+    """Pictures, attributes and texture coordinates that an input depends on."""
+    return [each for each in parts(given) if not isinstance(each, NodeContents) or each.category == "texcoord"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +91,23 @@ class MaterialContents:
 
     def textures(self) -> list[TextureContents]:
         """Pictures that it reads."""
-        found = (each for given in self.inputs.values() for each in leaves(given))
-        return [each for each in found if isinstance(each, TextureContents)]
+        return [each for each in self._leaves() if isinstance(each, TextureContents)]
 
     def primvars(self) -> set[str]:
         """Names of the attributes that it reads."""
-        found = (each for given in self.inputs.values() for each in leaves(given))
-        return {each.name for each in found if isinstance(each, PrimvarContents)}
+        return {each.name for each in self._leaves() if isinstance(each, PrimvarContents)}
 
     def texcoords(self) -> list[str]:
         """Names of the texture coordinates that it reads, each once."""
-        found = (each for given in self.inputs.values() for each in leaves(given))
         names = (
             str(each.inputs["name"]) if isinstance(each, NodeContents) else each.texcoords
-            for each in found
+            for each in self._leaves()
             if not isinstance(each, PrimvarContents)
         )
         return list(dict.fromkeys(names))
+
+    def _leaves(self) -> Iterator[Source]:
+        return (each for given in self.inputs.values() for each in leaves(given))
 
 
 @dataclass(frozen=True, eq=False)

@@ -334,15 +334,15 @@ def _plain(values: Values) -> float | list[float]:
 
 
 def _is_all(given: Input, value: float) -> bool:
+    """Whether an input is a number, or all channels of a colour are."""
     return is_constant(given) and not isinstance(given, str) and bool(np.all(np.asarray(given) == value))
 
 
 def affine(texture: TextureContents, factor: Any, offset: Any) -> TextureContents | None:
     """A picture times a factor and plus an offset, numbers or one for each channel; None if it has other channels."""
-    channels = ["rgba".index(each) for each in texture.channel]
     scales, offsets = np.ones(4), np.zeros(4)
     try:
-        scales[channels], offsets[channels] = factor, offset
+        scales[texture.channels], offsets[texture.channels] = factor, offset
     except ValueError:
         return None
     scale, bias, fallback = (np.asarray(each) for each in (texture.scale, texture.bias, texture.fallback))
@@ -439,17 +439,13 @@ def _simpler_conversion(kind: str, given: dict[str, Input]) -> Input | None:
 
 
 def _simpler_combination(_kind: str, given: dict[str, Input]) -> Input | None:
-    parts = [given[name] for name in ("in1", "in2", "in3")]
-    first = parts[0]
+    first = given["in1"]
     if not isinstance(first, TextureContents):
         return None
-    for part, channel in zip(parts, "rgb", strict=True):
+    for part, channel in zip((first, given["in2"], given["in3"]), "rgb", strict=True):
         if not isinstance(part, TextureContents) or part.channel != channel:
             return None
-        if any(
-            not np.array_equal(getattr(part, name), getattr(first, name))
-            for name in ("file", "color_space", "wrap", "scale", "bias", "to_uv", "texcoords")
-        ):
+        if not same(part, first, frozenset({"channel", "fallback"})):
             return None
     return replace(first, channel="rgb")
 

@@ -34,16 +34,11 @@ class ShapeReader:
     def __init__(
         self,
         name: str,  # Beginning of messages
-        time: float | None,
-        code: Usd.TimeCode,  # The same time, for all but the cage
+        time: Usd.TimeCode,
         materials: MaterialReader,
         notes: StageWarnings,
     ) -> None:
-        self._name = name
-        self._time = time
-        self._code = code
-        self._materials = materials
-        self._notes = notes
+        self._name, self._time, self._materials, self._notes = name, time, materials, notes
         self._skinning = Skinning(time, notes.add)
 
     def read(
@@ -58,15 +53,15 @@ class ShapeReader:
         with np.errstate(over="ignore", invalid="ignore"):
             if str(prim.GetTypeName()) not in GPRIMS:
                 return self._parts(prim, to_world, location)
-            require_types(prim, self._code)
-            cage, normals = read_gprim(prim, self._code)
+            require_types(prim, self._time)
+            cage, normals = read_gprim(prim, self._time)
             return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         from pxr import UsdGeom
 
         mesh = UsdGeom.Mesh(prim)
-        reader = MeshReader(mesh, location, self._time, self._skinning, report=self._notes.add_message)
+        reader = MeshReader(mesh, location, self._skinning, report=self._notes.add_message)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
         self._note_velocities(mesh)
@@ -97,9 +92,9 @@ class ShapeReader:
 
     def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
         """Note velocities where points are not those of a sample."""
-        if self._code.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
+        if self._time.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
             return
-        time = self._code.GetValue()
+        time = self._time.GetValue()
         if time not in mesh.GetPointsAttr().GetBracketingTimeSamples(time):
             what = "velocities of meshes are ignored; their points are interpolated between samples"
             self._notes.add(what, mesh.GetPath())
@@ -112,7 +107,7 @@ class ShapeReader:
         materials = [self._materials.bound(prim)]
         owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)), dtype=np.int64)
         for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
-            if value_at(subset.GetElementTypeAttr(), self._code) != "face":
+            if value_at(subset.GetElementTypeAttr(), self._time) != "face":
                 self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
             read = partial(_faces_of, reader, subset, len(owner))
@@ -157,9 +152,9 @@ class ShapeReader:
         constants = {name: values for name, values in constants.items() if values}
         radiance = None
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._code):
+            if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time):
                 self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
-            radiance = read_emission(prim, self._code).tolist()
+            radiance = read_emission(prim, self._time).tolist()
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
@@ -172,9 +167,9 @@ class ShapeReader:
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue() or primvar.GetInterpolation() != UsdGeom.Tokens.constant:
             return []
-        values = np.asarray(value_at(primvar.GetAttr(), self._code))
+        values = np.asarray(value_at(primvar.GetAttr(), self._time))
         if primvar.IsIndexed() and values.ndim:
-            indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._code))
+            indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._time))
             values = values[indices] if ((indices >= 0) & (indices < len(values))).all() else np.zeros(0)
         if values.dtype.kind == "f" and values.size in (1, 3) and np.isfinite(values).all():
             return values.astype(np.float64).ravel().tolist()

@@ -158,7 +158,7 @@ class _StageWalk:
         self._at, self._count = at, 0
         self._transforms: dict[str, Gf.Matrix4d] = {}
         self._materials = MaterialReader(self._code, notes)
-        self._shapes = ShapeReader(name, time, self._code, self._materials, notes)
+        self._shapes = ShapeReader(name, self._code, self._materials, notes)
         # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
         self._numbers: dict[object, int] = {}
         # Names of primvars that the shapes of instances read, and whether some of these have places of their own, by

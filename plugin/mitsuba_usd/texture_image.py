@@ -129,13 +129,16 @@ def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype) -> NDArray:
     """A tile of another size ``(height, width)`` and type."""
     if tile.shape[:2] == size and tile.dtype == dtype:
         return tile
-    values = tile.astype(np.float32) / np.float32(_full(tile.dtype))
-    if tile.shape[:2] != size:
-        # The filter goes beyond the values that there are.
-        bounds = float(values.min()), float(values.max())
-        resampled = mi.Bitmap(values).resample(mi.ScalarVector2u(size[1], size[0]), clamp=bounds)
-        values = np.array(resampled).reshape(*size, -1)
+    values = _resampled(tile.astype(np.float32) / np.float32(_full(tile.dtype)), size)
     return values.astype(dtype) if dtype.kind == "f" else np.rint(values * _full(dtype)).astype(dtype)
+
+
+def _resampled(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    if values.shape[:2] == size:
+        return values
+    # The filter goes beyond the values that there are.
+    bounds = float(values.min()), float(values.max())
+    return np.array(mi.Bitmap(values).resample(mi.ScalarVector2u(size[1], size[0]), clamp=bounds)).reshape(*size, -1)
 
 
 def _full(dtype: np.dtype) -> int:
@@ -233,12 +236,11 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
         return np.array(image)
 
 
-def halvings(
-    size: Sequence[int],  # Its sides in pixels; halves are rounded up
-    needed: float,  # Its sides stay at least as long, or as they are
-    most: int | None = None,  # Its sides become at most as long, whatever is needed
-) -> int:
-    """How often an image is halved."""
+def halvings(size: Sequence[int], needed: float, most: int | None = None) -> int:
+    """How often an image with sides of so many pixels is halved, rounded up.
+
+    Its sides stay at least as long as needed, or as they are, and become as short as the most, whatever is needed.
+    """
     shorter, longer = sorted(size)
     count = 0
     while longer > 1 and (shorter >= 2 * max(needed, 1) or (most is not None and longer > most)):
@@ -246,14 +248,8 @@ def halvings(
     return count
 
 
-def reduced(
-    pixels: NDArray,  # (h, w, c) array
-    needed: float,
-    most: int | None = None,
-    *,
-    is_srgb: bool,  # Whether colours are encoded; alpha is linear
-) -> NDArray:
-    """An image halved as often as `halvings` says."""
+def reduced(pixels: NDArray, needed: float, most: int | None = None, *, is_srgb: bool) -> NDArray:
+    """An image ``(h, w, c)`` halved as often as `halvings` says; in sRGB, colours are encoded, and alpha is linear."""
     count = halvings(pixels.shape[:2], needed, most)
     if not count:
         return pixels
@@ -301,11 +297,7 @@ def _half(values: NDArray) -> NDArray:
     """Half an image of 16 bits or of floats."""
     height, width = values.shape[:2]
     if height % 2 or width % 2:
-        # The filter goes beyond the values that there are.
-        bounds = float(values.min()), float(values.max())
-        size = mi.ScalarVector2u((width + 1) // 2, (height + 1) // 2)
-        resampled = mi.Bitmap(values.astype(np.float32)).resample(size, clamp=bounds)
-        found = np.array(resampled).reshape(size[1], size[0], -1)
+        found = _resampled(values.astype(np.float32), ((height + 1) // 2, (width + 1) // 2))
         return np.rint(found).astype(values.dtype) if values.dtype.kind == "u" else found
     rows = values[::2].astype(np.uint32 if values.dtype.kind == "u" else np.float32) + values[1::2]
     sums = rows[:, ::2] + rows[:, 1::2]

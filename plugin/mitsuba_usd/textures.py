@@ -48,13 +48,8 @@ class Textures:
             for key, picture in zip(first, found, strict=True):
                 self._keep(key, picture)
 
-    def color(
-        self,
-        given: TextureContents | NodeContents,
-        *,
-        is_radiance: bool = False,  # Whether values may be above 1
-    ) -> SceneNode:
-        """A texture of colours, or the fallback of a picture that cannot be read."""
+    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
+        """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
         most = None if is_radiance else 1.0
         if isinstance(given, NodeContents):
             found = self._baked(given)
@@ -67,8 +62,7 @@ class Textures:
             return self._bitmap(np.clip(values, 0, most), found.to_uv, found.wrap, is_raw=False)
         picture = self._picture(given.file, given)
         if picture is None:
-            channels = ["rgba".index(each) for each in given.channel]
-            numbers = np.broadcast_to(np.asarray(given.fallback)[channels], (3,))
+            numbers = np.broadcast_to(np.asarray(given.fallback)[given.channels], (3,))
             return {"type": "rgb", "value": np.clip(numbers, 0, most).tolist()}
         return self._plain(given, picture, is_raw=given.channel != "rgb")
 
@@ -79,7 +73,7 @@ class Textures:
             return self._bitmap(found.values[..., :1], found.to_uv, found.wrap, is_raw=True)
         picture = self._picture(given.file, given)
         if picture is None:
-            return float(given.fallback["rgba".index(given.channel[0])])
+            return float(given.fallback[given.channels[0]])
         return self._plain(replace(given, channel=given.channel[0]), picture, is_raw=True)
 
     def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
@@ -98,7 +92,7 @@ class Textures:
         else:
             found = self._source(given)
             if found is None:
-                return np.asarray(given.fallback)[["rgba".index(each) for each in given.channel]]
+                return np.asarray(given.fallback)[given.channels]
             values = found[0]
         return np.asarray(values.mean(axis=(0, 1), dtype=np.float64))
 
@@ -130,8 +124,7 @@ class Textures:
 
     def _plain(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
         """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
-        to_uv, pixels = picture.to_uv @ texture.to_uv, picture.pixels
-        channels = ["rgba".index(each) for each in texture.channel]
+        to_uv, pixels, channels = picture.to_uv @ texture.to_uv, picture.pixels, texture.channels
         is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
         is_same = all(texture.scale[each] == 1 and texture.bias[each] == 0 for each in channels)
         if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
@@ -185,9 +178,8 @@ def _key(path: str, use: TextureContents | None) -> tuple[str, str | None]:
 
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
     """``(h, w, k)`` linear values of the channels, scaled and moved; the fallback where there is no tile."""
-    channels = ["rgba".index(each) for each in texture.channel]
-    pixels = _selected(picture.pixels, channels)
-    values = linear_values(pixels, is_srgb_image(picture.pixels, texture.color_space), channels)
+    channels, is_srgb = texture.channels, is_srgb_image(picture.pixels, texture.color_space)
+    values = linear_values(_selected(picture.pixels, channels), is_srgb, channels)
     numbers = np.array([texture.scale, texture.bias, texture.fallback], dtype=np.float32)
     scale, bias, fallback = numbers[:, channels]
     if (scale != 1).any() or (bias != 0).any():

@@ -11,7 +11,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, in_digits, warn
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.cage.source import CageSource
-from mitsuba_subdivision.files.losses import warn_of_losses
+from mitsuba_subdivision.files.formats import warn_of_losses
 
 
 def test_warnings_name_the_file_of_the_caller():

@@ -11,8 +11,7 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
-from mitsuba_subdivision.files import triangle_writer
-from mitsuba_subdivision.files.formats import FORMATS, Format, function_named
+from mitsuba_subdivision.files.formats import FORMATS, Format, function_named, triangle_writers
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -39,28 +38,22 @@ def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
     np.testing.assert_array_equal(ControlCage.from_file(tmp_path / "cube.npz").positions, cube().positions)
     with pytest.raises(ValueError, match=r'unknown format ".npz" of triangles'):
         LimitSurface(cube()).tessellate(2).save(tmp_path / "triangles.npz")
-    assert list(triangle_writer.writers()) == [".obj", ".ply", ".usd", ".usda", ".usdc"]
+    assert list(triangle_writers()) == [".obj", ".ply", ".usd", ".usda", ".usdc"]
 
 
-def modules_after(code):
-    """Modules of cages, of files and of their formats that are imported after some code has run in a new process."""
-    packages = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files", "pxr", "plyfile")
-    code = f"import sys; {code}; print(*(name for name in sys.modules if name.startswith({packages})))"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-
-
-def test_neither_cages_nor_files_are_imported_with_the_package_and_formats_only_where_they_are_used():
-    assert modules_after("import mitsuba_subdivision") == []
-    assert not {"pxr", "plyfile"} & set(modules_after("import mitsuba_subdivision.surface"))
-
-
-def test_readers_are_imported_when_a_file_is_read(tmp_path):
+def test_neither_cages_nor_files_are_imported_with_the_package_and_readers_only_where_they_are_used(tmp_path):
+    """After each of several lines in a new process: modules of cages, of files and of their formats."""
     cube().save(tmp_path / "cube.obj")
-    code = "from mitsuba_subdivision import ControlCage"
-    assert [name for name in modules_after(code) if ".files" in name] == []
-    found = modules_after(f"{code}; ControlCage.from_file({str(tmp_path / 'cube.obj')!r})")
-    assert "mitsuba_subdivision.files.obj_reader" in found
-    assert "mitsuba_subdivision.files.usd_reader" not in found
+    packages = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files", "pxr", "plyfile")
+    names = f"print(*(name for name in sys.modules if name.startswith({packages})))"
+    lines = ["import mitsuba_subdivision", "from mitsuba_subdivision import ControlCage"]
+    lines += [f"ControlCage.from_file({str(tmp_path / 'cube.obj')!r})", "import mitsuba_subdivision.surface"]
+    code = "\n".join(["import sys", *(f"{line}\n{names}" for line in lines)])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    package, cage, reader, surface = (set(line.split()) for line in done.stdout.split("\n")[: len(lines)])
+    assert package == {name for name in cage if ".files" in name} == set()
+    assert "mitsuba_subdivision.files.obj_reader" in reader
+    assert not {"mitsuba_subdivision.files.usd_reader", "pxr", "plyfile"} & (reader | surface)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)

@@ -63,6 +63,7 @@ def test_polygons(read):
     np.testing.assert_array_equal(cage.positions, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.1, 0]])
     assert (cage.face_sizes.tolist(), cage.face_vertices.tolist()) == ([4, 3], [0, 1, 2, 3, 1, 4, 2])
     assert (cage.texcoords, cage.attributes, cage.scheme) == (None, {}, None)
+    assert read(SHEET.replace("double y", "uchar y").replace("0.1", "1")).face_count == 2
 
 
 def test_comments_may_stand_anywhere_in_a_header(read):
@@ -84,9 +85,7 @@ def test_binary_files_of_all_types(tmp_path, byte_order, name, size, index):
     of_faces = plyfile.PlyElement.describe(faces, "face", len_types={name: size}, val_types={name: index})
     elements = [plyfile.PlyElement.describe(vertices, "vertex"), of_faces]
     plyfile.PlyData(elements, byte_order=byte_order).write(tmp_path / "cube.ply")
-    cage = ControlCage.from_file(tmp_path / "cube.ply")
-    np.testing.assert_array_equal(cage.positions, cube().positions)
-    np.testing.assert_array_equal(cage.face_vertices, cube().face_vertices)
+    assert same(ControlCage.from_file(tmp_path / "cube.ply").contents, cube().contents)
 
 
 @pytest.mark.parametrize("byte_order", ["<", ">"])
@@ -178,12 +177,8 @@ def test_attributes(read):
     properties = ["float nx", "float ny", "float nz", "uchar red", "uchar green", "uchar blue", "float quality"]
     properties += ["double flow_1", "double flow_0", "short group_1"]
     cage = read(with_data(properties, [f"0 0 1 255 51 {i} {i / 2} 1 {i} 7" for i in range(5)]))
-    expected = {
-        "color": [[1, 0.2, i / 255] for i in range(5)],
-        "quality": [[i / 2] for i in range(5)],
-        "flow": [[i, 1] for i in range(5)],
-        "group": [[7]] * 5,
-    }
+    expected = {"color": [[1, 0.2, i / 255] for i in range(5)], "quality": [[i / 2] for i in range(5)]}
+    expected |= {"flow": [[i, 1] for i in range(5)], "group": [[7]] * 5}
     assert {name: each.values.tolist() for name, each in cage.attributes.items()} == expected
     assert {each.interpolation for each in cage.attributes.values()} == {"vertex"}
 
@@ -266,7 +261,13 @@ ERRORS = [
     ("3 1 4 2", "3 1 5 2", "line 17: face 1 has the vertex index 5; expected 0 to 4"),
     ("3 1 4 2", "3 1 -1 2", "line 17: face 1 has the vertex index -1; expected 0 to 4"),
     ("3 1 4 2", "2 1 4", "line 17: face 1 has 2 vertices; expected at least 3"),
+    ("3 1 4 2", "3 1 4 9999999999", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
+    ("3 1 4 2", "3 1 4 2.0", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
+    ("double y", "real y", "real"),
+    ("end_header", "end", "expected a PLY file"),
+    ("element face 2", "element vertex 2", "expected a PLY file"),
     ("2 0.1 0", "2 nan 0", "line 15: vertex 4 has the coordinates"),
+    ("2 0.1 0", "1e39 0.1 0", "line 15: vertex 4 has the coordinates (inf, "),
     ("double y", f"double {'y' * 9999}", "yyy"),
     ("uchar int", f"uchar {'i' * 9999}", "iii"),
 ]
@@ -289,24 +290,6 @@ def test_counts_that_the_file_cannot_hold_are_errors_at_once(read, form, propert
         read(text)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("3 1 4 2", "3 1 4 9999999999", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
-        ("3 1 4 2", "3 1 4 2.0", "line 17: element 'face': row 1: property 'vertex_indices': malformed input"),
-        ("uchar y", "real y", "real"),
-        ("end_header", "end", "expected a PLY file"),
-        ("element face 2", "element vertex 2", "expected a PLY file"),
-    ],
-)
-def test_numbers_and_words_that_fit_nothing_name_their_line(read, old, new, message):
-    text = SHEET.replace("double y", "uchar y").replace("0.1", "1")
-    assert read(text).face_count == 2
-    assert old in text
-    with pytest.raises(CageError, match=re.escape(message)):
-        read(text.replace(old, new, 1))
-
-
 def test_numbers_that_are_not_finite_are_errors_and_no_warnings(read):
     content = SHEET.replace("ascii", "binary_little_endian").replace("double", "float").encode()
     content = content[: content.index(b"0 0 0\n")] + np.zeros(12, "<f4").tobytes()
@@ -314,8 +297,6 @@ def test_numbers_that_are_not_finite_are_errors_and_no_warnings(read):
     signalling = b"\x01\x00\xa0\x7f"
     with pytest.raises(CageError, match=r'cage.ply": vertex 4 has the coordinates \(0.0, nan, 0.0\)'):
         read(content + bytes(4) + signalling + bytes(4) + faces)
-    with pytest.raises(CageError, match=r"line 15: vertex 4 has the coordinates \(inf, "):
-        read(SHEET.replace("2 0.1 0", "1e39 0.1 0"))
 
 
 def test_many_properties_and_long_names_are_read(read):
@@ -349,12 +330,8 @@ def test_round_trip_is_exact(any_cage, tmp_path, np_rng, size):
     path = tmp_path / "cage.ply"
     cage.save(path)
     again = ControlCage.from_file(path)
-    for name in ("positions", "face_sizes", "face_vertices"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(cage, name))
-    np.testing.assert_array_equal(again.texcoords.values, cage.texcoords.values)
+    assert same(again.contents, cage.contents)
     assert list(again.attributes) == list(attributes)
-    for name, attribute in attributes.items():
-        np.testing.assert_array_equal(again.attributes[name].values, attribute.values)
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -366,11 +343,7 @@ def test_materials_are_read_back(any_cage, tmp_path, np_rng):
     materials = {name: np.flatnonzero(owner == number) for name, number in names.items() if (owner == number).any()}
     cage = ControlCage.from_arrays(any_cage.positions, any_cage.face_sizes, any_cage.face_vertices, materials=materials)
     cage.save(tmp_path / "cage.ply")
-    again = ControlCage.from_file(tmp_path / "cage.ply")
-    np.testing.assert_array_equal(again.face_vertices, cage.face_vertices)
-    assert again.materials.keys() == materials.keys()
-    for name, faces in materials.items():
-        np.testing.assert_array_equal(again.materials[name], faces)
+    assert same(ControlCage.from_file(tmp_path / "cage.ply").contents, cage.contents)
 
 
 def test_names_of_materials_have_no_place(tmp_path):

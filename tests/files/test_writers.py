@@ -1,4 +1,4 @@
-"""Tessellations as files."""
+"""Tessellations, and cages in OBJ, as files."""
 
 import mitsuba as mi
 import numpy as np
@@ -6,7 +6,8 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron
-from mitsuba_subdivision.files.triangle_writer import write_triangles
+from mitsuba_subdivision.files.formats import write_triangles
+from mitsuba_subdivision.files.obj_writer import write_obj
 
 
 @pytest.fixture(scope="module")
@@ -24,28 +25,20 @@ def save(path, triangles, *data):
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_mitsuba_reads_ply_files(tmp_path, triangles, variant_scalar_rgb, np_rng):  # noqa: ARG001
+# Of OBJ files, Mitsuba numbers vertices anew, and its parser of numbers is right to a few units in the last place.
+@pytest.mark.parametrize(
+    ("kind", "options", "rtol", "atol"), [("ply", {}, 1e-7, 1e-6), ("obj", {"flip_tex_coords": False}, 1e-6, 1e-7)]
+)
+def test_mitsuba_reads_files(tmp_path, triangles, variant_scalar_rgb, np_rng, kind, options, rtol, atol):  # noqa: ARG001
     texcoords, attributes = data_of(triangles, np_rng)
-    path = tmp_path / "surface.ply"
-    save(path, triangles, texcoords, attributes)
-    found = mi.traverse(mi.load_dict({"type": "ply", "filename": str(path)}))
-    vertices = {"positions": triangles.positions, "normals": triangles.normals, "texcoords": texcoords}
-    for name, values in vertices.items():
-        np.testing.assert_allclose(np.array(found[f"vertex_{name}"]), values.ravel(), atol=1e-6)
-    np.testing.assert_array_equal(np.array(found["faces"]), triangles.triangles.ravel())
-
-
-def test_mitsuba_reads_obj_files(tmp_path, triangles, variant_scalar_rgb, np_rng):  # noqa: ARG001
-    texcoords, _ = data_of(triangles, np_rng)
-    path = tmp_path / "surface.obj"
-    save(path, triangles, texcoords)
-    found = mi.traverse(mi.load_dict({"type": "obj", "filename": str(path), "flip_tex_coords": False}))
-    faces = np.array(found["faces"])
+    path = tmp_path / f"surface.{kind}"
+    save(path, triangles, texcoords, attributes if kind == "ply" else None)
+    found = mi.traverse(mi.load_dict({"type": kind, "filename": str(path), **options}))
+    faces, corners = np.array(found["faces"]), triangles.triangles.ravel()
+    assert kind == "obj" or np.array_equal(faces, corners)
     for name, values in (("positions", triangles.positions), ("normals", triangles.normals), ("texcoords", texcoords)):
-        # Mitsuba numbers vertices anew.
         read = np.array(found[f"vertex_{name}"]).reshape(-1, values.shape[1])[faces]
-        # Its parser of numbers is right to a few units in the last place.
-        np.testing.assert_allclose(read, values[triangles.triangles.ravel()], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(read, values[corners], rtol=rtol, atol=atol)
 
 
 @pytest.mark.core
@@ -77,8 +70,7 @@ def test_usd_reads_usd_files(tmp_path, triangles, np_rng, suffix):
     save(path, triangles, texcoords, attributes)
     stage = Usd.Stage.Open(str(path))
     mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
-    assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
-    assert mesh.GetNormalsInterpolation() == "vertex"
+    assert (mesh.GetSubdivisionSchemeAttr().Get(), mesh.GetNormalsInterpolation()) == ("none", "vertex")
     np.testing.assert_array_equal(mesh.GetPointsAttr().Get(), triangles.positions.astype(np.float32))
     np.testing.assert_array_equal(mesh.GetNormalsAttr().Get(), triangles.normals.astype(np.float32))
     np.testing.assert_array_equal(mesh.GetFaceVertexCountsAttr().Get(), np.full(len(triangles.triangles), 3))
@@ -147,3 +139,44 @@ def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     assert capsys.readouterr().err.startswith(message)
     assert main(["tessellate", str(path), "-o", str(tmp_path / "out.txt")]) == 1
     assert 'unknown format ".txt" of triangles; expected one of .obj, .ply, .usd' in capsys.readouterr().err
+
+
+def test_file_is_plain_obj(tmp_path):
+    cage = ControlCage([[0, 0.1, -0.0], [1, 0, 1e-300], [0, 1, 0], [1, 1, 0]], [[0, 1, 3, 2], [1, 0, 2]])
+    write_obj(cage.contents, tmp_path / "cage.obj")
+    vertices = "v 0.0 0.1 -0.0\nv 1.0 0.0 1e-300\nv 0.0 1.0 0.0\nv 1.0 1.0 0.0\n"
+    expected = f"# 4 vertices, 2 faces\n{vertices}f 1 2 4 3\nf 2 1 3\n"
+    assert (tmp_path / "cage.obj").read_text() == expected
+
+
+def test_materials_are_read_back(tmp_path):
+    materials = {"": [0], "red 100%": [1, 4], "großes Glas": [2, 3, 5]}
+    square = cube().face_vertices.reshape(-1, 4)
+    ControlCage(cube().positions, square, materials=materials).save(tmp_path / "cage.obj")
+    found = ControlCage.from_file(tmp_path / "cage.obj")
+    np.testing.assert_array_equal(found.face_vertices, square.ravel())
+    assert [faces.tolist() for faces in found.materials.values()] == list(materials.values())
+    found.save(tmp_path / "again.obj")
+    assert ControlCage.from_file(tmp_path / "again.obj").materials.keys() == found.materials.keys()
+    with pytest.warns(CageWarning, match='no place for material "a # b", further materials of a face of the cage'):
+        ControlCage(cube().positions, square, materials={"a": [0, 1], "a # b": [1]}).save(tmp_path / "cage.obj")
+    found = ControlCage.from_file(tmp_path / "cage.obj").materials
+    assert {name: faces.tolist() for name, faces in found.items()} == {"": [1, 2, 3, 4, 5], "a": [0]}
+
+
+def test_existing_file_is_replaced_and_nothing_else_is_left_but_stays_where_that_fails(tmp_path, monkeypatch):
+    path = tmp_path / "cage.obj"
+    write_obj(cube().contents, path)
+    write_obj(tetrahedron().contents, str(path))
+    np.testing.assert_array_equal(ControlCage.from_file(path).positions, tetrahedron().positions)
+    assert list(tmp_path.iterdir()) == [path]
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("pathlib.Path.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_obj(cube().contents, path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -57,25 +57,17 @@ class _Node:
 class BruteForce:
     """Evaluate the limit surface of one control cage; refined neighbourhoods are kept for the next sample.
 
-    Parameters
-    ----------
-    scheme : "catmull_clark", "loop" or "doo_sabin"
-    positions : (n_v, d) of float, int or Decimal
-        Taken exactly. Any dimension; with unit vectors the samples are the weights of the control points.
-    faces : one sequence of 0-based vertices per face
-        Counter-clockwise from outside. The one-ring of an element that is asked for must be closed.
-    digits : int
-        Least number of digits; deep samples use more.
+    Positions are taken exactly, of any dimension: with unit vectors, samples are the weights of the control points.
+    Faces are counter-clockwise from outside; the one-ring of an element that is asked for must be closed. ``digits``
+    are the least number; deep samples use more.
     """
 
     def __init__(self, scheme: str, positions, faces, digits: int = 80):
         self.scheme = scheme
         self.rules = RULES[scheme]
         self.digits = digits
-        self.points = {
-            i: tuple(Decimal(x if isinstance(x, (int, Decimal)) else float(x)) for x in point)
-            for i, point in enumerate(positions)
-        }
+        exactly = ((x if isinstance(x, (int, Decimal)) else float(x) for x in point) for point in positions)
+        self.points = {i: tuple(map(Decimal, point)) for i, point in enumerate(exactly)}
         self.faces = [tuple(int(v) for v in face) for face in faces]
         self.at_vertex, _ = incidence(self.faces)
         self.roots = {}

@@ -10,7 +10,7 @@ from math import cos, pi
 
 import numpy as np
 
-INFINITE = 10.0
+from reference.sharp_refinement import INFINITE, left_of, less
 
 
 @dataclass
@@ -31,10 +31,6 @@ class Channel:
     mode: str
     method: str = "uniform"
     followed: dict | None = None
-
-
-def _less(sharpness):
-    return sharpness if sharpness >= INFINITE else max(sharpness - 1, 0)
 
 
 class _Around:
@@ -74,13 +70,9 @@ class _Around:
         return INFINITE if self.is_boundary(edge) else self.c.creases.get(edge, 0)
 
     def left(self, edge, vertex):
-        """What a refinement leaves of an edge's sharpness, in its half at a vertex."""
-        own = self.sharpness(edge)
+
         others = [self.sharpness(other) for other in self.edges_at[vertex] if other != edge]
-        others = [sharpness for sharpness in others if 0 < sharpness < INFINITE]
-        if self.c.method == "chaikin" and 0 < own < INFINITE and others:
-            return max(0.75 * own + 0.25 * np.mean(others) - 1, 0)
-        return _less(own)
+        return left_of(self.sharpness(edge), others, self.c.method)
 
     def vertex_sharpness(self, vertex):
         single = len(self.at_vertex[vertex]) == 1
@@ -162,11 +154,10 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
     def edge_value(edge, f):
         i = next(i for g, i in around.at_edge[edge] if g == f)
         own = (around.value(f, i) + around.value(f, i + 1)) / 2
-        key, cut = ("edge", edge), around.is_seam(edge)
+        key, cut, sharpness = ("edge", edge), around.is_seam(edge), around.sharpness(edge)
         side = f if cut else None
         if (key, side) in values:
             return key, side
-        sharpness = around.sharpness(edge)
         if c.mode == "all" or cut or sharpness >= INFINITE or all(around.left(edge, v) > 0 for v in edge):
             return add(key, side, own)
         sides = around.at_edge[edge]
@@ -195,7 +186,7 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
             faces.append(tuple(vertex for vertex, _ in edges))
             indices.append(tuple(index for _, index in edges))
     creases = {frozenset((("vertex", v), ("edge", edge))): around.left(edge, v) for edge in c.creases for v in edge}
-    corners = {("vertex", vertex): _less(sharpness) for vertex, sharpness in c.corners.items()}
+    corners = {("vertex", vertex): less(sharpness) for vertex, sharpness in c.corners.items()}
     followed = {(("vertex", v), i): (("vertex", w), j) for (v, i), (w, j) in c.followed.items()}
     finer = Channel(faces, indices, values, creases, corners, c.sharp_boundary_corners, c.mode, c.method, followed)
     return finer, child
@@ -220,10 +211,10 @@ def _moved(around, vertex, index, scheme):
             return "smooth", _smooth(around, vertex, own, scheme)
 
         rule, first = by_rule(at_vertex, before)
-        next_rule, second = by_rule(_less(at_vertex), after)
+        next_rule, second = by_rule(less(at_vertex), after)
         if rule in ("smooth", next_rule):
             return first
-        pairs = [(at_vertex, _less(at_vertex)), *((before[edge], after[edge]) for edge in edges)]
+        pairs = [(at_vertex, less(at_vertex)), *((before[edge], after[edge]) for edge in edges)]
     else:
         if around.rule_at_mismatch(vertex, index) == "corner":
             return own
@@ -231,7 +222,7 @@ def _moved(around, vertex, index, scheme):
         place = c.followed.get((vertex, index), (vertex, index))
         pairs = [(around.sharpness(edge), around.left(edge, vertex)) for edge in around.semi_sharp_within(*place)]
         at_vertex = around.vertex_sharpness(vertex)
-        pairs.append((at_vertex, _less(at_vertex)))
+        pairs.append((at_vertex, less(at_vertex)))
         sharp = [edge for edge in edges if around.is_seam(edge) or around.is_boundary(edge)]
         first, second = own, _along(around, vertex, index, own, sharp)
         if any(after > 0 for _, after in pairs):

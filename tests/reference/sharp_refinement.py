@@ -15,6 +15,18 @@ import numpy as np
 INFINITE = 10.0
 
 
+def less(sharpness: float) -> float:
+    return sharpness if sharpness >= INFINITE else max(sharpness - 1, 0)
+
+
+def left_of(sharpness: float, others: list[float], method: str) -> float:
+    """What a refinement leaves of an edge's sharpness, in its half at a vertex that has other edges."""
+    semi = [other for other in others if 0 < other < INFINITE]
+    if method == "chaikin" and 0 < sharpness < INFINITE and semi:
+        return max(0.75 * sharpness + 0.25 * sum(semi) / len(semi) - 1, 0)
+    return less(sharpness)
+
+
 @dataclass
 class SharpMesh:
     """Polygon mesh with a sharpness for each edge, a frozenset of two vertices, and vertex; border edges are infinite.
@@ -39,11 +51,10 @@ class SharpMesh:
                 spokes[a].add(b)
                 spokes[b].add(a)
         sharp = {edge: INFINITE if len(faces) == 1 else self.edges.get(edge, 0) for edge, faces in faces_at.items()}
-        left = {
-            (v, far): self._left(sharp[frozenset((v, far))], [sharp[frozenset((v, x))] for x in ends if x != far])
-            for v, ends in spokes.items()
-            for far in ends
-        }
+        left = {}
+        for v, ends in spokes.items():
+            at = {far: sharp[frozenset((v, far))] for far in ends}
+            left |= {(v, far): left_of(at[far], [at[x] for x in ends if x != far], self.method) for far in ends}
         centres = {face: self.points[list(face)].sum(axis=0) / len(face) for face in self.faces}
         points, number = [], {}
 
@@ -69,18 +80,8 @@ class SharpMesh:
             if self.scheme == "loop":
                 middles.append(tuple(number[edge] for edge in ends))
         new_edges = {frozenset((v, number[frozenset((v, far))])): value for (v, far), value in left.items()}
-        vertices = {v: self._less(s) for v, s in self.vertices.items()}
+        vertices = {v: less(s) for v, s in self.vertices.items()}
         return SharpMesh(self.scheme, np.array(points), new_faces + middles, new_edges, vertices, self.method)
-
-    @staticmethod
-    def _less(sharpness: float) -> float:
-        return INFINITE if sharpness >= INFINITE else max(sharpness - 1, 0)
-
-    def _left(self, sharpness: float, others: list[float]) -> float:
-        semi = [s for s in others if 0 < s < INFINITE]
-        if self.method == "chaikin" and 0 < sharpness < INFINITE and semi:
-            return max(0.75 * sharpness + 0.25 * sum(semi) / len(semi) - 1, 0)
-        return self._less(sharpness)
 
     def _edge_point(self, edge, faces, sharpness, left, centres):
         a, b = edge
@@ -101,13 +102,11 @@ class SharpMesh:
         before = {far: sharp[frozenset((vertex, far))] for far in ends}
         after = {far: left[vertex, far] for far in ends}
         first = self._by_rule(vertex, own, before, centres)
-        rule, next_rule = self._rule(own, before), self._rule(self._less(own), after)
+        rule, next_rule = self._rule(own, before), self._rule(less(own), after)
         if rule in ("smooth", next_rule):
             return first
-        second = self._by_rule(vertex, self._less(own), after, centres)
-        lost = [s for far, s in before.items() if s > 0 and after[far] == 0]
-        if own > 0 and self._less(own) == 0:
-            lost.append(own)
+        second = self._by_rule(vertex, less(own), after, centres)
+        lost = [s for far, s in before.items() if s > 0 and after[far] == 0] + [own] * (own > 0 and less(own) == 0)
         share = min(sum(lost) / len(lost), 1) if lost else 0
         return share * first + (1 - share) * second
 

@@ -13,6 +13,7 @@ from regression.defects import SCENES
 
 SCENE = str(SCENES / "valence3.xml")
 SMALL = ["-D", "resolution=16", "--variant", "scalar_rgb"]
+RANGES = "expected a seed, the samples of a batch, and ranges"
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +48,7 @@ def test_a_scene_against_its_reference(folder, capsys):
 def test_another_image_fails_and_says_where_even_if_no_report_can_be_written(folder, capsys, tmp_path, monkeypatch):
     words = ["reference.exr", "stam.exr", "--html", str(tmp_path / "report")]
     assert compare(folder, *words) == 2
-    said = capsys.readouterr().out
-    assert "worst pixel (probe)" in said
-    assert "(u, v) = (" in said
+    assert re.search(r"worst pixel \(probe\)(.|\n)*\(u, v\) = \(", capsys.readouterr().out)
     assert (tmp_path / "report" / "index.html").is_file()
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert compare(folder, *words) == 3
@@ -72,8 +71,7 @@ def test_a_warning_has_a_status_of_its_own(folder, tmp_path, monkeypatch):
     # The scene has changed, and so has the machine: the tile tier cannot tell, at this tolerance.
     monkeypatch.setattr(scene, "_processor", lambda: "another")
     changed = (SCENES / "valence3.xml").read_text().replace('value="0.72, 0.66', 'value="0.7201, 0.66')
-    changed = changed.replace("cages/valence3.obj", str(SCENES / "cages/valence3.obj"))
-    (tmp_path / "scene.xml").write_text(changed)
+    (tmp_path / "scene.xml").write_text(changed.replace("cages/valence3", str(SCENES / "cages/valence3")))
     assert compare(folder, "reference.exr", str(tmp_path / "scene.xml"), "--tiers", "paired", "--spp", "32") == 1
 
 
@@ -164,7 +162,7 @@ def passes(tmp_path_factory):
     ("words", "message"),
     [
         (["1", "of_two", "2"], "another pass has as well"),
-        (["1", "1"], "another pass has as well"),
+        (["1", "1"], "has batch 0, which another pass has as well"),
         (["1", "of_16"], "batch is 8 and 16"),
         (["1", "seed"], "seed is 0 and 1"),
         (["1", "larger"], "size is [8, 8] and [9, 9]"),
@@ -175,17 +173,16 @@ def passes(tmp_path_factory):
 )
 def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
     assert merge(passes / "merged.exr", *(passes / f"{word}.exr" for word in words)) == 3
-    told = capsys.readouterr().err
+    (told,) = capsys.readouterr().err.splitlines()
     assert message in told
-    assert told.count("\n") == 1
     assert not (passes / "merged.exr").exists()
 
 
 def test_a_missing_pass_is_told(passes, capsys, tmp_path):
     for there, missing in (("13", "2"), ("2", "1, 3")):
         assert merge(tmp_path / "merged.exr", *(passes / f"{number}.exr" for number in there)) == 0
-        told = f"mitsuba-subdivision: warning: of 3 passes, these are missing: {missing}\n"
-        assert capsys.readouterr().err == told
+        told = capsys.readouterr().err
+        assert told == f"mitsuba-subdivision: warning: of 3 passes, these are missing: {missing}\n"
 
 
 def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeypatch):
@@ -216,10 +213,6 @@ def test_merged_passes_need_room_for_their_variance_and_a_file_of_their_own(pass
     assert (passes / "1.exr").read_bytes() == before
 
 
-def without(prefix):
-    return lambda channels, metadata: ({n: v for n, v in channels.items() if not n.startswith(prefix)}, metadata)
-
-
 def with_pixel(name, value):
     def change(channels, metadata):
         values = channels[name].copy()
@@ -237,13 +230,10 @@ def with_sampling(**changes):
     return with_metadata(sampling={"seed": 0, "batch": 8, "batches": [[2, 5]], **changes})
 
 
-RANGES = "expected a seed, the samples of a batch, and ranges"
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without("variance"), "is no pass: it has no variance"),
+        (lambda c, m: ({n: c[n] for n in c if "variance" not in n}, m), "is no pass: it has no variance"),
         (with_pixel("G", np.nan), "is not finite: G = nan at x = 4, y = 3"),
         (with_pixel("variance.R", np.inf), "is not finite: variance.R = inf at x = 4, y = 3"),
         (with_pixel("variance.R", -1), "has a variance of -1; expected at least 0"),
@@ -284,9 +274,8 @@ def test_damaged_files_are_status_3_and_one_line(folder, passes, tmp_path, np_rn
             assert main(words) == 3, words
             # Of the process, not of Python alone: OpenEXR writes there itself.
             printed, told = capfd.readouterr()
-            assert printed == ""
+            assert (printed, told.count("\n")) == ("", 1)
             assert told.endswith(f'damaged.exr" {problem}\n')
-            assert told.count("\n") == 1
     for _ in range(20):
         flipped = np.frombuffer(whole, dtype=np.uint8).copy()
         flipped[np_rng.integers(0, len(whole), 4)] = np_rng.integers(0, 256, 4)

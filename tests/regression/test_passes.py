@@ -1,15 +1,14 @@
-"""Rendering by passes: the same samples, however they are spread."""
-
-import itertools
+"""Rendering by passes: the same samples, however they are spread, and the same mean and variance."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.regression import RegressionError
-from mitsuba_subdivision.regression.image import load_image, save_image, write_exr
+from mitsuba_subdivision.regression import ImageError, RegressionError
+from mitsuba_subdivision.regression.image import Estimate, combine, load_image, save_image
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
+from regression.random_images import BATCH, SPREAD, estimate, truth
 
 SCENE = SCENES / "valence3.xml"
 SAMPLING = Sampling(12, 8, seed=5)
@@ -26,32 +25,28 @@ def loaded(variant):  # noqa: ARG001
 
 
 def test_shares_have_every_batch_once():
-    for batches, count in itertools.product((1, 5, 12), (1, 2, 5)):
-        if count <= batches:
-            shares = [Sampling(batches).share(i + 1, count) for i in range(count)]
-            assert [b for share in shares for b in share] == list(range(batches))
+    for batches, count in ((1, 1), (5, 1), (5, 2), (5, 5), (12, 1), (12, 2), (12, 5)):
+        shares = [Sampling(batches).share(i + 1, count) for i in range(count)]
+        assert [batch for share in shares for batch in share] == list(range(batches))
 
 
-@pytest.mark.parametrize(
-    ("spp", "batches", "batch"), [(256, 4, 64), (100, 4, 25), (1, 4, 1), (200, 4, 50), (300, 5, 64)]
-)
-def test_samples_come_in_whole_batches_of_which_there_are_four(spp, batches, batch):
-    found = Sampling.of_spp(spp)
-    assert (found.batches, found.batch) == (batches, batch)
+def test_samples_come_in_whole_batches_of_which_there_are_four():
+    for spp, *expected in ((256, 4, 64), (100, 4, 25), (1, 4, 1), (200, 4, 50), (300, 5, 64)):
+        found = Sampling.of_spp(spp)
+        assert [found.batches, found.batch] == expected
 
 
 def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
-    passes = []
-    for i in (3, 1, 2):
-        save_image(tmp_path / f"{i}.exr", render_pass(loaded, SAMPLING, i, 3))
-        passes.append(load_image(tmp_path / f"{i}.exr"))
-    merged, whole = merge_passes(passes), render_pass(loaded, SAMPLING)
+    passes = [render_pass(loaded, SAMPLING, i, 3) for i in (1, 2, 3)]
+    for i, image in enumerate(passes):
+        save_image(tmp_path / f"{i}.exr", image)
+    merged = merge_passes([load_image(tmp_path / f"{i}.exr") for i in (2, 0, 1)])
+    direct, whole = merge_passes(passes), render_pass(loaded, SAMPLING)
     assert np.allclose(merged.pixels, whole.pixels, rtol=1e-6)
     assert np.allclose(merged.estimate.variance, whole.estimate.variance, rtol=1e-5)
     assert (merged.estimate.count == SAMPLING.spp).all()
     assert merged.metadata["sampling"] == {**whole.metadata["sampling"], "passes": 3}
     # Not only close: the same as when nothing was written in between.
-    direct = merge_passes([render_pass(loaded, SAMPLING, i, 3) for i in (1, 2, 3)])
     assert np.array_equal(direct.pixels, merged.pixels)
     assert np.array_equal(direct.estimate.variance, merged.estimate.variance)
 
@@ -66,19 +61,13 @@ def test_merging_by_steps_counts_all_batches_and_keeps_what_only_the_first_pass_
     assert merged.metadata["paired"] == {"seed": 5, "spp": 8}
 
 
-def test_passes_that_do_not_belong_together_are_refused(loaded, tmp_path):
-    first = render_pass(loaded, SAMPLING, 1, 2)
+def test_passes_that_do_not_belong_together_are_refused(loaded):
+    """For other reasons, see `test_command_line`."""
     other = load_scene(SCENE, {"resolution": 16, "rate": 2}, "box")
-    write_exr(tmp_path / "a.exr", np.ones((16, 16, 3)))
-    for passes, message in (
-        ([first, render_pass(loaded, SAMPLING, 1, 3)], "has batch 0, which another pass has"),
-        ([first, render_pass(loaded, Sampling(12, 8, seed=6), 2, 2)], "seed is 5 and 6"),
-        ([first, render_pass(other, SAMPLING, 2, 2)], "rate is "),
-        ([first, load_image(tmp_path / "a.exr")], "is no pass"),
-        ([], "no passes"),
-    ):
-        with pytest.raises(RegressionError, match=message):
-            merge_passes(passes)
+    with pytest.raises(RegressionError, match="rate is "):
+        merge_passes([render_pass(loaded, SAMPLING, 1, 2), render_pass(other, SAMPLING, 2, 2)])
+    with pytest.raises(RegressionError, match="no passes"):
+        merge_passes([])
     for share, message in (((1, 13), "12 batches, fewer than 13"), ((3, 2), "no pass 3 of 2")):
         with pytest.raises(RegressionError, match=message):
             SAMPLING.share(*share)
@@ -128,3 +117,45 @@ def test_lights_keep_the_order_of_the_scene(variant_llvm_ad_rgb):  # noqa: ARG00
         kept = [mi.load_dict({"type": "area"}) for _ in range(count)] + kept[::2]
         scene = load_scene({"type": "scene", "camera": camera, **dict(zip("abcd", lights, strict=True))}).scene
         assert [emitter.get_shape().bbox().center().x for emitter in scene.emitters()] == [0, 1, 2, 3]
+
+
+def batches(rng, count, samples=16, offset=0.0):
+    return [Estimate.of_batch(offset + rng.random((4, 5, 3)), samples) for _ in range(count)]
+
+
+@pytest.mark.parametrize("split", [[12], [1, 11], [5, 4, 3], [1] * 12])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_any_split_gives_mean_and_variance_of_all(np_rng, split, offset):
+    every = batches(np_rng, 12, offset=offset)
+    rest, parts = iter(every), []
+    for size in split:
+        parts.append(combine(next(rest) for _ in range(size)))
+    found = combine(parts)
+    means = np.stack([batch.mean for batch in every])
+    assert np.allclose(found.mean, means.mean(axis=0), rtol=1e-14)
+    # Of E[x^2] - E[x]^2 nothing would be left at an offset of a million.
+    assert np.allclose(found.variance, 16 * means.var(axis=0, ddof=1), rtol=1e-8)
+    assert (found.count == 12 * 16).all()
+    assert found.batches == 12
+
+
+def test_samples_weigh_alike_in_batches_of_any_size(np_rng):
+    small, large = batches(np_rng, 3, 4), batches(np_rng, 2, 50)
+    found = combine([*small, *large]).mean
+    expected = sum(batch.mean * batch.count[0, 0] for batch in [*small, *large]) / (3 * 4 + 2 * 50)
+    assert np.allclose(found, expected, rtol=1e-14)
+
+
+def test_variance_is_that_of_a_sample_and_one_batch_tells_none(np_rng):
+    found = estimate(np_rng, 400).variance / (SPREAD * truth()) ** 2
+    # 399 degrees of freedom: 7 % a pixel; 3072 of them.
+    assert found.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / 399 / found.size))
+    assert BATCH > 1
+    assert not combine(batches(np_rng, 1)).variance.any()
+
+
+def test_nothing_and_other_sizes_are_refused(np_rng):
+    with pytest.raises(ImageError, match="nothing to combine"):
+        combine([])
+    with pytest.raises(ImageError, match="5 x 4 and 2 x 2"):
+        combine([*batches(np_rng, 1), Estimate.of_batch(np.zeros((2, 2, 3)), 1)])

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 
 import flip_evaluator  # noqa: F401
 import matplotlib.pyplot  # noqa: F401
@@ -11,6 +9,7 @@ import mitsuba as mi
 import numpy.fft  # noqa: F401
 import PIL.PngImagePlugin  # noqa: F401
 import pytest
+from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.regression.image import load_image
 
 pytest_plugins = ["pytester"]
@@ -67,12 +66,13 @@ def reference(project):
     return project.path / "references" / "ball.exr"
 
 
-def test_the_command_of_a_reference_gives_the_same_bytes(with_reference):
-    written = reference(with_reference).read_bytes()
-    words = load_image(reference(with_reference)).metadata["command"].split()[1:]
-    folder = reference(with_reference).parent
-    subprocess.run([sys.executable, "-m", "mitsuba_subdivision", *words], cwd=folder, check=True, timeout=60)
-    assert reference(with_reference).read_bytes() == written
+def test_the_command_of_a_reference_gives_the_same_bytes(with_reference, monkeypatch):
+    path = reference(with_reference)
+    written, command = path.read_bytes(), load_image(path).metadata["command"]
+    path.unlink()
+    monkeypatch.chdir(path.parent)
+    assert main(command.split()[1:]) == 0
+    assert path.read_bytes() == written
 
 
 def test_update_writes_references_that_are_missing_or_damaged_or_of_another_size(project):
@@ -116,7 +116,7 @@ def test_values_that_are_not_finite_are_one_line(with_reference):
 
     monkeypatch.setattr(passes, "render_pixels", broken)"""
     with_reference.makepyfile(TEST.replace("(render_regression):", broken))
-    result = failing(with_reference, "-W", "error")
+    result = failing(with_reference, "-W", "error", "--render-report=none")
     (line,) = {line for line in result.outlines if " finite " in line}
     told = line.split("the test is not: ")[1]
     assert told.startswith("R = nan at x = 5, y = 3 and at 2 more pixels; channels R, G, B, ")
@@ -134,14 +134,14 @@ def test_a_difference_fails_and_leaves_a_report_and_update_writes_only_what_diff
     with_reference.runpytest("--render-update").assert_outcomes(passed=1)
     assert reference(with_reference).read_bytes() == before
     make_brighter(with_reference)
-    told = failing(with_reference).stdout
-    told.fnmatch_lines(["*paired fail*same samples*", "*changed since the reference was made: ball.xml*"])
-    told.fnmatch_lines(["*worst pixel*of shape 0*", "*report: *index.html*"])
+    lines = ["*paired fail*same samples*", "*changed since the reference was made: ball.xml*"]
+    failing(with_reference).stdout.fnmatch_lines([*lines, "*worst pixel*of shape 0*", "*report: *index.html*"])
     (folder,) = [path for path in (with_reference.path / "failures").iterdir() if path.is_dir()]
     assert {path.name for path in folder.iterdir()} == {"index.html", "comparison.json", "maps.exr", "test.exr"}
     assert json.loads((folder / "comparison.json").read_text())["status"] == "fail"
     assert folder.name in (with_reference.path / "failures" / "index.html").read_text()
-    failing(with_reference, "--render-update").stdout.fnmatch_lines(["*wrote the reference*again*"])
+    told = failing(with_reference, "--render-update", "--render-report=none").stdout
+    told.fnmatch_lines(["*wrote the reference*again*"])
     with_reference.runpytest().assert_outcomes(passed=1)
 
 
@@ -159,7 +159,7 @@ def test_samples_are_scaled_and_other_parameters_than_the_reference_are_an_error
     with_reference.runpytest("--render-spp-scale=4", "--render-report=all").assert_outcomes(passed=1)
     (path,) = with_reference.path.glob("failures/*/comparison.json")
     assert json.loads(path.read_text())["tiers"]["tile"]["samples"] == 4 * 32
-    assert with_reference.runpytest_subprocess("--render-spp-scale=0").ret == pytest.ExitCode.USAGE_ERROR
+    assert with_reference.runpytest("--render-spp-scale=0").ret == pytest.ExitCode.USAGE_ERROR
     with_reference.makepyfile(TEST.replace("spp=32", "spp=32, parameters={'albedo': 0.6}"))
     told = "*was made with the scene parameters {}; this test has {'albedo': '0.6'}*"
     failing(with_reference).stdout.fnmatch_lines([told])
@@ -186,16 +186,11 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
         def test_dictionary(check):
             check(scene(0.5))
 
-        def test_loaded(check):
+        def test_others(check):
             check(mi.load_dict(scene(0.5)))
-
-        def test_other(check):
+            check(scene(0.5001), tolerances={"paired_relative": 1, "alpha": 1e-300})
             with pytest.raises(pytest.fail.Exception):
                 check(scene(0.6))
-
-        def test_loose_tolerance(check):
-            loose = {"paired_relative": 1, "alpha": 1e-300}
-            check(scene(0.5001), tolerances=loose)
 
         @pytest.mark.parametrize(("given", "message"), [
             ({"name": None}, "has no name"),
@@ -209,8 +204,8 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
                 check(scene(0.5), **given)
         """
     )
-    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=8)
-    project.runpytest("-W", "error").assert_outcomes(passed=9)
+    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=6)
+    project.runpytest("-W", "error", "--render-report=none").assert_outcomes(passed=7)
 
 
 def test_a_project_without_renders_imports_nothing_for_it(pytester):

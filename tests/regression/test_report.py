@@ -32,9 +32,24 @@ def failed():
 
 
 @pytest.fixture(scope="module")
-def page(failed, tmp_path_factory):
-    """A report of it."""
-    return write_report(tmp_path_factory.mktemp("report"), failed)
+def same(failed):
+    return compare(failed.reference, failed.reference)
+
+
+@pytest.fixture(scope="module")
+def reports(same, failed, tmp_path_factory):
+    """Of both, in folders of one that had none before: the page, and its figure as matplotlib has it."""
+    folder, figures, save = tmp_path_factory.mktemp("reports"), [], Figure.savefig
+    assert write_index(folder) is None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda *given, **more: figures.append(given[0]) or save(*given, **more))
+        pages = write_report(folder / "a", same, "unchanged"), write_report(folder / "b", failed, "changed")
+    return list(zip(pages, map(by_title, figures), strict=True))
+
+
+@pytest.fixture(scope="module")
+def page(reports):
+    return reports[1][0]
 
 
 class Reader(HTMLParser):
@@ -49,12 +64,16 @@ class Reader(HTMLParser):
         self.links += [value for name, value in attrs if name in ("href", "src") and not value.startswith("data:")]
 
 
+def by_title(figure):
+    return {axes.get_title(loc="left"): axes for axes in figure.axes if axes.get_title(loc="left")}
+
+
 def drawn(comparison, monkeypatch):
-    """The figure of a report, as matplotlib has it, by the titles of its panels."""
+    """The panels of a report, by their titles."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     report._panels(comparison)
-    return {axes.get_title(loc="left"): axes for axes in figures[0].axes if axes.get_title(loc="left")}
+    return by_title(figures[0])
 
 
 def test_the_page_has_one_picture_runs_nothing_escapes_names_and_lies_beside_its_numbers(page):
@@ -85,23 +104,21 @@ def test_the_ends_of_the_scale_are_the_differences_they_say(monkeypatch):
     np.testing.assert_allclose(np.unique(picture.get_array()), picture.get_clim())
 
 
-def test_equal_pictures_are_shown_alike_and_a_circle_is_around_the_worst_pixel_of_others(tmp_path, failed, monkeypatch):
+def test_equal_pictures_are_shown_alike_and_a_circle_is_around_the_worst_pixel_of_others(failed, reports):
     """With white for the brightest."""
-    same = compare(failed.reference, failed.reference)
-    panels = drawn(same, monkeypatch)
+    panels = reports[0][1]
     reference, test = (panels[name].images[0].get_array() for name in ("Reference", "Test"))
     np.testing.assert_array_equal(reference, test)
     is_brightest = failed.reference.pixels.max(axis=2) >= np.percentile(failed.reference.pixels, 99.5)
     assert (np.round(255 * reference[is_brightest].max(axis=1)) == 255).all()
     assert reference.min() < 0.8
-    for comparison, centre in ((failed, [(failed.worst.x, failed.worst.y)]), (same, [])):
-        axes = drawn(comparison, monkeypatch)["Reference"]
-        assert [patch.center for patch in axes.patches] == centre
-        assert ("Dashed circle: worst pixel" in write_report(tmp_path, comparison).read_text()) == bool(centre)
+    for (page, panels), centre in zip(reports, ([], [(failed.worst.x, failed.worst.y)]), strict=True):
+        assert [patch.center for patch in panels["Reference"].patches] == centre
+        assert ("Dashed circle: worst pixel" in page.read_text()) == bool(centre)
 
 
-def test_the_picture_has_every_panel_with_colours_and_outlines_of_what_they_say(failed, monkeypatch):
-    panels = drawn(failed, monkeypatch)
+def test_the_picture_has_every_panel_with_colours_and_outlines_of_what_they_say(failed, reports):
+    panels = reports[1][1]
     assert list(panels) == PANELS
     evidence, angle = (panels[name].images[0] for name in ("Evidence against noise", "Angle between normals"))
     assert evidence.get_clim() == (0, failed.tier("tile").maps["evidence"].max())
@@ -125,11 +142,8 @@ def test_images_that_are_not_finite_have_both_pictures_with_magenta(failed, monk
     np.testing.assert_array_equal(np.round(255 * codes), [[[0, 188, 255]], [[255, 0, 255]]])
 
 
-def test_the_index_lists_failures_first(tmp_path, failed):
-    assert write_index(tmp_path) is None
-    write_report(tmp_path / "a", compare(failed.reference, failed.reference), "unchanged")
-    write_report(tmp_path / "b", failed, "changed")
-    text = write_index(tmp_path).read_text()
+def test_the_index_lists_failures_first(page):
+    text = write_index(page.parent.parent).read_text()
     assert text.index("changed") < text.index("unchanged")
     assert 'href="b/index.html"' in text
 
@@ -142,9 +156,8 @@ def test_a_browser_shows_the_difference(tmp_path, page):
     subprocess.run(command, check=True, capture_output=True, timeout=60)
     pixels = imread(shot)[..., :3]
     # Panels of about 290 pixels in four columns: the square, a quarter of the test's side, is there once.
-    red = (pixels[..., 0] > 0.8) & (pixels[..., 1:] < 0.45).all(axis=2)
-    rows, columns = np.nonzero(red)
-    assert len(rows) > 0.5 * (250 / 4) ** 2
+    _, columns = np.nonzero((pixels[..., 0] > 0.8) & (pixels[..., 1:] < 0.45).all(axis=2))
+    assert len(columns) > 0.5 * (250 / 4) ** 2
     # In the second of four columns.
     assert 300 < np.median(columns) < 620
     # The page fits: nothing but white at its right border.

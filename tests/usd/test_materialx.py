@@ -95,6 +95,12 @@ def test_documents_are_found_by_reference_and_layers_stay_as_they_are(stage, tmp
     assert "file format" not in "".join(capfd.readouterr())
 
 
+def test_inputs_are_overridden_as_in_any_reference(stage):
+    """On the material, whose inputs the shader's are; a later document wins over nothing."""
+    over = 'over "Red" {\nfloat inputs:specular_roughness = 0.9\n}'
+    assert material(stage(RED, RED_SQUARE, over)).inputs["roughness"] == pytest.approx(0.9)
+
+
 def test_the_library_of_nodes_goes_with_the_reader(stage):
     reader = StageReader(stage(RED))
     reader.at()
@@ -117,12 +123,6 @@ def test_warnings_keep_their_kind_and_are_given_before_an_error(stage, monkeypat
     assert found == {RuntimeWarning: "overflow", CageWarning: "the stage is odd"}
 
 
-def test_inputs_are_overridden_as_in_any_reference(stage):
-    """On the material, whose inputs the shader's are; a later document wins over nothing."""
-    over = 'over "Red" {\nfloat inputs:specular_roughness = 0.9\n}'
-    assert material(stage(RED, RED_SQUARE, over)).inputs["roughness"] == pytest.approx(0.9)
-
-
 def test_variants_and_instances_have_their_documents(tmp_path):
     """A piece in two colours, each placed twice as an instance, by a reference in between."""
     (tmp_path / "red.mtlx").write_text(RED)
@@ -140,12 +140,10 @@ def test_variants_and_instances_have_their_documents(tmp_path):
     ]
     contents = StageReader(write(tmp_path, "".join(pieces))).at()
     assert (len(contents.instances), len(contents.groups)) == (4, 2)
-    colors = {
-        round(each.to_world[0, 3]): contents.materials[contents.groups[each.group][0].material].inputs["base_color"]
-        for each in contents.instances
-    }
-    np.testing.assert_allclose([colors[0], colors[3]], [[0.8, 0.1, 0.05], [0.1, 0.2, 0.9]], rtol=1e-6)
-    assert (colors[6], colors[9]) == (colors[0], colors[3])
+    placed = sorted(contents.instances, key=lambda instance: instance.to_world[0, 3])
+    found = [contents.materials[contents.groups[each.group][0].material].inputs["base_color"] for each in placed]
+    np.testing.assert_allclose(found[:2], [[0.8, 0.1, 0.05], [0.1, 0.2, 0.9]], rtol=1e-6)
+    assert found[2:] == found[:2]
 
 
 GRAPH = """<nodegraph name="NG">
@@ -279,8 +277,7 @@ def test_networks_inside_a_stage(tmp_path):
     found = material(path)
     # (in - 0.5) * amount + 0.5
     assert found.inputs.get("roughness", 0.5) == pytest.approx(0.0, abs=1e-7)
-    color = found.inputs["base_color"]
-    assert isinstance(color, PrimvarContents)
+    assert isinstance(color := found.inputs["base_color"], PrimvarContents)
     assert color.name == "tone"
     (entry,) = (each for each in msub.usd_scene(path, mi).values() if getattr(each, "bsdf", None))
     np.testing.assert_allclose(mi.traverse(entry)["bsdf.brdf_0.base_color.value"], [[0.1], [0.2], [0.3]], rtol=1e-5)
@@ -293,8 +290,7 @@ def test_colours_are_linear_unless_their_space_is_that_of_srgb(stage, space, is_
     contents, messages = told(StageReader(path).at)
     assert ["colour space" in each for each in messages] == [True] * (space == "acescg")
     expected = ((color + 0.055) / 1.055) ** 2.4 if is_srgb else color
-    (found,) = contents.materials
-    np.testing.assert_allclose(found.inputs["base_color"], expected, rtol=1e-6)
+    np.testing.assert_allclose([each.inputs["base_color"] for each in contents.materials], [expected], rtol=1e-6)
 
 
 def test_packages_hold_documents_and_their_pictures(tmp_path):
@@ -321,18 +317,16 @@ POSITIONS = element("position", "p", "vector3")
 POSITIONS += element("convert", "c", "color3", given("in", "vector3", nodename="p"))
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("<materialx", "cannot be read"),
-        (document(given("subsurface", "float", value="1")), "subsurface scattering is rendered as diffuse"),
-        (
-            document(given("thin_film_thickness", "float", value="500")),
-            "inputs of standard_surface that Mitsuba's BSDFs lack",
-        ),
-        (document(given("base_color", "color3", nodename="c"), graph=POSITIONS), 'nodes "position" are ignored'),
-    ],
-)
+THIN_FILM = given("thin_film_thickness", "float", value="500")
+TOLD = [
+    ("<materialx", "cannot be read"),
+    (document(given("subsurface", "float", value="1")), "subsurface scattering is rendered as diffuse"),
+    (document(THIN_FILM), "inputs of standard_surface that Mitsuba's BSDFs lack"),
+    (document(given("base_color", "color3", nodename="c"), graph=POSITIONS), 'nodes "position" are ignored'),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), TOLD)
 def test_what_cannot_be_had_is_told_once(stage, text, message):
     path = stage(text, RED_SQUARE + RED_SQUARE.replace('"square"', '"other"'))
     _, messages = told(StageReader(path).at)
@@ -344,12 +338,13 @@ TEXCOORD = "ND_texcoord_vector2", ""
 SECOND_TEXCOORD = "ND_texcoord_vector2", "int inputs:index = 1"
 PRIMVAR = "ND_geompropvalue_vector2", 'string inputs:geomprop = "st"\nfloat2 inputs:default = (0.5, 0)'
 # An input of an image, what its coordinates are, and what is told.
+
 IGNORED_INPUTS = [
     ('string inputs:layer = "some"', TEXCOORD, "layer of images is ignored (/Red/image)"),
     ('string inputs:filtertype = "closest"', TEXCOORD, "filtertype of images is ignored (/Red/image)"),
     ('string inputs:framerange = "1-10"', TEXCOORD, "framerange of images is ignored (/Red/image)"),
-    ("int inputs:frameoffset = 3", TEXCOORD, "frameoffset of images is ignored (/Red/image)"),
     ('string inputs:frameendaction = "periodic"', TEXCOORD, "frameendaction of images is ignored (/Red/image)"),
+    ("int inputs:frameoffset = 3", TEXCOORD, "frameoffset of images is ignored (/Red/image)"),
     (ADDRESSES.format("constant"), TEXCOORD, 'textures with the address mode "constant" are clamped (/Red/image)'),
     (ADDRESSES.format("other"), TEXCOORD, "address modes other than periodic, mirror"),
     ('string inputs:uaddressmode = "clamp"', TEXCOORD, "vaddressmode of textures is ignored; uaddressmode is used for"),
@@ -368,13 +363,9 @@ def test_inputs_of_images_and_coordinates_that_are_ignored_are_told_once_by_name
         message = "inputs that ND_tiledimage_color3 does not have are ignored"
     picture(tmp_path / "black.png", 0)
     inputs = "asset inputs:file = @black.png@\nfloat2 inputs:texcoord.connect = </Red/where.outputs:out>"
-    text = network(
-        "standard_surface",
-        "color3f inputs:base_color.connect = </Red/image.outputs:out>",
-        shader("image", node, inputs, image, "color3f outputs:out"),
-        shader("where", *where, "float2 outputs:out"),
-        shader("tone", "ND_geompropvalue_color3", 'string inputs:geomprop = "tone"', "color3f outputs:out"),
-    )
+    nodes = shader("image", node, inputs, image, "color3f outputs:out") + shader("where", *where, "float2 outputs:out")
+    nodes += shader("tone", "ND_geompropvalue_color3", 'string inputs:geomprop = "tone"', "color3f outputs:out")
+    text = network("standard_surface", "color3f inputs:base_color.connect = </Red/image.outputs:out>", nodes)
     found, messages = told(StageReader(write(tmp_path, text)).at)
     assert [message in each for each in messages] == [True]
     assert [each.file for each in found.materials[0].textures()] == [str(tmp_path / "black.png")]
@@ -408,6 +399,11 @@ BOX = """int[] faceVertexCounts = [4, 4, 4, 4, 4, 4]
     int[] faceVertexIndices = [0, 3, 2, 1, 4, 5, 6, 7, 0, 1, 5, 4, 1, 2, 6, 5, 2, 3, 7, 6, 3, 0, 4, 7]
     point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0), (-1,-1,2), (1,-1,2), (1,1,2), (-1,1,2)]
 """
+# Sharp edges keep the box a box.
+SHARP = """int[] creaseIndices = [0, 3, 2, 1, 0, 4, 5, 6, 7, 4, 0, 4, 1, 5, 2, 6, 3, 7]
+    int[] creaseLengths = [5, 5, 2, 2, 2, 2]
+    float[] creaseSharpnesses = [10, 10, 10, 10, 10, 10]
+"""
 
 
 @pytest.mark.parametrize("scheme", ["none", "catmullClark"])
@@ -416,26 +412,17 @@ def test_light_fades_on_its_way_through_a_body(stage, scheme):
     numbers = {"transmission": 1, "transmission_depth": 1, "specular_IOR": 1, "specular_roughness": 0}
     inputs = [given(name, "float", value=value) for name, value in numbers.items()]
     glass = document(given("transmission_color", "color3", value="0.25, 0.5, 0.81"), *inputs)
-    head = f'uniform token subdivisionScheme = "{scheme}"\n'
-    # Sharp edges keep the box a box.
-    edges = [[0, 3, 2, 1, 0], [4, 5, 6, 7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
-    if scheme != "none":
-        head += f"int[] creaseIndices = {[v for edge in edges for v in edge]}\n"
-        head += f"int[] creaseLengths = {[len(edge) for edge in edges]}\n"
-        head += f"float[] creaseSharpnesses = {[10] * len(edges)}\n"
-    path = stage(glass, VIEW + mesh("square", head, BOX, bound("Looks/Red")))
+    head = f'uniform token subdivisionScheme = "{scheme}"'
+    path = stage(glass, VIEW + mesh("square", head, BOX, SHARP, bound("Looks/Red")))
     scene = msub.usd_scene(path, mi, size=(8, 8), spp=1024)
     assert scene["integrator"]["type"] == "volpath"
     found = np.array(mi.render(mi.load_dict(scene)))
     np.testing.assert_allclose(found.mean(axis=(0, 1)), np.array([0.25, 0.5, 0.81]) ** 2, rtol=0.03)
 
 
-PLAIN = document(given("base_color", "color3", value="0.25, 0.5, 0.75"), given("specular", "float", value="0"))
-OF_MESH = document(
-    given("base_color", "color3", nodename="tone"),
-    given("specular", "float", value="0"),
-    graph=element("geomcolor", "tone", "color3"),
-)
+NO_SPECULAR, GEOMCOLOR = given("specular", "float", value="0"), element("geomcolor", "tone", "color3")
+PLAIN = document(given("base_color", "color3", value="0.25, 0.5, 0.75"), NO_SPECULAR)
+OF_MESH = document(given("base_color", "color3", nodename="tone"), NO_SPECULAR, graph=GEOMCOLOR)
 TONE = "color3f[] primvars:displayColor = [(0.25, 0.5, 0.75)]"
 
 

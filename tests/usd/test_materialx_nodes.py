@@ -1,6 +1,7 @@
 """What MaterialX nodes compute, against values by hand and a second implementation of the noises."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +18,9 @@ def picture(channel="rgb", name="a.png", to_uv=None, wrap="repeat"):
     return TextureContents(name, channel, "raw", wrap, [1.0] * 4, [0.0] * 4, matrix, "st", [0.0] * 4)
 
 
-class Points:
-    def __init__(self, points):
-        self.points = np.asarray(points, dtype=float)
-
-    def texcoords(self):
-        return self.points
+def at(points):
+    """What an expression is evaluated at: texture coordinates."""
+    return SimpleNamespace(texcoords=lambda: np.asarray(points, dtype=float))
 
 
 GREY = [0.2, 0.5, 0.7]
@@ -86,7 +84,7 @@ def test_operations_take_arrays_of_points():
 
 @pytest.mark.core
 def test_ramps_and_splits_lie_as_the_specification_says():
-    points = Points([[0.25, 0.75], [1.5, -1]])
+    points = at([[0.25, 0.75], [1.5, -1]])
     for pattern, expected in (
         (node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV), [1.5, 3]),
         (node("ramptb", "float", valuet=1.0, valueb=3.0, texcoord=UV), [1.5, 3]),
@@ -123,15 +121,15 @@ def _perlin(x, y):
 
 def test_noises_are_those_of_open_shading_language():
     points = np.random.default_rng(2).uniform(-20, 20, (50, 2))
-    found = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), Points(points))
+    found = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), at(points))
     np.testing.assert_allclose(found[..., 0], [2 * _perlin(*p) + 0.5 for p in points], atol=1e-12)
     fractal = node("fractal2d", "float", amplitude=1.0, octaves=3.0, lacunarity=2.0, diminish=0.5, texcoord=UV)
     expected = [sum(0.5**k * _perlin(*(p * 2**k)) for k in range(3)) for p in points]
-    np.testing.assert_allclose(evaluate(fractal, Points(points))[..., 0], expected, atol=1e-12)
-    cells = evaluate(node("cellnoise2d", "float", texcoord=UV), Points(points))[..., 0]
+    np.testing.assert_allclose(evaluate(fractal, at(points))[..., 0], expected, atol=1e-12)
+    cells = evaluate(node("cellnoise2d", "float", texcoord=UV), at(points))[..., 0]
     expected = [_hash(*(math.floor(x) & 0xFFFFFFFF for x in p)) / 0xFFFFFFFF for p in points]
     np.testing.assert_allclose(cells, expected, atol=1e-12)
-    wide = evaluate(node("noise2d", "vector3", amplitude=[1.0] * 3, pivot=0.0, texcoord=UV), Points(points))
+    wide = evaluate(node("noise2d", "vector3", amplitude=[1.0] * 3, pivot=0.0, texcoord=UV), at(points))
     assert wide.shape == (50, 3)
     assert np.abs(np.corrcoef(wide.T) - np.eye(3)).max() < 0.5
 
@@ -140,7 +138,7 @@ def test_distances_of_worley_noise_are_to_the_nearest_of_random_points():
     """Without jitter, the points are the centres of the unit squares."""
     points = np.random.default_rng(3).uniform(-5, 5, (40, 2))
     given = {"texcoord": UV, "jitter": 0.0, "style": 0.0}
-    found = evaluate(node("worleynoise2d", "float", **given), Points(points))[..., 0]
+    found = evaluate(node("worleynoise2d", "float", **given), at(points))[..., 0]
     np.testing.assert_allclose(found, np.linalg.norm(points - np.floor(points) - 0.5, axis=1), atol=1e-12)
 
 
@@ -226,7 +224,7 @@ def test_lookups_of_a_linear_image_are_linear(np_rng):
 
 @pytest.mark.parametrize("noise", ["noise2d", "fractal2d", "cellnoise2d"])
 def test_ramps_end_at_the_unit_square_and_repeat_where_there_is_noise(noise):
-    ramp = node("ramplr", "float", valuel=0.0, valuer=1.0, texcoord=node("texcoord", "vector2", name="st"))
-    pattern = node(noise, "float", texcoord=node("texcoord", "vector2", name="st"))
+    ramp = node("ramplr", "float", valuel=0.0, valuer=1.0, texcoord=UV)
+    pattern = node(noise, "float", texcoord=UV)
     assert _procedural_wrap(ramp) == "clamp"
     assert _procedural_wrap(node("add", "float", in1=ramp, in2=pattern)) == "repeat"

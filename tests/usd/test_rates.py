@@ -1,4 +1,4 @@
-"""Segments that a picture needs, points that a camera frames, and surfaces that are made once."""
+"""Segments that a picture needs, points that a camera frames, and surfaces and copies that are made once."""
 
 import warnings
 from dataclasses import replace
@@ -9,34 +9,24 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mitsuba_subdivision.cage import CageWarning, named_cages
+from mitsuba_subdivision.cage import Attribute, CageWarning, named_cages
+from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_subdivision.studio.polygon_mesh import points_at
-from mitsuba_usd.contents import InstanceContents, SceneContents, ShapeContents
+from mitsuba_usd import copies
+from mitsuba_usd.contents import InstanceContents, ShapeContents
+from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
 from mitsuba_usd.limit_surfaces import DENSE, Surfaces
 from mitsuba_usd.rates import segments_of, triangles_for_picture
 from mitsuba_usd.stage_warnings import StageWarnings
+from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
-
-WIDTH = 640
-PERSPECTIVE = {"type": "perspective", "fov": 30.0, "fov_axis": "x", "near_clip": 0.01}
-
-
-def _sensor(distance, width=WIDTH, **changes):
-    """Looks along z from so far in front of the origin."""
-    to_world = mi.ScalarTransform4f().translate([0, 0, -distance])
-    film = {"type": "hdrfilm", "width": width, "height": width // 2}
-    return {**PERSPECTIVE, "to_world": to_world, "film": film, **changes}
 
 
 def _shape(cage, matrix=None, name="/shape"):
     return ShapeContents(name, replace(cage.contents, scheme="catmull_clark"), np.eye(4) if matrix is None else matrix)
-
-
-def _scene(*shapes, groups=(), instances=()):
-    return SceneContents("z", [*shapes], [*groups], [*instances], [], [], None, None)
 
 
 def _segments(contents, sensor, shading):
@@ -45,7 +35,7 @@ def _segments(contents, sensor, shading):
 
 
 def _rate(shape, sensor, shading="exact"):
-    return _segments(_scene(shape), sensor, shading)[shape]
+    return _segments(scene_of(shape), sensor, shading)[shape]
 
 
 def _triangles(contents, sensor, shading="exact", **parameters):
@@ -65,7 +55,7 @@ def _moved(*offset, scale=1.0):
 @pytest.mark.parametrize("columns", [8, 20, 60])
 def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns, shading):
     cage = named_cages.torus(columns, columns // 2)
-    sensor = _sensor(12.0)
+    sensor = sensor_at(12.0)
     rate = _rate(_shape(cage), sensor, shading)
     surface = msub.LimitSurface(cage)
 
@@ -75,7 +65,7 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
         corners = np.asarray(mesh.positions)[np.asarray(mesh.triangles)[::29]]
         places = np.concatenate([corners.mean(axis=1), (corners + np.roll(corners, 1, axis=1)).reshape(-1, 3) / 2])
         distance = surface.closest_point(places).distance.max()
-        return distance * WIDTH / (2 * np.tan(np.radians(15)) * (12 - 1))
+        return distance * WIDTH / (2 * np.tan(np.radians(FOV / 2)) * (12 - 1))
 
     assert error(rate) < ERRORS[shading]
     assert rate == 1 or error(max(1, rate // 2)) > ERRORS[shading]
@@ -84,12 +74,12 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
 @pytest.mark.core
 def test_segments_follow_the_size_in_the_picture():
     cage = named_cages.torus(8, 5)
-    near, far, larger = (_rate(_shape(cage), each) for each in (_sensor(8), _sensor(80), _sensor(8, 2560)))
+    near, far, larger = (_rate(_shape(cage), each) for each in (sensor_at(8), sensor_at(80), sensor_at(8, 2560)))
     assert far < near < larger
     # Around the camera, a picture may show any part from near.
-    assert _rate(_shape(cage), _sensor(0)) == FINEST_RATE
+    assert _rate(_shape(cage), sensor_at(0)) == FINEST_RATE
     # Four times the size, four times as far away.
-    assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), _sensor(8)) == near
+    assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), sensor_at(8)) == near
     wide = mi.ScalarTransform4f().translate([0, 0, -8]).scale([3, 3, 1])
     film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH}
     flat = {"type": "orthographic", "to_world": wide, "film": film, "near_clip": 0.01}
@@ -101,15 +91,15 @@ def test_the_nearest_instance_decides():
     places = [InstanceContents(f"/{z}", 0, _moved(0, 0, z)) for z in (0, 40, 400)]
 
     def rate(instances):
-        return _segments(_scene(groups=[[shape]], instances=instances), _sensor(8), "exact")[shape]
+        return _segments(scene_of(groups=[[shape]], instances=instances), sensor_at(8), "exact")[shape]
 
-    assert rate(places) == rate(places[:1]) == _rate(shape, _sensor(8)) > rate(places[1:]) > rate(places[2:])
+    assert rate(places) == rate(places[:1]) == _rate(shape, sensor_at(8)) > rate(places[1:]) > rate(places[2:])
 
 
 def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
-    cage, sensor = named_cages.torus(24, 16), _sensor(5.0)
+    cage, sensor = named_cages.torus(24, 16), sensor_at(5.0)
     shape, group, dense = _shape(cage), _shape(cage, name="/group"), _shape(named_cages.torus(300, 200))
-    contents = _scene(shape, dense, groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
+    contents = scene_of(shape, dense, groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
     segments = _segments(contents, sensor, "exact")
     found = _triangles(contents, sensor)
     expected = {**outline_for(sensor), "max_rate": FINEST_RATE}
@@ -122,7 +112,7 @@ def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
     assert _triangles(contents, sensor, tessellation_rate=2)[group] == {"tessellation_rate": 2}
     assert set(_triangles(contents, sensor, "vertex")[shape]) == {"tessellation_rate"}
     # A few uniform triangles need no choice.
-    far = _sensor(40.0)
+    far = sensor_at(40.0)
     assert _triangles(contents, far)[shape] == {"tessellation_rate": _rate(shape, far)}
 
 
@@ -145,7 +135,7 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
     contents = replace(cage.contents, positions=points, holes=np.arange(40), scheme="catmull_clark")
     with pytest.warns(CageWarning, match="used by no face"):
         surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
-    points = Surfaces().points(_scene(ShapeContents("/shape", contents, _moved(1, 2, 3))))
+    points = Surfaces().points(scene_of(ShapeContents("/shape", contents, _moved(1, 2, 3))))
     exact = points_at(frame_table(surface).apply(surface.cage.positions)[0], _moved(1, 2, 3))
     for direction in np.random.default_rng(0).normal(size=(50, 3)):
         unit = direction / np.linalg.norm(direction)
@@ -171,3 +161,129 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
     first, second, third = (surfaces.properties(each) for each in (one, other, moved))
     assert first["face_vertices"] is second["face_vertices"]
     assert not np.array_equal(np.array(first["positions"]), np.array(third["positions"]))
+
+
+FACES = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+POINTS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+COUNT = LEAST_INSTANCES + 6
+
+
+def cube(scheme="catmull_clark", **more):
+    return CageContents(POINTS, np.full(6, 4), np.concatenate(FACES), scheme=scheme, **more)
+
+
+def placed(number):
+    matrix = np.diag([1.0, 2.0, 1.0, 1.0])
+    matrix[0, 3] = number
+    return matrix
+
+
+def scene(shapes=(), group=(), count=COUNT):
+    instances = [InstanceContents(f"/i{number}", 0, placed(number)) for number in range(count)]
+    return scene_of(*shapes, groups=[[*group]], instances=instances)
+
+
+def rates_of(shape):
+    """Of two kinds, as for copies near the camera and others."""
+    return {shape: np.where(np.arange(COUNT) < 10, 3, 1)}
+
+
+def test_copies_of_one_rate_are_one_shape():
+    shape, alone = ShapeContents("/cube", cube(), np.eye(4)), ShapeContents("/alone", cube(), np.eye(4))
+    found, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", StageWarnings())
+    first, many, few = found.shapes
+    assert (found.groups, found.instances, first) == ([], [], alone)
+    assert (rates[many], rates[few], len(few.cage.face_sizes)) == (1, 3, 6 * 10)
+    expected = [POINTS * [1, 2, 1] + [number, 0, 0] for number in range(10)]
+    np.testing.assert_allclose(few.cage.positions, np.concatenate(expected))
+
+
+def joined(contents):
+    return with_copies(contents, {}, "exact", StageWarnings())[0].shapes
+
+
+def test_copies_of_a_part_show_its_faces_only():
+    part = ShapeContents("/cube", cube(), np.eye(4), shown_faces=np.array([1, 4]))
+    expected = np.add.outer(6 * np.arange(COUNT), [1, 4]).ravel()
+    np.testing.assert_array_equal(joined(scene(group=[part]))[0].shown_faces, expected)
+
+
+@pytest.mark.parametrize("faces", [FACES[:1], FACES[:2]])
+def test_copies_of_few_faces_are_one_shape(faces):
+    sheet = CageContents(POINTS, np.full(len(faces), 4), np.concatenate(faces), scheme="catmull_clark")
+    found = joined(scene(group=[ShapeContents("/sheet", sheet, np.eye(4))]))
+    assert [len(each.cage.face_sizes) for each in found] == [len(faces) * COUNT]
+
+
+@pytest.mark.parametrize("shading", ["vertex", "exact"])
+def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
+    """Twice as many triangles along each side of 10 cubes do not fit."""
+    triangles = 12 * (10 * 2**2 + (COUNT - 10))
+    fits = copies.TRIANGLE_BYTES * triangles + copies.FACE_BYTES[shading] * 6 * COUNT
+    shape = ShapeContents("/cube", cube(), np.eye(4))
+    for allowed, expected in ((fits, [1, 2]), (fits - 1, [1])):
+        monkeypatch.setattr(copies, "MOST_BYTES", allowed)
+        _, rates = with_copies(scene(group=[shape]), rates_of(shape), shading, StageWarnings())
+        assert [*rates.values()] == expected
+
+
+def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbers(monkeypatch):
+    shape, notes = ShapeContents("/cube", cube(), np.eye(4)), StageWarnings()
+    few, contents = (scene(group=[shape], count=count) for count in (LEAST_INSTANCES - 1, COUNT))
+    assert with_copies(few, {}, "exact", StageWarnings()) == (few, {})
+    monkeypatch.setattr(copies, "MOST_BYTES", 1)
+    assert with_copies(contents, rates_of(shape), "exact", notes) == (contents, {})
+    with pytest.warns(UserWarning, match=rf"copies with {6 * COUNT:,} faces .* GB, and stay {COUNT} instances"):
+        notes.warn("stage")
+
+
+def test_rates_that_are_chosen_do_not_give_way(monkeypatch):
+    monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 12 * COUNT * 3)
+    shape = ShapeContents("/cube", cube(), np.eye(4))
+    rates = {shape: np.full(COUNT, 4)}
+    assert with_copies(scene(group=[shape]), rates, "vertex", StageWarnings(), lowest=4)[1] == {}
+    assert [*with_copies(scene(group=[shape]), rates, "vertex", StageWarnings())[1].values()] == [1]
+
+
+def test_copies_that_are_no_instances_are_one_shape_too():
+    """With attributes, which Mitsuba looks up in the wrong place of instances."""
+    kinds = {"heat": (8, "vertex"), "paint": (24, "face_varying")}
+    attributes = {name: Attribute(np.arange(1.0 * count)[:, None], kind) for name, (count, kind) in kinds.items()}
+    cage = cube(None, attributes=attributes)
+    mirrored = np.diag([-1.0, 1, 1, 1])
+    shapes = [ShapeContents(f"/c{k}", cage, mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
+    (found,) = joined(scene(shapes, count=0))
+    heat, paint = (found.cage.attributes[name] for name in ("heat", "paint"))
+    np.testing.assert_array_equal(heat.values.ravel(), np.tile(np.arange(8.0), COUNT))
+    # Faces of mirrored copies are turned over, with what their corners have.
+    corners = np.concatenate(FACES)
+    at_vertices = dict(zip(zip(np.arange(24) // 4, corners, strict=True), np.arange(24.0), strict=True))
+    vertices = found.cage.face_vertices[24:48] - 8
+    values = paint.values[paint.indices[24:48], 0]
+    assert [at_vertices[each] for each in zip(np.arange(24) // 4, vertices, strict=True)] == values.tolist()
+
+
+def strip(faces):
+    """Quadrilaterals in a row."""
+    points = np.array([[k // 2, k % 2, 0.0] for k in range(2 * faces + 2)])
+    corners = np.add.outer(2 * np.arange(faces), [0, 2, 3, 1])
+    return CageContents(points, np.full(faces, 4), corners.ravel(), scheme="catmull_clark")
+
+
+def test_large_copies_are_shapes_of_their_own_that_share_a_cage(monkeypatch):
+    shape = ShapeContents("/strip", strip(LARGE), 2 * np.eye(4))
+    contents = scene(group=[shape])
+    found = with_large_copies(contents)
+    assert (found.groups, found.instances) == ([[]], [])
+    assert [each.name for each in found.shapes[:2]] == ["/i0/strip", "/i1/strip"]
+    assert all(each.cage is shape.cage for each in found.shapes)
+    np.testing.assert_array_equal([each.to_world for each in found.shapes], [2 * placed(k) for k in range(COUNT)])
+    assert with_copies(found, {}, "exact", StageWarnings()) == (found, {})
+    monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 2 * LARGE * COUNT - 1)
+    assert with_large_copies(contents) is contents
+
+
+def test_small_or_few_copies_are_no_shapes_of_their_own():
+    large, small = (ShapeContents("/strip", strip(count), np.eye(4)) for count in (LARGE, LARGE - 1))
+    for contents in (scene(group=[small]), scene(group=[large], count=LEAST_INSTANCES - 1)):
+        assert [*with_large_copies(contents).instances] == contents.instances

@@ -21,6 +21,7 @@ pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
 MATERIALX = ("standard_surface", "open_pbr_surface", "gltf_pbr")
 COLOR = [0.2, 0.4, 0.8]
+COPPER = [0.955, 0.638, 0.538]
 # Of means of 65,536 samples whose lobes are chosen by other odds.
 SAMPLED = 0.02
 # Media have finite densities.
@@ -68,14 +69,14 @@ def both(model, degrees=0.0, **given):
     return albedo(mi.load_dict(entry(look(model, **given))[0]), degrees)
 
 
-@pytest.mark.parametrize(
-    ("model", "given"),
-    [
-        ("standard_surface", {"base": 0.5, "base_color": COLOR, "specular": 0.0}),
-        ("open_pbr_surface", {"base_weight": 0.5, "base_color": COLOR, "specular_weight": 0.0}),
-        ("gltf_pbr", {"base_color": [0.1, 0.2, 0.4], "metallic": 0.0, "specular": 0.0}),
-    ],
-)
+DIFFUSE = [
+    ("standard_surface", {"base": 0.5, "base_color": COLOR, "specular": 0.0}),
+    ("open_pbr_surface", {"base_weight": 0.5, "base_color": COLOR, "specular_weight": 0.0}),
+    ("gltf_pbr", {"base_color": [0.1, 0.2, 0.4], "metallic": 0.0, "specular": 0.0}),
+]
+
+
+@pytest.mark.parametrize(("model", "given"), DIFFUSE)
 def test_what_is_diffuse_reflects_its_colour(model, given):
     for degrees in (0, 60):
         reflected, transmitted = both(model, degrees, **given)
@@ -130,11 +131,7 @@ def test_edges_of_metals_have_the_colour_that_the_models_say():
     np.testing.assert_allclose(found, expected, atol=0.01)
 
 
-COPPER = [0.955, 0.638, 0.538]
-SCHLICK = {"UsdPreviewSurface": "diffuseColor", "gltf_pbr": "base_color"}
-
-
-@pytest.mark.parametrize(("model", "color"), SCHLICK.items())
+@pytest.mark.parametrize(("model", "color"), [("UsdPreviewSurface", "diffuseColor"), ("gltf_pbr", "base_color")])
 def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, color):
     """A conductor of Gulbrandsen's with a white edge is 0.13 too pale at 75 degrees."""
     for degrees in (0, 45, 60, 75, 82):
@@ -188,8 +185,8 @@ def test_opacity_of_preview_surfaces_is_glass_unless_it_is_presence():
     glass, _ = entry(look("UsdPreviewSurface", opacity=0.0, roughness=0.0))
     assert (glass["type"], glass["int_ior"]) == ("dielectric", 1.5)
     half, _ = entry(look("UsdPreviewSurface", opacity=0.25, roughness=0.5, diffuseColor=COLOR))
-    assert (half["type"], half["weight"], half["bsdf_1"]["type"]) == ("blendbsdf", 0.75, "roughdielectric")
-    assert half["bsdf_1"]["alpha"] == pytest.approx(0.25)
+    assert (half["type"], half["weight"]) == ("blendbsdf", 0.75)
+    assert (half["bsdf_1"]["type"], half["bsdf_1"]["alpha"]) == ("roughdielectric", pytest.approx(0.25))
     hole, _ = entry(look("UsdPreviewSurface", opacity=0.25, opacityMode="presence"))
     assert (hole["type"], hole["opacity"]) == ("mask", 0.25)
     for opacity, expected in ((0.4, 0.0), (0.6, 1.0)):
@@ -197,18 +194,16 @@ def test_opacity_of_preview_surfaces_is_glass_unless_it_is_presence():
         assert cut.get("opacity", 1.0) == expected
 
 
+WHITE = [1.0] * 3
 WHITES = [
-    ("standard_surface", {"base_color": [1.0] * 3, "specular_roughness": 0.5, "coat": 1.0}),
-    ("standard_surface", {"base_color": [1.0] * 3, "metalness": 1.0, "specular_roughness": 0.3}),
-    ("standard_surface", {"transmission": 0.5, "specular_roughness": 0.3, "base_color": [1.0] * 3}),
-    (
-        "standard_surface",
-        {"subsurface": 0.5, "subsurface_color": [1.0] * 3, "base_color": [1.0] * 3, "thin_walled": 1.0},
-    ),
-    ("open_pbr_surface", {"base_color": [1.0] * 3, "specular_roughness": 0.4, "coat_weight": 1.0}),
+    ("standard_surface", {"base_color": WHITE, "specular_roughness": 0.5, "coat": 1.0}),
+    ("standard_surface", {"base_color": WHITE, "metalness": 1.0, "specular_roughness": 0.3}),
+    ("standard_surface", {"base_color": WHITE, "transmission": 0.5, "specular_roughness": 0.3}),
+    ("standard_surface", {"base_color": WHITE, "subsurface": 0.5, "subsurface_color": WHITE, "thin_walled": 1.0}),
+    ("open_pbr_surface", {"base_color": WHITE, "specular_roughness": 0.4, "coat_weight": 1.0}),
     ("open_pbr_surface", {"transmission_weight": 1.0, "specular_roughness": 0.4}),
-    ("gltf_pbr", {"base_color": [1.0] * 3, "metallic": 0.5, "roughness": 0.4, "clearcoat": 1.0}),
-    ("UsdPreviewSurface", {"diffuseColor": [1.0] * 3, "opacity": 0.5, "roughness": 0.4, "clearcoat": 1.0}),
+    ("gltf_pbr", {"base_color": WHITE, "metallic": 0.5, "roughness": 0.4, "clearcoat": 1.0}),
+    ("UsdPreviewSurface", {"diffuseColor": WHITE, "opacity": 0.5, "roughness": 0.4, "clearcoat": 1.0}),
 ]
 
 
@@ -219,19 +214,18 @@ def test_white_surfaces_nearly_keep_their_light_and_hardly_add_to_it(model, give
         reflected, transmitted = both(model, degrees, **given)
         # Radiance on the inner side of glass is that of a smaller solid angle.
         total = reflected + transmitted * (1.0 if "thin_walled" in given else 1.5**2)
-        assert (total > 0.8).all()
-        assert (total < 1.08).all(), (model, given, degrees, total)
+        assert 0.8 < total.min() <= total.max() < 1.08, (model, given, degrees, total)
 
 
 def test_models_agree_where_they_mean_the_same():
-    usual = {"base_color": COLOR, "specular_roughness": 0.4}
-    entries = [bsdf_of("standard_surface", specular_IOR=1.6, **usual)]
-    entries.append(bsdf_of("open_pbr_surface", specular_ior=1.6, **usual))
-    entries.append(bsdf_of("gltf_pbr", base_color=COLOR, metallic=0.0, roughness=0.4, ior=1.6))
-    entries.append(bsdf_of("UsdPreviewSurface", diffuseColor=COLOR, roughness=0.4, ior=1.6))
-    for each in entries:
-        assert each["base_color"]["value"] == pytest.approx(COLOR)
-        assert (each["roughness"], each["eta"]) == (pytest.approx(0.4), pytest.approx(1.6))
+    for model, color, given in (
+        ("standard_surface", "base_color", {"specular_IOR": 1.6, "specular_roughness": 0.4}),
+        ("open_pbr_surface", "base_color", {"specular_ior": 1.6, "specular_roughness": 0.4}),
+        ("gltf_pbr", "base_color", {"metallic": 0.0, "roughness": 0.4, "ior": 1.6}),
+        ("UsdPreviewSurface", "diffuseColor", {"roughness": 0.4, "ior": 1.6}),
+    ):
+        found = bsdf_of(model, **given, **{color: COLOR})
+        assert [*found["base_color"]["value"], found["roughness"], found["eta"]] == pytest.approx([*COLOR, 0.4, 1.6])
 
 
 ROUGH_METAL = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}
@@ -282,21 +276,18 @@ def test_coats_dim_what_lies_below():
     inner = 1 - 0.96 / 1.5**2
     np.testing.assert_allclose(found, 0.5 * 0.96 * (1 - inner) / (1 - 0.5 * inner))
     coated = bsdf_of("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2)
-    assert coated["clearcoat"] == pytest.approx((0.6 / 2.6) ** 2 / 0.04)
-    assert coated["clearcoat_gloss"] == pytest.approx(0.06 / 0.099)
+    expected = [(0.6 / 2.6) ** 2 / 0.04, 0.06 / 0.099]
+    assert [coated["clearcoat"], coated["clearcoat_gloss"]] == pytest.approx(expected)
     _, notes = entry(look("standard_surface", coat=1.0, coat_roughness=0.6))
     with pytest.warns(UserWarning, match=r"coats rougher than 0\.32"):
         notes.warn("file")
 
 
-def test_bodies_without_a_distance_absorb_nothing():
-    """Whatever their colour: by glTF's extension for volumes, the distance is infinite unless it is given."""
+def test_bodies_absorb_nothing_without_a_distance_and_all_of_a_colour_that_they_have_none_of():
+    """By glTF's extension for volumes, the distance is infinite unless it is given."""
     body = {"transmission": 1.0, "thickness": 1.0, "attenuation_color": COLOR}
     assert "depth" not in look("gltf_pbr", **body).inputs
     assert look("gltf_pbr", **body, attenuation_distance=2.0).inputs["depth"] == 2.0
-
-
-def test_bodies_absorb_all_of_a_colour_that_they_have_none_of():
     inputs = {"transmission": 1.0, "transmission_depth": 2.0, "transmission_color": [0.0, 0.5, 1.0]}
     medium = interior(look("standard_surface", **inputs))["interior"]
     along = np.exp(-2 * medium["scale"] * np.array(medium["sigma_t"]["value"]))
@@ -314,7 +305,7 @@ def test_bodies_absorb_all_of_a_colour_that_they_have_none_of():
 def test_sheets_let_through_the_part_of_diffuse_light_that_the_model_says(model, given, part):
     reflected, transmitted = both(model, base_color=[0.8] * 3, subsurface_color=[0.8] * 3, **given)
     np.testing.assert_allclose(transmitted, 0.8 * part, rtol=SAMPLED)
-    assert (reflected > 0.8 * (1 - part) - SAMPLED).all()
+    assert reflected.min() > 0.8 * (1 - part) - SAMPLED
 
 
 def test_emission_and_presence():

@@ -10,22 +10,16 @@ from hypothesis import strategies as st
 from mitsuba_subdivision.cage.attributes import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_usd.baking import Baked
-from mitsuba_usd.contents import (
-    InstanceContents,
-    MaterialContents,
-    NodeContents,
-    SceneContents,
-    ShapeContents,
-    TextureContents,
-)
+from mitsuba_usd.contents import InstanceContents, MaterialContents, NodeContents, ShapeContents, TextureContents
 from mitsuba_usd.stage_warnings import StageWarnings
 from mitsuba_usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_usd.texture_image import halvings, read_texture_image, reduced
 from mitsuba_usd.textures import Textures
+from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
-WIDTH, FOV, DISTANCE = 640, 30.0, 10.0
+DISTANCE = 10.0
 # Half a level of 8 bits, and one where two roundings meet.
 LEVEL = 1.01 / 255
 # The depth of a flat square is known but for single precision.
@@ -46,19 +40,9 @@ def square(side=1.0, uv_side=1.0, to_world=None, *, has_texcoords=True):
     return ShapeContents("/square", cage, np.eye(4) if to_world is None else to_world, material=0)
 
 
-def scene(*shapes, inputs, groups=(), instances=()):
-    return SceneContents("z", [*shapes], [*groups], [*instances], [MaterialContents("/m", inputs)], [], None, None)
-
-
-def sensor(distance=DISTANCE):
-    to_world = mi.ScalarTransform4f().translate([0, 0, -distance])
-    film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH // 2}
-    view = {"fov": FOV, "fov_axis": "x", "near_clip": 0.01}
-    return {"type": "perspective", **view, "to_world": to_world, "film": film}
-
-
-def needed_for(contents):
-    return texels_for_pictures(contents, [sensor()])
+def needed_for(*shapes, inputs, **more):
+    contents = scene_of(*shapes, materials=[MaterialContents("/m", inputs)], **more)
+    return texels_for_pictures(contents, [sensor_at(DISTANCE)])
 
 
 def pixels_of_unit(distance=DISTANCE):
@@ -68,7 +52,7 @@ def pixels_of_unit(distance=DISTANCE):
 @pytest.mark.parametrize("side", [0.1, 2.0])
 @pytest.mark.parametrize("uv_side", [1.0, 4.0])
 def test_texels_follow_from_pixels(side, uv_side):
-    found = needed_for(scene(square(side, uv_side), inputs={"base_color": texture()}))
+    found = needed_for(square(side, uv_side), inputs={"base_color": texture()})
     assert found == {"a.png": pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit() * side / uv_side, rel=ROUNDED)}
 
 
@@ -76,15 +60,15 @@ def test_the_copy_that_is_largest_in_the_picture_decides():
     near = np.eye(4)
     near[2, 3] = -DISTANCE / 2
     copies = {"groups": [[square()]], "instances": [InstanceContents("/i", 0, near)]}
-    found = needed_for(scene(square(), inputs={"base_color": texture()}, **copies))["a.png"]
+    found = needed_for(square(), inputs={"base_color": texture()}, **copies)["a.png"]
     assert found == pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit(DISTANCE / 2), rel=ROUNDED)
 
 
 def test_where_the_detail_is_unknown_nothing_is_reduced():
-    assert needed_for(scene(square(has_texcoords=False), inputs={"base_color": texture()})) == {"a.png": np.inf}
+    assert needed_for(square(has_texcoords=False), inputs={"base_color": texture()}) == {"a.png": np.inf}
     texcoord = NodeContents("texcoord", "vector2", {})
     elsewhere = NodeContents("image", "color3", {"file": texture(), "texcoord": texcoord})
-    assert needed_for(scene(square(), inputs={"base_color": elsewhere})) == {}
+    assert needed_for(square(), inputs={"base_color": elsewhere}) == {}
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 3, 4]), st.booleans())
@@ -118,8 +102,8 @@ def test_images_keep_as_many_pixels_as_are_needed(needed, side):
 def test_a_picture_that_repeats_needs_fewer_texels():
     """Where two uses of a file repeat it differently, the one that shows most of it decides."""
     often, once = (texture(to_uv=np.diag([repeats, repeats, 1.0])) for repeats in (4, 1))
-    of_both = needed_for(scene(square(), inputs={"base_color": often, "emission": once}))["a.png"]
-    assert of_both == pytest.approx(4 * needed_for(scene(square(), inputs={"base_color": often}))["a.png"])
+    of_both = needed_for(square(), inputs={"base_color": often, "emission": once})["a.png"]
+    assert of_both == pytest.approx(4 * needed_for(square(), inputs={"base_color": often})["a.png"])
 
 
 @pytest.mark.parametrize(("size", "most", "side"), [((63, 64), 33, 32), ((64, 64), 64, 64), ((5, 3), 1, 1)])
@@ -134,8 +118,7 @@ def test_a_limit_holds_for_all_sizes(size, most, side):
 def test_images_of_other_types_are_halved_as_bytes_are(dtype, is_srgb):
     pixels = np.random.default_rng(0).integers(0, 256, (16, 8, 4), dtype=np.uint8)
     others = pixels * np.uint16(257) if dtype == np.uint16 else (pixels / 255).astype(dtype)
-    found = reduced(others, 4, is_srgb=is_srgb)
-    found = found / (65535 if dtype == np.uint16 else 1)
+    found = reduced(others, 4, is_srgb=is_srgb) / (65535 if dtype == np.uint16 else 1)
     np.testing.assert_allclose(found, reduced(pixels, 4, is_srgb=is_srgb) / 255, rtol=0, atol=LEVEL)
 
 

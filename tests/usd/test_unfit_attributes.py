@@ -19,9 +19,8 @@ COUNT = {"constant": 1, "uniform": 6, "vertex": 8, "varying": 8, "faceVarying": 
 # Read texture coordinates and a colour of the mesh.
 SPECULAR = "int inputs:useSpecularWorkflow = 1\ncolor3f inputs:{}.connect = </{}.outputs:{}>"
 TINT = shader("tint", "UsdPrimvarReader_float3", 'string inputs:varname = "tint"', "float3 outputs:result")
-PAINTS = material(SPECULAR.format("diffuseColor", "st/texture", "rgb"), texture("black.png"), name="st").replace(
-    "/paint/", "/st/"
-)
+TEXTURED = material(SPECULAR.format("diffuseColor", "st/texture", "rgb"), texture("black.png"), name="st")
+PAINTS = TEXTURED.replace("/paint/", "/st/")
 PAINTS += material(SPECULAR.format("specularColor", "tint/tint", "result"), TINT, name="tint")
 
 
@@ -54,20 +53,9 @@ def points_of(shape):
 CREASE = "int[] creaseIndices = {}\nint[] creaseLengths = {}\nfloat[] creaseSharpnesses = {}"
 CORNER = "int[] cornerIndices = {}\nfloat[] cornerSharpnesses = {}"
 # Vertices, lengths and sharpnesses.
-CREASES = [
-    ("[0, 99]", "[2]", "[3]"),
-    ("[-1, 0]", "[2]", "[3]"),
-    ("[0, 1, 3]", "[2]", "[3]"),
-    ("[0]", "[2]", "[3]"),
-    ("[0, 1]", "[2, 2]", "[3, 3]"),
-    ("[0, 1]", "[]", "[]"),
-    ("[0]", "[1]", "[3]"),
-    ("[0, 1]", "[-2]", "[3]"),
-    ("[0, 1]", "[2]", "[]"),
-    ("[0, 1]", "[2]", "[3, 3]"),
-    ("[0, 1]", "[2]", "[-3]"),
-    ("[0, 1]", "[2]", "[nan]"),
-]
+CREASES = [(vertices, "[2]", "[3]") for vertices in ("[0, 99]", "[-1, 0]", "[0, 1, 3]", "[0]")]
+CREASES += [("[0, 1]", "[2, 2]", "[3, 3]"), ("[0, 1]", "[]", "[]"), ("[0]", "[1]", "[3]"), ("[0, 1]", "[-2]", "[3]")]
+CREASES += [("[0, 1]", "[2]", sharpness) for sharpness in ("[]", "[3, 3]", "[-3]", "[nan]")]
 CORNERS = [("[99]", "[3]"), ("[-1]", "[3]"), ("[0, 1]", "[3]"), ("[0]", "[3, 3]"), ("[0]", "[-3]"), ("[0]", "[nan]")]
 HOLES = [("int", "6"), ("int", "-1"), ("float", "0.5"), ("string", '"a"')]
 TAGS = {
@@ -96,11 +84,8 @@ def primvar(name, kind, value, interpolation, count, indices=""):
 
 
 def primvars():
-    for name, kind, value in (
-        ("displayColor", "color3f", "(1, 0, 0)"),
-        ("tint", "color3f", "(1, 0, 0)"),
-        ("st", "texCoord2f", "(0, 1)"),
-    ):
+    kinds = {"displayColor": ("color3f", "(1, 0, 0)"), "tint": ("color3f", "(1, 0, 0)"), "st": ("texCoord2f", "(0, 1)")}
+    for name, (kind, value) in kinds.items():
         for interpolation, count in COUNT.items():
             if interpolation == "constant" and name == "st":
                 continue
@@ -164,26 +149,15 @@ def test_what_does_not_fit_its_mesh_is_left_out_by_name_and_the_mesh_stays(tmp_p
     assert not wrong, "\n".join(map(str, wrong))
 
 
-UNUSABLE = [
-    (POINTS.replace(", (1,1,1)]", "]"), COUNTS, VERTICES),
-    (POINTS.replace("(1,1,1)", "(1,1,nan)"), COUNTS, VERTICES),
-    (POINTS.replace("(1,1,1)", "(1,1,inf)"), COUNTS, VERTICES),
-    ('string[] points = ["a"]', COUNTS, VERTICES),
-    ("float2[] points = [(0, 0)]", COUNTS, VERTICES),
-    ("point3f[] points = []", COUNTS, VERTICES),
-    (COUNTS, VERTICES),
-    (POINTS, COUNTS.replace("4]", "3]"), VERTICES),
-    (POINTS, COUNTS.replace("4]", "5]"), VERTICES),
-    (POINTS, COUNTS.replace("4, 4]", "-4, 12]"), VERTICES),
-    (POINTS, COUNTS.replace("int", "float").replace("4]", "4.5]"), VERTICES),
-    (POINTS, VERTICES),
-    (POINTS, COUNTS, VERTICES.replace("5]", "5, 5]")),
-    (POINTS, COUNTS, VERTICES.replace(",5]", "]")),
-    (POINTS, COUNTS, VERTICES.replace("5]", "8]")),
-    (POINTS, COUNTS, VERTICES.replace("5]", "-1]")),
-    (POINTS, COUNTS, 'string[] faceVertexIndices = ["a"]'),
-    (POINTS, COUNTS),
-]
+BAD_POINTS = ["", POINTS.replace(", (1,1,1)]", "]"), *(POINTS.replace("1)]", f"{bad})]") for bad in ("nan", "inf"))]
+BAD_POINTS += ['string[] points = ["a"]', "float2[] points = [(0, 0)]", "point3f[] points = []"]
+BAD_COUNTS = ["", *(COUNTS.replace("4, 4]", bad) for bad in ("4, 3]", "4, 5]", "-4, 12]"))]
+BAD_COUNTS += [COUNTS.replace("int", "float").replace("4]", "4.5]")]
+BAD_VERTICES = ["", *(VERTICES.replace(",5]", bad) for bad in ("]", ",5,5]", ",8]", ",-1]"))]
+BAD_VERTICES += ['string[] faceVertexIndices = ["a"]']
+UNUSABLE = [(points, COUNTS, VERTICES) for points in BAD_POINTS]
+UNUSABLE += [(POINTS, counts, VERTICES) for counts in BAD_COUNTS]
+UNUSABLE += [(POINTS, COUNTS, vertices) for vertices in BAD_VERTICES]
 
 
 @pytest.mark.parametrize("flat", ["", POLYGONS], ids=["smooth", "flat"])
@@ -205,8 +179,6 @@ INSTANCER = {
     "ids": "int64[] ids = [1, 2]",
     "invisibleIds": "int64[] invisibleIds = []",
 }
-
-
 BROKEN_INSTANCERS = [
     ("prototypes", ["", "int prototypes = 3", "rel prototypes = </none>", "rel prototypes = </prim>"]),
     ("protoIndices", ["", "int[] protoIndices = [0, 1]", "int[] protoIndices = [0, -1]"]),

@@ -5,29 +5,24 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 from .. import variants
 from ..llvm import best_variant
+from ..regression.scene import require_variant
 from ..schemes import SCHEME_CLASSES
 from ..tessellation import HIGHEST_RATE
 
-if TYPE_CHECKING:
-    Commands = argparse._SubParsersAction["CommandParser"]
-
+# A text, as Python's class takes no type.
+Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 # Exit status of wrong usage, as argparse has it.
 USAGE_ERROR = 2
 
 
 def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
     """Add the option ``--variant`` to a command, with other names that it may have."""
-    parser.add_argument(
-        *aliases,
-        "--variant",
-        dest="variant",
-        metavar="VARIANT",
-        help="variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)",
-    )
+    text = "variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)"
+    parser.add_argument(*aliases, "--variant", dest="variant", metavar="VARIANT", help=text)
 
 
 def set_variant(name: str | None) -> None:
@@ -35,23 +30,16 @@ def set_variant(name: str | None) -> None:
 
     Raises RegressionError if the variant cannot run here.
     """
-    from ..regression.scene import require_variant
-
     variants.set_variant(require_variant(name) if name else best_variant())
 
 
 def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:
     """Add the options that choose one surface of a file: ``--scheme``, ``--prim``, ``--time``, ``--rate``."""
-    parser.add_argument(
-        "--scheme", help=f"one of {', '.join(SCHEME_CLASSES)} (default: the file's, otherwise catmull_clark)"
-    )
-    parser.add_argument(
-        "--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage"
-    )
-    parser.add_argument("--time", type=float, help="time code of a USD file (default: the first)")
-    parser.add_argument(
-        "--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})"
-    )
+    add = parser.add_argument
+    add("--scheme", help=f"one of {', '.join(SCHEME_CLASSES)} (default: the file's, otherwise catmull_clark)")
+    add("--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage")
+    add("--time", type=float, help="time code of a USD file (default: the first)")
+    add("--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})")
 
 
 def positive(text: str) -> int:

@@ -6,15 +6,12 @@ import argparse
 import dataclasses
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ..cage import ControlCage
 from ..messages import print_result
+from ..surface import LimitSurface
 from ..whole_file import require_writable
-from .arguments import add_cage_options
-
-if TYPE_CHECKING:
-    from ..surface import LimitSurface
-    from .arguments import Commands
+from .arguments import Commands, add_cage_options
 
 
 def add_parser(commands: Commands) -> None:
@@ -34,14 +31,8 @@ def add_parser(commands: Commands) -> None:
         description="Write triangles on the limit surface of a control cage, with exact points and normals.",
     )
     _add_cage(tessellate)
-    tessellate.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help=".obj, .ply, .usd, .usda or .usdc file to write",
-    )
+    text = ".obj, .ply, .usd, .usda or .usdc file to write"
+    tessellate.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=text)
     tessellate.set_defaults(run=_tessellate, parser=tessellate)
 
 
@@ -52,9 +43,6 @@ def _add_cage(parser: argparse.ArgumentParser) -> None:
 
 
 def _surface(options: argparse.Namespace) -> LimitSurface:
-    from ..cage import ControlCage
-    from ..surface import LimitSurface
-
     rules = {"scheme": options.scheme} if options.scheme else {}
     return LimitSurface(ControlCage.from_file(options.cage, prim=options.prim, time=options.time, **rules))
 
@@ -69,9 +57,9 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _tessellate(options: argparse.Namespace) -> None:
-    from ..files.triangle_writer import require_format
+    from ..files.formats import require_triangle_format
 
-    require_format(options.output)
+    require_triangle_format(options.output)
     surface = _surface(options)
     require_writable(options.output, [options.cage])
     triangles = surface.tessellate(options.rate)

@@ -6,16 +6,14 @@ import argparse
 import json
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..messages import PROGRAM, print_remark, print_result
+from ..regression import ImageError
 from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
-from ..whole_file import require_folder, require_writable, whole_file
-from .arguments import positive, seed, table
+from ..variants import variant_set
+from ..whole_file import require_folder, require_writable, write_text
+from .arguments import Commands, positive, seed, table
 from .passes import TOLERANCES, add_tolerances
-
-if TYPE_CHECKING:
-    from .arguments import Commands
 
 # Exit status of ``compare`` and ``merge`` for input or output that cannot be used: 1 and 2 say how images differ.
 UNUSABLE = 3
@@ -57,7 +55,6 @@ def add_parser(commands: Commands) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from ..regression import ImageError
     from ..regression.compare import compare
     from ..regression.image import load_image
     from ..regression.report import write_report
@@ -81,18 +78,15 @@ def _compare(options: argparse.Namespace) -> int:
         require_writable(options.html / "index.html")
     if test is None:
         from ..regression.references import TEST_SPP, compare_scene, variant_for
-        from ..variants import variant_set
 
         with variant_set(variant_for(reference)):
-            found = compare_scene(
-                reference, options.test, tiers, options.spp or TEST_SPP, tolerances, seed=options.seed or 0
-            )
+            sampling = {"spp": options.spp or TEST_SPP, "seed": options.seed or 0}
+            found = compare_scene(reference, options.test, tiers, tolerances=tolerances, **sampling)
     else:
         found = compare(reference, test, tiers, tolerances)
     text = json.dumps(found.as_dict(), indent=1)
     if options.json and options.json != "-":
-        with whole_file(Path(options.json)) as beside:
-            beside.write_text(f"{text}\n", encoding="utf-8")
+        write_text(Path(options.json), f"{text}\n")
     # The result first, which a report that cannot be written does not hide.
     print_result(text if options.json == "-" else found)
     page = write_report(options.html, found) if options.html else None
@@ -104,7 +98,6 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _merge(options: argparse.Namespace) -> None:
-    from ..regression import ImageError
     from ..regression.image import load_image, require_finite, save_image
     from ..regression.passes import merge_passes, missing_passes
 
@@ -118,7 +111,6 @@ def _merge(options: argparse.Namespace) -> None:
     save_image(options.output, merged)
     missing = missing_passes(merged)
     if missing:
-        numbers = ", ".join(map(str, missing))
         count = merged.metadata["sampling"].get("passes", 1)
-        print_remark(f"warning: of {count} passes, these are missing: {numbers}")
+        print_remark(f"warning: of {count} passes, these are missing: {', '.join(map(str, missing))}")
     print_result(options.output)

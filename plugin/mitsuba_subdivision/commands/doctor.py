@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from ..messages import print_result
-
-if TYPE_CHECKING:
-    from .arguments import Commands
+from .arguments import Commands
 
 
 def add_parser(commands: Commands) -> None:

@@ -5,17 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..figures import FIGURES, FigureOptions, require_options
 from ..figures.output import COLUMN, INCH, PAGE
 from ..messages import print_result
 from ..schemes import SCHEME_CLASSES
 from ..whole_file import require_folder, require_writable
-from .arguments import add_variant, positive, set_variant, table
-
-if TYPE_CHECKING:
-    from .arguments import Commands
+from .arguments import Commands, add_variant, positive, set_variant, table
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
@@ -31,34 +27,19 @@ def add_parser(commands: Commands) -> None:
         description="Draw a figure of the documentation, or all. Options that do not change the figure are refused.",
         epilog=table("figures", {name: figure.shows for name, figure in FIGURES.items()}),
     )
-    figure.add_argument("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
-    figure.add_argument(
-        "-o", "--output", type=Path, default=DRAWN, metavar="DIR", help="folder to write to (default: %(default)s)"
-    )
-    figure.add_argument("--resolution", type=positive, metavar="N", help="width of a panel in pixels (default: 512)")
-    figure.add_argument("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
-    figure.add_argument(
-        "--width",
-        type=width,
-        metavar="LENGTH",
-        help=f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)",
-    )
-    figure.add_argument(
-        "--scheme",
-        choices=list(SCHEME_CLASSES),
-        metavar="SCHEME",
-        help=f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)",
-    )
+    add = figure.add_argument
+    add("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
+    add("-o", "--output", type=Path, default=DRAWN, metavar="DIR", help="folder to write to (default: %(default)s)")
+    add("--resolution", type=positive, metavar="N", help="width of a panel in pixels (default: 512)")
+    add("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
+    text = f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)"
+    add("--width", type=width, metavar="LENGTH", help=text)
+    text = f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)"
+    add("--scheme", choices=list(SCHEME_CLASSES), metavar="SCHEME", help=text)
     takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
-    figure.add_argument("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
-    figure.add_argument(
-        "--format",
-        choices=FigureOptions.formats,
-        action="append",
-        dest="formats",
-        metavar="FORMAT",
-        help="png, pdf or exr; can be repeated (default: all that the figure has)",
-    )
+    add("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
+    text = "png, pdf or exr; can be repeated (default: all that the figure has)"
+    add("--format", choices=FigureOptions.formats, action="append", dest="formats", metavar="FORMAT", help=text)
     add_variant(figure)
     figure.set_defaults(run=_figure, parser=figure)
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+
+import mitsuba as mi
 
 from ..messages import print_result
+from ..regression import RegressionError
+from ..regression.scene import BOX, LoadedScene, load_scene
 from ..regression.tiers import Tolerances
+from ..studio.studio_entries import sampler
 from ..whole_file import require_writable
 from .arguments import positive
 from .pictures import threads
-
-if TYPE_CHECKING:
-    from ..regression.scene import LoadedScene
 
 TOLERANCES = f"Tolerances: {', '.join(Tolerances().as_dict())}."
 
@@ -25,23 +26,14 @@ def add_pass_options(render: argparse.ArgumentParser) -> None:
     group = render.add_argument_group(
         "rendering by passes", "The image is an OpenEXR file with the variance and the number of samples of each pixel."
     )
-    group.add_argument(
-        "--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together'
-    )
-    group.add_argument("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
-    group.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        help="render the passes, or the frames of a model, on the Dask cluster of this scheduler",
-    )
-    group.add_argument(
-        "--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)"
-    )
-    group.add_argument(
-        "--reference",
-        action="store_true",
-        help='write a reference for "compare": with the box filter, geometry AOVs and tolerances',
-    )
+    add = group.add_argument
+    add("--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together')
+    add("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
+    text = "render the passes, or the frames of a model, on the Dask cluster of this scheduler"
+    add("--dask", metavar="ADDRESS", help=text)
+    add("--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)")
+    text = 'write a reference for "compare": with the box filter, geometry AOVs and tolerances'
+    add("--reference", action="store_true", help=text)
     add_tolerances(group, "tolerance to store with the reference; can be repeated")
     render.epilog = TOLERANCES
 
@@ -61,9 +53,6 @@ def wants_passes(options: argparse.Namespace) -> bool:
 
 def validate_pass_options(options: argparse.Namespace) -> None:
     """Raise RegressionError for options of ``render`` that contradict each other, or have no effect with the others."""
-    from ..regression import RegressionError
-    from ..regression.scene import BOX
-
     if wants_passes(options) and options.output.suffix.lower() != ".exr":
         raise RegressionError(f'output "{options.output}"; expected a name ending in .exr, which keeps the variance')
     if options.share and (options.passes or options.dask):
@@ -90,15 +79,11 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     """Render by passes according to the options of ``render``, in the current variant, and write the image.
 
     A model is loaded by ``load``, here and on the workers of a cluster; it must be picklable.
-
     Raises RegressionError if there are fewer batches than passes, or no cluster answers.
     """
-    import mitsuba as mi
-
     from ..regression.image import save_image
     from ..regression.passes import BATCH, LEAST_BATCHES, Sampling, merge_passes, render_on_cluster, render_pass
     from ..regression.references import REFERENCE_SPP, as_reference
-    from ..regression.scene import BOX, load_scene
 
     filter_name = BOX if options.reference else options.filter
     is_model = load is not None
@@ -113,8 +98,6 @@ def render_by_passes(options: argparse.Namespace, load: Callable[[], LoadedScene
     number, count = options.share or (1, options.passes or 1)
     batch = options.batch or min(BATCH, max(1, spp // max(LEAST_BATCHES, count)))
     if is_model:
-        from ..studio.studio_entries import sampler
-
         # Mitsuba would round each batch up, and more samples than recorded would count.
         batch = sampler(batch)["sample_count"]
     sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)

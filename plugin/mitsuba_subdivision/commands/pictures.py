@@ -12,23 +12,25 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from uuid import uuid4
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageWarning, warn
+from ..regression.scene import LoadedScene, render_image
+from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
+from ..studio.cage_scenes import CageScenes
 from ..studio.camera import DEFAULT_VIEW, VIEWS
+from ..studio.denoising import denoised
+from ..studio.picture import shading_for
 from ..studio.scene_parts import SceneParts
+from ..studio.studio_entries import Look, variant_in_use
 from ..variants import SceneNode
-from ..whole_file import require_writable, whole_file
-
-if TYPE_CHECKING:
-    from ..regression.scene import LoadedScene
-    from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
-    from ..studio.studio_entries import Look
+from ..whole_file import require_writable, write_text
 
 # Options that select one mesh of a USD file.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
@@ -46,8 +48,6 @@ def render_picture(
     options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None
 ) -> NDArray[np.float32]:
     """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
-    from ..regression.scene import render_image
-
     count = options.shutter or 1
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
@@ -55,8 +55,6 @@ def render_picture(
         with threads(options.threads):
             found = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
-                from ..studio.denoising import denoised
-
                 # Each by itself, as its albedo and normals are those of its time.
                 found = denoised(loaded, found, seed)
         total = total + found / count
@@ -89,8 +87,6 @@ def as_data(options: argparse.Namespace) -> dict[str, Any]:
 @contextmanager
 def threads(count: int | None) -> Iterator[None]:
     """Render with so many threads. With one, nothing may be read or written meanwhile; see `set_variant`."""
-    import drjit as dr
-
     before = dr.thread_count()
     dr.set_thread_count(count or before)
     try:
@@ -107,10 +103,10 @@ def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator
     warned: set[str] = set()
     with cluster(options.dask) as client:
         for number, (image, messages) in results(client, partial(_frame, command), str(mi.variant()), numbers):
-            for message in messages:
+            for message in dict.fromkeys(messages):
                 if message not in warned:
-                    warned.add(message)
                     warn(message)
+            warned.update(messages)
             yield number, image
 
 
@@ -132,8 +128,6 @@ def _kept(command: bytes) -> tuple[argparse.Namespace, FrameRange | Turntable | 
 
 def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture:
     """What a model's pictures show."""
-    from ..studio.animation import FrameRange, StillPicture, Turntable
-
     source = _source(options)
     if options.frames or options.shutter:
         return FrameRange(source, options.frames or range(1, 2))
@@ -144,9 +138,6 @@ def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture
 
 def _source(options: argparse.Namespace) -> SceneSource[Any]:
     """One mesh, or a whole USD file."""
-    from ..studio.picture import shading_for
-    from ..studio.studio_entries import variant_in_use
-
     look, which = _look(options), {"time": options.time, "numbers": options.frames}
     is_usd = options.scene.suffix.lower().startswith(".usd")
     if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
@@ -155,21 +146,16 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
         given = {"tessellation_rate": options.rate, "shading": options.shading}
         parameters = {name: value for name, value in given.items() if value is not None}
         return StageScenes(options.scene, look, parameters, shutter=options.shutter, **which)
+    what = f'one cage of "{options.scene}"'
     if options.shutter:
-        what = f'one cage of "{options.scene}", which has no camera'
-        raise ValueError(f"--shutter was given for {what}; expected a whole USD file")
+        raise ValueError(f"--shutter was given for {what}, which has no camera; expected a whole USD file")
     if options.texture_size:
-        what = f'one cage of "{options.scene}"'
         raise ValueError(f"--texture-size was given for {what}; expected it for a whole USD file")
-    from ..studio.cage_scenes import CageScenes
-
     shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
     return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
 
 
 def _look(options: argparse.Namespace) -> Look:
-    from ..studio.studio_entries import Look
-
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
@@ -189,7 +175,6 @@ def save_scene(
     Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
     with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
     meshes as PLY files; pictures as PNG or EXR files.
-
     Returns list of Path: the files that were written; the scene is the last. Raises ValueError if the path does not end
     in .xml, something in memory can be written to no file, or a file to write is one that the scene reads. Nothing has
     been written then. Raises OSError if a file cannot be written.
@@ -206,25 +191,22 @@ def save_scene(
     config = mi.parser.ParserConfig(str(mi.variant()))
     text = _readable(mi.parser.write_string(mi.parser.parse_dict(config, entries)))
     written = parts.write()
-    with whole_file(path) as beside:
-        beside.write_text(f'<?xml version="1.0"?>\n{text}', encoding="utf-8")
+    write_text(path, f'<?xml version="1.0"?>\n{text}')
     return [*written, path]
 
 
 def _readable(text: str) -> str:
-    """The text that Mitsuba writes, with transforms as look-at, and without digits beyond single precision."""
-    text = _MATRIX.sub(_placed, text)
-    return _NUMBERS.sub(lambda tag: _NUMBER.sub(_precise if tag[1] == "lookat" else _shortest, tag[0]), text)
+    """The text that Mitsuba writes, with transforms as look-at, and without digits beyond single precision.
 
+    The difference of a look-at's points is a direction: they get more digits.
+    """
 
-def _precise(found: re.Match[str]) -> str:
-    """A coordinate of two nearby points, whose difference is a direction."""
-    return f"{float(found[0]):.{DIGITS}g}"
+    def shortened(tag: re.Match[str]) -> str:
+        if tag[1] == "lookat":
+            return _NUMBER.sub(lambda found: f"{float(found[0]):.{DIGITS}g}", tag[0])
+        return _NUMBER.sub(lambda found: str(np.float32(float(found[0]))).removesuffix(".0"), tag[0])
 
-
-def _shortest(found: re.Match[str]) -> str:
-    """The fewest digits that distinguish a number from others of single precision."""
-    return str(np.float32(float(found[0]))).removesuffix(".0")
+    return _NUMBERS.sub(shortened, _MATRIX.sub(_placed, text))
 
 
 def _placed(found: re.Match[str]) -> str:

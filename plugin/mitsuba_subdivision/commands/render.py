@@ -9,22 +9,23 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
 
 from ..files.formats import FORMATS
 from ..messages import print_remark, print_result
+from ..progress import counted
+from ..regression.scene import BOX, kept_search_folders, load_scene
 from ..shapes.parameter_table import SHADINGS
 from ..studio.camera import DEFAULT_VIEW, UP_AXES, VIEWS
+from ..studio.denoising import require_denoiser
 from ..whole_file import require_writable, whole_file
-from .arguments import add_cage_options, add_variant, finite, positive, seed, set_variant
+from .arguments import Commands, add_cage_options, add_variant, finite, positive, seed, set_variant
 from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes
 from .pictures import as_data, load_still, pictures, render_picture
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from .arguments import Commands
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 SCENE_SUFFIX = ".xml"
@@ -51,44 +52,22 @@ def add_parser(commands: Commands) -> None:
         description="Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, "
         "in a neutral studio.",
     )
-    render.add_argument("scene", type=Path, metavar="FILE", help="Mitsuba scene (.xml), or a model: a control cage")
-    render.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="image to write: .exr, .png, .jpg or .hdr; of frames also .gif or .mp4",
-    )
-    render.add_argument(
-        "--spp", type=positive, metavar="N", help="samples per pixel (default: the scene's; models: 64)"
-    )
-    render.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
-    render.add_argument(
-        "-D",
-        "--define",
-        dest="parameters",
-        metavar="NAME=VALUE",
-        type=_assignment,
-        action="append",
-        default=[],
-        help="value of a parameter of the scene; can be repeated",
-    )
-    render.add_argument("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
-    render.add_argument(
-        "--denoise", action="store_true", help="render with the box filter, and remove noise by Open Image Denoise"
-    )
+    add = render.add_argument
+    add("scene", type=Path, metavar="FILE", help="Mitsuba scene (.xml), or a model: a control cage")
+    text = "image to write: .exr, .png, .jpg or .hdr; of frames also .gif or .mp4"
+    add("-o", "--output", type=Path, required=True, metavar="FILE", help=text)
+    add("--spp", type=positive, metavar="N", help="samples per pixel (default: the scene's; models: 64)")
+    add("--seed", type=seed, default=0, metavar="N", help="seed of the samples (default: %(default)s)")
+    many: dict[str, Any] = {"action": "append", "default": []}
+    text = "value of a parameter of the scene; can be repeated"
+    add("-D", "--define", dest="parameters", metavar="NAME=VALUE", type=_assignment, help=text, **many)
+    add("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
+    add("--denoise", action="store_true", help="render with the box filter, and remove noise by Open Image Denoise")
     add_variant(render, "-m", "--mode")
-    render.add_argument("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
-    render.add_argument(
-        "-a",
-        "--append",
-        metavar="PATHS",
-        action="append",
-        default=[],
-        help='folders to search for files, separated by ";"',
-    )
-    render.add_argument("-v", "--verbose", action="count", default=0, help="print messages of Mitsuba; repeat for more")
+    add("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
+    text = 'folders to search for files, separated by ";"'
+    add("-a", "--append", metavar="PATHS", help=text, **many)
+    add("-v", "--verbose", action="count", default=0, help="print messages of Mitsuba; repeat for more")
     _add_model_options(render)
     _add_frame_options(render)
     add_pass_options(render)
@@ -97,35 +76,21 @@ def add_parser(commands: Commands) -> None:
 
 def _add_model_options(render: argparse.ArgumentParser) -> None:
     group = render.add_argument_group("models")
-    group.add_argument("--view", choices=list(VIEWS), help=f"view of the camera (default: {DEFAULT_VIEW})")
-    group.add_argument("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
-    group.add_argument(
-        "--elevation", type=finite, metavar="DEG", help="elevation above the ground instead of --view, -90 to 90"
-    )
-    group.add_argument("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
-    group.add_argument(
-        "--size",
-        type=_size,
-        metavar="WxH",
-        help="pixels of the picture (default: 640x480, or as the stage or its camera asks for)",
-    )
-    group.add_argument(
-        "--texture-size",
-        type=positive,
-        metavar="N",
-        help="pixels along the sides of a stage's textures at most (default: as many as the picture shows)",
-    )
-    group.add_argument("--checker", action="store_true", help="show texture coordinates as a checkerboard")
-    group.add_argument("--cage", action="store_true", help="draw the control cage")
+    add = group.add_argument
+    add("--view", choices=list(VIEWS), help=f"view of the camera (default: {DEFAULT_VIEW})")
+    add("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
+    add("--elevation", type=finite, metavar="DEG", help="elevation above the ground instead of --view, -90 to 90")
+    add("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
+    text = "pixels of the picture (default: 640x480, or as the stage or its camera asks for)"
+    add("--size", type=_size, metavar="WxH", help=text)
+    text = "pixels along the sides of a stage's textures at most (default: as many as the picture shows)"
+    add("--texture-size", type=positive, metavar="N", help=text)
+    add("--checker", action="store_true", help="show texture coordinates as a checkerboard")
+    add("--cage", action="store_true", help="draw the control cage")
     add_cage_options(group, "as many as the picture needs")
-    group.add_argument(
-        "--shading",
-        choices=SHADINGS,
-        help="normals: interpolated between vertices, or exact (default: auto, exact where supported)",
-    )
-    group.add_argument(
-        "--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered"
-    )
+    text = "normals: interpolated between vertices, or exact (default: auto, exact where supported)"
+    add("--shading", choices=SHADINGS, help=text)
+    add("--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered")
 
 
 def _add_frame_options(render: argparse.ArgumentParser) -> None:
@@ -135,18 +100,10 @@ def _add_frame_options(render: argparse.ArgumentParser) -> None:
         "interrupted command can be repeated.",
     )
     group.add_argument("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
-    group.add_argument(
-        "--frames",
-        type=_frame_range,
-        metavar="FIRST:LAST[:STEP]",
-        help="times of a USD file, or numbers of files whose name has %%04d in it",
-    )
-    group.add_argument(
-        "--shutter",
-        type=positive,
-        metavar="N",
-        help="motion blur of a USD file: mean of N times while the shutter of its camera is open (default: none)",
-    )
+    text = "times of a USD file, or numbers of files whose name has %%04d in it"
+    group.add_argument("--frames", type=_frame_range, metavar="FIRST:LAST[:STEP]", help=text)
+    text = "motion blur of a USD file: mean of N times while the shutter of its camera is open (default: none)"
+    group.add_argument("--shutter", type=positive, metavar="N", help=text)
     group.add_argument("--fps", type=_fps, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
 
 
@@ -175,9 +132,6 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
             raise ValueError(f'{flag} was given for the {what} "{options.scene}"; expected it for {other}')
     validate_pass_options(options)
     if options.denoise:
-        from ..regression.scene import BOX
-        from ..studio.denoising import require_denoiser
-
         require_denoiser()
         options.filter = BOX
     has_frames = options.turntable or options.frames
@@ -204,28 +158,20 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
 @contextmanager
 def _settings(options: argparse.Namespace) -> Iterator[None]:
     """Set search folders and log level by the options, and restore them afterwards."""
-    import mitsuba as mi
-
-    resolver = mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
-    folders, level = [str(folder) for folder in resolver], mi.log_level()
-    for folder in ";".join(options.append).split(";"):
-        if folder:
+    level = mi.log_level()
+    with kept_search_folders() as resolver:
+        for folder in filter(None, ";".join(options.append).split(";")):
             resolver.append(folder)
-    if options.verbose:
-        levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
-        mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
-    try:
-        yield
-    finally:
-        resolver.clear()
-        for folder in folders:
-            resolver.append(folder)
-        mi.set_log_level(level)
+        if options.verbose:
+            levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
+            mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
+        try:
+            yield
+        finally:
+            mi.set_log_level(level)
 
 
 def _render_scene(options: argparse.Namespace) -> None:
-    from ..regression.scene import load_scene
-
     if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
     if wants_passes(options):
@@ -238,7 +184,6 @@ def _render_scene(options: argparse.Namespace) -> None:
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, as the integrator has AOVs')
     _write_image(options, render_picture(options, [loaded], options.spp), options.output)
-    print_result(options.output)
 
 
 def _render_model(options: argparse.Namespace) -> None:
@@ -255,13 +200,10 @@ def _render_model(options: argparse.Namespace) -> None:
         return
     _, image = next(pictures(options, [1]))
     _write_image(options, image, options.output)
-    print_result(options.output)
 
 
 def _write_frames(options: argparse.Namespace) -> None:
     """Render the missing frames, and join all to a video if requested."""
-    from ..progress import counted
-
     is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
         require_encoder(options.output)
@@ -277,14 +219,12 @@ def _write_frames(options: argparse.Namespace) -> None:
     for _ in counted(missing, "Frames"):
         number, image = next(found)
         _write_image(options, image, paths[number])
-        print_result(paths[number])
     if is_video:
         write_video(options.output, list(paths.values()), options.fps or DEFAULT_FPS)
         print_result(options.output)
 
 
 def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
-    import mitsuba as mi
 
     from ..regression.image import METADATA_ATTRIBUTE
 
@@ -294,6 +234,7 @@ def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: 
         if options.denoise:
             bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
         bitmap.write(str(beside))
+    print_result(path)
 
 
 def _index(text: str) -> int:

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
+from ..examples import example_file
 from ..regression.probe import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .figure_scenes import in_8_bits, load_stage, render, staged
-from .output import FigureError, FigureOptions, panels, scene_path, scientific, show, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, scientific, show, write_pixels, write_plot
 from .own_cage import around_vertices, frame
 from .projection import project
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from .subdivision import edge_curves
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
 NEEDLE_RADIUS = 0.3
@@ -60,19 +60,11 @@ class Row:
     rate: int
     own: ControlCage | None = None
 
-    @property
-    def scene(self) -> Path:
-        return scene_path(f"valence{5 if self.own else self.valence}")
-
-    @property
-    def cage(self) -> str:
-        """File of the cage, relative to the scene's folder."""
-        prefix = {"catmull_clark": "valence", "loop": "loop_valence", "doo_sabin": "doo_sabin_face"}[self.scheme]
-        return f"cages/{prefix}{self.valence}.obj"
-
     def surface(self) -> LimitSurface:
         """The scene's surface. The extraordinary point is corner 0 of element 0, and vertex 0 of a tessellation."""
-        return LimitSurface(self.own or ControlCage.from_file(self.scene.parent / self.cage), self.scheme)
+        prefix = {"catmull_clark": "valence", "loop": "loop_valence", "doo_sabin": "doo_sabin_face"}[self.scheme]
+        name = f"cages/{prefix}{self.valence}.obj"
+        return LimitSurface(self.own or ControlCage.from_file(example_file(name)), self.scheme)
 
 
 # At |c1| = 10 and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the
@@ -127,11 +119,9 @@ def draw(options: FigureOptions) -> list[Path]:
     for row, row_axes in zip(rows, axes, strict=True):
         for rule, axis in zip(RULES, row_axes, strict=True):
             vertex = vertex_normal(row, rule)
-            pixels, overlay = _render(row, rule, options)
             location, error = _caption(row, rule, vertex)
             options.report(f"valence {row.valence}, {rule.title}: {location}; {error}")
-            _draw_panel(axis, pixels, overlay, f"{location}\n{error}")
-            rendered.append(pixels)
+            rendered.append(_draw_panel(axis, row, rule, options, f"{location}\n{error}"))
             records.append({"valence": row.valence, "rule": rule.title, **vars(vertex)})
         row_axes[0].set_ylabel(f"valence {row.valence}, |c₁| = {vertex.offset:.1f}")
     for axis, rule in zip(axes[0], RULES, strict=True):
@@ -159,27 +149,19 @@ def _own_rows(path: Path, scheme: str) -> list[Row]:
 
 def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
     """Label with the sample location of the vertex and the error of its normal."""
-    location = (
-        "u = v = 0" if vertex.level is None else f"u = v = {scientific(rule.sample_offset(row))}, n = {vertex.level}"
-    )
+    location = "u = v = 0"
+    if vertex.level is not None:
+        location = f"u = v = {scientific(rule.sample_offset(row))}, n = {vertex.level}"
     if vertex.error >= 0.1:
         return location, f"error {vertex.error:.1f}°"
     is_negligible = vertex.error < NEGLIGIBLE
     return location, f"error {'below ' * is_negligible}{scientific(max(vertex.error, NEGLIGIBLE))}°"
 
 
-@dataclass(frozen=True, eq=False)
-class Overlay:
-    """Lines over an image, in pixels."""
-
-    # (n, 2, 2): both ends of the normals near the extraordinary vertex; that vertex's own comes first
-    needles: NDArray[np.float64]
-    edges: NDArray[np.float64]  # (m, points, 2): the cage's edges on the limit surface
-
-
-def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray[np.float32], Overlay]:
+def _draw_panel(axis: Axes, row: Row, rule: NormalRule, options: FigureOptions, caption: str) -> NDArray[np.float32]:
+    """Render the surface, and draw it with normals near the extraordinary vertex and with edges; returns the pixels."""
     offset, resolution = rule.sample_offset(row), options.resolution
-    surface, stage = row.surface(), load_stage(row.scene.stem, resolution=resolution)
+    surface, stage = row.surface(), load_stage(f"valence{5 if row.own else row.valence}", resolution=resolution)
     shape = {
         "type": "subdivision",
         **surface.cage.as_properties(mi),
@@ -196,30 +178,15 @@ def _render(row: Row, rule: NormalRule, options: FigureOptions) -> tuple[NDArray
     near = np.flatnonzero(distance < NEEDLE_RADIUS)
     start = tessellation.positions[near].astype(np.float64)
     needles = np.stack([start, start + NEEDLE_LENGTH * tessellation.normals[near]], axis=1)
-    sensor = scene.sensors()[0]
-    return pixels, Overlay(project(sensor, needles, resolution), project(sensor, _edges(surface), resolution))
-
-
-def _edges(surface: LimitSurface) -> NDArray[np.float64]:
-    """Curves between the elements near the extraordinary point: ``(m, 17, 3)``."""
-    elements = surface.patches.elements
-    along = np.stack([np.linspace(0, 1, 17), np.zeros(17)], axis=1)
-    corner = np.arange(len(elements.face)) - elements.face_offsets[elements.face]
-    begin = surface.evaluate(elements.face, np.zeros((len(corner), 2)), corner).p
-    near = np.flatnonzero(np.linalg.norm(begin - begin[0], axis=1) < EDGE_RADIUS)
-    # Elements that are a part of a face end in the middle of an edge.
-    faces, corners = np.repeat(elements.face[near], 17), np.repeat(corner[near], 17)
-    samples = surface.evaluate(faces, np.tile(along, (len(near), 1)), corners)
-    return samples.p.reshape(-1, 17, 3).astype(np.float64, copy=False)
-
-
-def _draw_panel(axis: Axes, pixels: NDArray[np.float32], overlay: Overlay, caption: str) -> None:
-    from matplotlib.collections import LineCollection
-
+    edges = edge_curves(surface, np.arange(surface.patches.elements.half_edge_count), 16)
+    edges = edges[np.linalg.norm(edges[:, 0] - edges[0, 0], axis=1) < EDGE_RADIUS]
     show(axis, in_8_bits(pixels), caption=caption)
-    axis.set_xlim(0, pixels.shape[1])
-    axis.set_ylim(pixels.shape[0], 0)
-    own, *others = overlay.needles
-    axis.add_collection(LineCollection(list(overlay.edges), colors="#40362a", linewidths=0.3, alpha=0.4))
+    axis.set(xlim=(0, pixels.shape[1]), ylim=(pixels.shape[0], 0))
+    sensor = scene.sensors()[0]
+    # The needle of the extraordinary vertex comes first.
+    own, *others = project(sensor, needles, resolution)
+    curves = list(project(sensor, edges, resolution))
+    axis.add_collection(LineCollection(curves, colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
     axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=1.5, capstyle="round"))
+    return pixels

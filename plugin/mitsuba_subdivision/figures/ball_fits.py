@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
-from ..fit.to_mesh import triangle_samples
+from ..fit.point_fit import mesh_samples
+from ..fit.views import with_sample_count
 from ..shapes.moving_vertices import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode
 from .figure_scenes import make_mesh
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 VIEWS, PIXELS, SPP, EDGE_SPP, TARGET_SPP = 8, 80, 16, 2, 256
 # Of the target: radius of its core, and how fast arms end to their sides.
@@ -109,8 +107,8 @@ class Measurement:
     """Measures distances to the target at steps spaced evenly on a logarithmic axis."""
 
     def __init__(self, target: ControlCage, steps: int) -> None:
-        self._points = _samples(target.positions, target.triangles, 0)
-        self._tree = _tree(self._points)
+        self._points = mesh_samples(target.positions, target.triangles, SAMPLES, 0)[0]
+        self._tree = cKDTree(self._points)
         self._after = {0, *np.rint(np.geomspace(1, steps, MEASUREMENTS)).astype(int).tolist()}
 
     def __call__(self, course: Course, cage: Callable[[], ControlCage]) -> None:
@@ -119,8 +117,8 @@ class Measurement:
         if done not in self._after:
             return
         course.cages[done] = cage()
-        points = _samples(*triangles_of(course.cages[done]), 1)
-        there, back = np.array(self._tree.query(points)[0]), np.array(_tree(points).query(self._points)[0])
+        points = mesh_samples(*triangles_of(course.cages[done]), SAMPLES, 1)[0]
+        there, back = np.array(self._tree.query(points)[0]), np.array(cKDTree(points).query(self._points)[0])
         course.distances[done] = float(there.mean() + back.mean()) / 2 / DIAGONAL
 
 
@@ -132,7 +130,7 @@ def fit_cage(refine: list[int], views: list[View], steps: int, measure: Measurem
         views,
         {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
         shape={"bsdf": GREY},
-        learning_rate=_rates(RATES, steps),
+        learning_rate=[(0, RATES[0]), (steps, RATES[1])],
         smoothing=SMOOTHING,
         refine=refine,
         spp=SPP,
@@ -152,9 +150,7 @@ def fit_mesh(views: list[View], steps: int, measure: Measurement) -> Course:
     scene = mi.load_dict({"type": "scene", "integrator": integrator(SPP, EDGE_SPP), **LIGHTS, "mesh": shape})
     params, key = mi.traverse(scene), "mesh.vertex_positions"
     targets = [upload(mi.TensorXf, view.picture) for view in views]
-    sensors = [mi.load_dict(view.sensor) for view in views]
-    for sensor in sensors:
-        sensor.sampler().set_sample_count(SPP)
+    sensors = [with_sample_count(view.sensor, SPP) for view in views]
     large_steps = LargeSteps(mesh.laplacian(), MESH_SMOOTHING)
     optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(mesh.positions)
@@ -165,7 +161,7 @@ def fit_mesh(views: list[View], steps: int, measure: Measurement) -> Course:
     def squared_error(image: mi.TensorXf, view: int) -> mi.TensorXf:
         return dr.mean(dr.square(image - targets[view]), axis=None)
 
-    course, rate = Course(), Schedule.of(_rates(MESH_RATES, steps), "learning_rate")
+    course, rate = Course(), Schedule.of([(0, MESH_RATES[0]), (steps, MESH_RATES[1])], "learning_rate")
     measure(course, moved)
     for step in range(steps):
         params[key] = large_steps.from_differential(optimizer["u"])
@@ -187,20 +183,3 @@ def triangles_of(cage: ControlCage) -> tuple[NDArray[np.floating], NDArray[np.in
         return cage.positions, cage.triangles
     found = LimitSurface(cage).tessellate(SEGMENTS)
     return found.positions, found.triangles
-
-
-def _rates(ends: tuple[float, float], steps: int) -> list[tuple[float, float]]:
-    return [(0, ends[0]), (steps, ends[1])]
-
-
-def _samples(positions: NDArray[np.floating], triangles: NDArray[np.integer], seed: int) -> NDArray[np.float64]:
-    """Random points on triangles, uniform by area."""
-    chosen, weights = triangle_samples(positions, triangles, SAMPLES, seed)
-    found: NDArray[np.float64] = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
-    return found
-
-
-def _tree(points: NDArray[np.float64]) -> cKDTree:
-    from scipy.spatial import cKDTree
-
-    return cKDTree(points)

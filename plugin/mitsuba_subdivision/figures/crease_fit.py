@@ -37,7 +37,11 @@ class CreaseFit:
     edges: NDArray[np.integer]  # (12, 2) int: all edges
     truth: NDArray[np.float64]  # (12,) float64: sharpness of the target's edges
     sharpness: NDArray[np.float64]  # (steps + 1, 12) float64: after each step
-    losses: list[float]
+
+    def shown(self) -> list[tuple[ControlCage, NDArray[np.float64]]]:
+        """Target, start and result with their sharpness."""
+        ends = self.truth, self.sharpness[0], self.sharpness[-1]
+        return list(zip((self.target, self.start, self.found), ends, strict=True))
 
 
 def fit_creases(steps: int) -> CreaseFit:
@@ -60,7 +64,7 @@ def fit_creases(steps: int) -> CreaseFit:
         spp=SPP,
         callbacks=[lambda fit: sharpness.append(fit.sharpness)],
     ).run(steps)
-    return CreaseFit(target, start, fit.cage, edges, truth, np.array(sharpness), fit.losses)
+    return CreaseFit(target, start, fit.cage, edges, truth, np.array(sharpness))
 
 
 def tagged(factors: tuple[float, float, float], sharpness: NDArray[np.float64]) -> ControlCage:

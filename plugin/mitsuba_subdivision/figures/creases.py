@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..variants import SceneNode
-from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
-from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .figure_scenes import edge_rods, load_stage, make_mesh, paint, render_panels, staged
+from .output import FigureError, FigureOptions, panels, rows_of, scene_path, write_pixels, write_plot
 from .own_cage import fitted, read
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 TITLES = {
-    "smooth": ("smooth", "tags ignored"),
-    "own": ("semi-sharp", "the cage's own tags"),
-    "infinite": ("infinitely sharp", "every crease"),
+    "smooth": "smooth\ntags ignored",
+    "own": "semi-sharp\nthe cage's own tags",
+    "infinite": "infinitely sharp\nevery crease",
 }
-CAGE_TITLE = ("control cage", "")
+CAGE_TITLE = "control cage"
 # Height of the images, in widths.
 HEIGHT = 1.55
 RATE = 24
@@ -46,8 +44,7 @@ def draw(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
     cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
     if options.cage:
-        box = cage.positions.min(axis=0), cage.positions.max(axis=0)
-        cage = fitted(read(options.cage), *box)
+        cage = fitted(read(options.cage), cage.positions.min(axis=0), cage.positions.max(axis=0))
         if not cage.tags.edges.any():
             raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
     stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
@@ -56,15 +53,10 @@ def draw(options: FigureOptions) -> list[Path]:
         shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": RATE}
         scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
     figure, axes = panels(options, *rows_of(options, len(scenes)))
-    rendered = []
-    for ((headline, caption), scene), axis in zip(scenes.items(), axes.flat, strict=True):
-        options.report(f"{headline}, {caption}" if caption else headline)
-        rendered.append(render(scene, options, headline)[..., :3])
-        show(axis, in_8_bits(rendered[-1]), headline, caption)
+    pixels = render_panels(options, axes, scenes.items())
     _draw_legend(axes[0, 0], cage)
-    written = write_plot(options, "creases", figure)
-    metadata = {"pictures": [CAGE_TITLE[0], *TITLES], "spp": options.spp}
-    return written + write_pixels(options, "creases", np.concatenate(rendered, axis=1), metadata)
+    metadata = {"pictures": [CAGE_TITLE, *TITLES], "spp": options.spp}
+    return write_plot(options, "creases", figure) + write_pixels(options, "creases", pixels, metadata)
 
 
 def _tagged(cage: ControlCage, name: str) -> ControlCage:
@@ -83,18 +75,11 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
     # Each triangle has three vertices of its own, so that no normals are averaged.
     positions = cage.positions[np.array(fans).ravel()]
     shapes: SceneNode = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
-    topology, sharpness = cage.topology, cage.tags.edges
-    # The sharpest edge comes last: a vertex keeps the joint of that edge.
-    for half_edge in sorted(topology.edge_half_edge, key=lambda half_edge: sharpness[half_edge]):
-        ends = topology.face_vertices[[half_edge, topology.next[half_edge]]]
-        p0, p1 = cage.positions[ends].tolist()
-        colour, radius = EDGES[max(least for least in EDGES if least <= sharpness[half_edge])]
-        rod = {"radius": radius, "bsdf": paint(colour)}
-        shapes[f"edge{half_edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
-        shapes |= {
-            f"joint{end}": {"type": "sphere", "center": at, **rod} for end, at in zip(ends, (p0, p1), strict=True)
-        }
-    return shapes
+    topology, half_edges = cage.topology, cage.topology.edge_half_edge
+    ends = np.stack([topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]], axis=1)
+    sharpness = cage.tags.edges[half_edges]
+    looks = [EDGES[max(least for least in EDGES if least <= value)] for value in sharpness]
+    return shapes | edge_rods(cage, ends, sharpness, looks)
 
 
 def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
@@ -111,8 +96,6 @@ def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
 
 def _draw_legend(axis: Axes, cage: ControlCage) -> None:
     """Draw the colours of sharpness below the cage."""
-    from matplotlib.lines import Line2D
-
     shown = labels(cage.tags.edges)
     handles = [Line2D([], [], color=EDGES[least][0], linewidth=2, label=label) for least, label in shown.items()]
     handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import SymLogNorm
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from ..cage.named_cages import extraordinary
 from ..schemes import scheme_named
-from ..surface import LimitSurface, SurfaceSamples
+from ..surface import LimitSurface
 from .characteristic import patch_of_valence
+from .figure_scenes import grid_points
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_plot
 from .own_cage import around_vertices, frame
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 VALENCES = (3, 5, 8)
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
@@ -34,18 +35,6 @@ LEVELS = np.arange(0, 41)
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
 
 
-@dataclass(frozen=True, eq=False)
-class CurvatureMap:
-    """Curvature around vertex 0 of a bent ball."""
-
-    # (valence, s, s): positions in the tangent plane of a grid in each element
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    # (valence, s, s): mean curvature is positive where the surface bends inward, as on a ball
-    gaussian: NDArray[np.float64]
-    mean: NDArray[np.float64]
-
-
 def bent_ball(valence: int) -> LimitSurface:
     """The surface of the figure. Vertex 0 has the valence, and elements 0 to ``valence - 1`` lie around it."""
     cage = extraordinary(valence)
@@ -59,45 +48,36 @@ def growth(valence: int) -> float:
     return float(patch.basis.moduli[3] / patch.basis.subdominant**2)
 
 
-def curvature_map(surface: LimitSurface, valence: int, count: int) -> CurvatureMap:
-    """Sample the elements at the vertex, more densely towards it."""
-    at = surface.evaluate(0, np.zeros((1, 2)))
+def curvature_map(surface: LimitSurface, valence: int, count: int) -> NDArray[np.floating]:
+    """Sample the elements around vertex 0, more densely towards it.
+
+    Returns x and y in the tangent plane, Gaussian and mean curvature, of a grid in each element, (4, valence, n, n);
+    mean curvature is positive where the surface bends inward, as on a ball.
+    """
     # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
-    along = np.concatenate([[0], np.geomspace(1e-3, 1, count)])
-    u, v = np.meshgrid(along, along)
-    u[0, 0] = v[0, 0] = 1e-4
-    uv = np.stack([u.ravel(), v.ravel()], axis=1)
-    found = [surface.evaluate(element, uv, derivatives=2) for element in range(valence)]
-    grid = (valence, *u.shape)
-    points = np.concatenate([f.p for f in found]) - at.p[0]
-    gaussian, mean = (np.concatenate(values) for values in zip(*map(_curvatures, found), strict=True))
-    return CurvatureMap(
-        points[:, 0].reshape(grid), points[:, 1].reshape(grid), gaussian.reshape(grid), -mean.reshape(grid)
-    )
+    uv = grid_points(np.concatenate([[0], np.geomspace(1e-3, 1, count)]))
+    uv[0] = 1e-4
+    points, gaussian, mean = _curvatures(surface, uv, valence)
+    x, y, _ = (points - surface.evaluate(0, [[0, 0]]).p[0]).T
+    return np.stack([x, y, gaussian, -mean]).reshape(4, valence, count + 1, count + 1)
 
 
-def _curvatures(samples: SurfaceSamples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gaussian and mean curvature of samples with second derivatives."""
-    if samples.gaussian_curvature is None or samples.mean_curvature is None:
-        raise ValueError("samples without second derivatives have no curvature; expected derivatives=2")
-    return samples.gaussian_curvature.astype(np.float64), samples.mean_curvature.astype(np.float64)
+def _curvatures(surface: LimitSurface, uv: NDArray[np.float64], valence: int) -> tuple[NDArray[np.floating], ...]:
+    """Points, Gaussian and mean curvature at parameters in each of the first elements."""
+    found = surface.evaluate(np.arange(valence)[:, None], uv, derivatives=2)
+    return found.p, np.asarray(found.gaussian_curvature), np.asarray(found.mean_curvature)
 
 
 def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]:
     """Largest absolute principal curvature of a few samples on each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
-    largest = np.zeros(len(LEVELS))
-    for element in range(valence):
-        gaussian, mean = _curvatures(surface.evaluate(element, uv, derivatives=2))
-        principal = np.abs(mean) + np.sqrt(np.maximum(mean**2 - gaussian, 0))
-        largest = np.maximum(largest, principal.reshape(len(LEVELS), -1).max(axis=1))
-    return largest
+    _, gaussian, mean = _curvatures(surface, uv, valence)
+    principal = np.abs(mean) + np.sqrt(np.maximum(mean**2 - gaussian, 0))
+    return np.asarray(principal.reshape(valence, len(LEVELS), -1).max(axis=(0, 2)))
 
 
 def draw(options: FigureOptions) -> list[Path]:
     """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level."""
-    from matplotlib.colors import SymLogNorm
-
     surfaces = {valence: bent_ball(valence) for valence in VALENCES}
     if options.cage:
         cages = around_vertices(options.cage, len(VALENCES), frame(bent_ball(5)))
@@ -108,17 +88,14 @@ def draw(options: FigureOptions) -> list[Path]:
         found, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
         measured = largest_by_level(surface, valence)
         options.report(f"valence {valence}: {rate:.4f} per level; largest at level {LEVELS[-1]} {measured[-1]:.3g}")
-        for axis, values in zip(column, (found.gaussian, found.mean), strict=False):
-            shown = _draw_disc(axis, found, values, norm)
+        for axis, values in zip(column, found[2:], strict=False):
+            shown = _draw_disc(axis, zip(*found[:2], values, strict=True), norm)
         plot = column[-1]
         plot.semilogy(LEVELS, measured, "o", markersize=2, color=SERIES[1][0], label="surface")
-        line = measured[-1] * rate ** (LEVELS - LEVELS[-1])
-        plot.semilogy(LEVELS, line, color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")
+        plot.semilogy(LEVELS, measured[-1] * rate ** (LEVELS - LEVELS[-1]), color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")
         column[0].set_title(f"valence {valence}")
-        plot.set_xlabel(f"level $n$\n|λ₄|/λ₂² = {rate:.3f}")
+        plot.set(xlabel=f"level $n$\n|λ₄|/λ₂² = {rate:.3f}", ylim=(0.3, 1e6), box_aspect=0.75)
         plot.grid()
-        plot.set_ylim(0.3, 1e6)
-        plot.set_box_aspect(0.75)
         label_powers(plot.yaxis)
     for axis, name in zip(axes[:, 0], ("Gaussian", "mean"), strict=False):
         axis.set_ylabel(name)
@@ -132,22 +109,17 @@ def draw(options: FigureOptions) -> list[Path]:
     return write_plot(options, "curvature", figure)
 
 
-def _draw_disc(axis: Axes, found: CurvatureMap, values: NDArray[np.float64], norm: Any) -> Any:
-    """Draw values of the curvature in a disc around the vertex; returns the last part drawn, for the colour bar."""
-    from matplotlib.patches import Circle
-
+def _draw_disc(axis: Axes, grids: Iterable[tuple[NDArray[np.floating], ...]], norm: Any) -> Any:
+    """Draw values at x and y in a disc around the vertex; returns the last grid drawn, for the colour bar."""
     disc = Circle((0, 0), RADIUS, facecolor="none", edgecolor="black", linewidth=0.5)
     axis.add_patch(disc)
-    for x, y, value in zip(found.x, found.y, values, strict=True):
+    for x, y, value in grids:
         shown = axis.pcolormesh(x, y, value, norm=norm, cmap="RdBu_r", shading="gouraud", rasterized=True)
         shown.set_clip_path(disc)
         (edge,) = axis.plot(x[0], y[0], color="black", linewidth=0.3, alpha=0.6)
         edge.set_clip_path(disc)
         # In grey, both ends of the colours are dark: lines of negative curvature are dashed.
-        lines = axis.contour(x, y, value, levels=NEGATIVE, colors="black", linewidths=0.4)
-        lines.set_clip_path(disc)
-    axis.set_aspect("equal")
-    axis.set_xlim(-1.02 * RADIUS, 1.02 * RADIUS)
-    axis.set_ylim(-1.02 * RADIUS, 1.02 * RADIUS)
+        axis.contour(x, y, value, levels=NEGATIVE, colors="black", linewidths=0.4).set_clip_path(disc)
+    axis.set(aspect="equal", xlim=(-1.02 * RADIUS, 1.02 * RADIUS), ylim=(-1.02 * RADIUS, 1.02 * RADIUS))
     hide_frame(axis)
     return shown

@@ -97,9 +97,7 @@ def with_lines(shape: mi.Shape) -> mi.Mesh:
     """A mesh of the shape's triangles, each with its own texture coordinates, for a texture that draws their edges."""
     parameters = mi.traverse(shape)
     faces = np.array(parameters["faces"])
-    corners = {
-        name: np.array(parameters[name]).reshape(-1, 3)[faces] for name in ("vertex_positions", "vertex_normals")
-    }
+    corners = {key: np.array(parameters[key]).reshape(-1, 3)[faces] for key in ("vertex_positions", "vertex_normals")}
     buffers = {**corners, "vertex_texcoords": np.tile([[0, 0], [1, 0], [0, 1]], (len(faces) // 3, 1))}
     triangles = np.arange(len(faces)).reshape(-1, 3)
     return mitsuba_mesh("triangles", triangles, buffers, bsdf=mi.load_dict(glazed(_lines())))
@@ -111,5 +109,4 @@ def _lines() -> SceneNode:
     distance = np.minimum(np.minimum(u, v), 1 - u - v)
     part = np.clip(1.5 - distance / LINE, 0, 1)[..., None]
     colours = part * np.array(LINES) + (1 - part) * np.array(GLAZE)
-    data = upload(mi.TensorXf, colours)
-    return {"type": "bitmap", "data": data, "raw": True, "wrap_mode": "clamp"}
+    return {"type": "bitmap", "data": upload(mi.TensorXf, colours), "raw": True, "wrap_mode": "clamp"}

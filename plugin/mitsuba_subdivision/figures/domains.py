@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib
 import numpy as np
+from matplotlib.colors import ListedColormap
 from numpy.typing import NDArray
 
 from ..schemes import scheme_named
@@ -29,9 +31,6 @@ def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.fl
 
 def draw(options: FigureOptions) -> list[Path]:
     """Draw the domains of the regular children at each level, and their images under the characteristic map."""
-    import matplotlib
-    from matplotlib.colors import ListedColormap
-
     scheme = scheme_named(options.scheme)
     patch = patch_of_valence(scheme, VALENCE)
     characteristic = CharacteristicMap(patch, VALENCE)
@@ -53,8 +52,7 @@ def draw(options: FigureOptions) -> list[Path]:
             bent = characteristic(outline(corners))
             for sector in range(VALENCE):
                 round_.fill(*characteristic.sector(bent, sector).T, **style)
-    innermost = sub_domain(scheme.domain, LEVELS - 1, 0)
-    flat.fill(*innermost.T, facecolor="#d9d9d9", edgecolor="#2d3a45", linewidth=0.2)
+    flat.fill(*sub_domain(scheme.domain, LEVELS - 1, 0).T, facecolor="#d9d9d9", edgecolor="#2d3a45", linewidth=0.2)
     for axis in (flat, round_):
         axis.set_aspect("equal")
         hide_frame(axis)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from ..cage import ControlCage
 from ..mitsuba_mesh import mitsuba_mesh
-from ..progress import timed
 from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded
 from ..variants import SceneNode
@@ -65,9 +66,7 @@ def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.flo
     Every part has a seed of its own, so that the same options give the same image.
     """
     width, height = scene.sensors()[0].film().crop_size()
-    parts = _parts(options.spp, PART_SAMPLES // (int(width) * int(height)))
-    with timed(name) as at:
-        return render_parts(scene, parts, on_part=lambda index: at(f"part {index + 1} of {len(parts)}"))
+    return render_parts(scene, _parts(options.spp, PART_SAMPLES // (int(width) * int(height))), what=name)
 
 
 def _parts(spp: int, most: int) -> list[int]:
@@ -108,8 +107,7 @@ def draw_picture(
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Put linear RGBA pixels, premultiplied by alpha as Mitsuba makes them, on white: 8-bit sRGB."""
-    covered = np.clip(pixels[..., 3:], 0, 1)
-    return in_8_bits(pixels[..., :3] + (1 - covered))
+    return in_8_bits(pixels[..., :3] + (1 - np.clip(pixels[..., 3:], 0, 1)))
 
 
 def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -119,10 +117,27 @@ def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def paint(colour: str | tuple[float, float, float]) -> SceneNode:
     """Diffuse material of an sRGB colour."""
-    from matplotlib.colors import to_rgb
-
     linear = decoded(np.array(to_rgb(colour)))
     return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
+
+
+def edge_rods(
+    cage: ControlCage,
+    edges: NDArray[np.integer],  # (n, 2) int: ends
+    sharpness: NDArray[np.floating],  # (n,)
+    looks: Sequence[tuple[str | tuple[float, float, float], float]],  # (n): colour in sRGB and radius
+) -> SceneNode:
+    """Rods along edges of a cage, with joints at their ends."""
+    shapes: SceneNode = {}
+    # The sharpest edge comes last: a vertex keeps the joint of that edge.
+    for edge in np.argsort(sharpness, kind="stable"):
+        colour, radius = looks[edge]
+        rod = {"radius": radius, "bsdf": paint(colour)}
+        p0, p1 = cage.positions[edges[edge]].tolist()
+        shapes[f"edge{edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
+        for end, at in zip(edges[edge], (p0, p1), strict=True):
+            shapes[f"joint{end}"] = {"type": "sphere", "center": at, **rod}
+    return shapes
 
 
 def split_quads(quads: NDArray[np.integer]) -> NDArray[np.integer]:
@@ -130,28 +145,42 @@ def split_quads(quads: NDArray[np.integer]) -> NDArray[np.integer]:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
-def grid_triangles(segments: int) -> NDArray[np.integer]:
-    """Triangles of a square grid of ``segments + 1`` points in each row and column, numbered row by row."""
-    corner = np.arange((segments + 1) ** 2).reshape(segments + 1, segments + 1)
-    quads = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], axis=-1)
-    return split_quads(quads.reshape(-1, 4))
+def grid_points(along: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Points ``(n^2, 2)`` of a square grid with these coordinates, row by row."""
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+
+
+def grid_triangles(segments: int, count: int) -> NDArray[np.integer]:
+    """Triangles of some square grids of ``segments + 1`` points in each row and column, numbered row by row."""
+    corner = np.arange(count * (segments + 1) ** 2).reshape(count, segments + 1, segments + 1)
+    quads = [corner[:, :-1, :-1], corner[:, :-1, 1:], corner[:, 1:, 1:], corner[:, 1:, :-1]]
+    return np.concatenate([split_quads(quad.reshape(-1, 4)) for quad in np.stack(quads, axis=-1)])
+
+
+def render_panels(
+    options: FigureOptions,
+    axes: Any,
+    # By titles of the panels; a second line of a title stands below the panel
+    scenes: Iterable[tuple[str, mi.Scene]],
+) -> NDArray[np.float32]:
+    """Render a scene in each panel; returns the pictures side by side."""
+    rendered = []
+    for (title, scene), axis in zip(scenes, axes.flat, strict=True):
+        name, _, caption = title.partition("\n")
+        options.report(title.replace("\n", ", "))
+        rendered.append(render(scene, options, name)[..., :3])
+        show(axis, in_8_bits(rendered[-1]), name, caption)
+    return np.concatenate(rendered, axis=1)
 
 
 def draw_row(
     options: FigureOptions,
     name: str,  # Of the scene and of the figure
-    # By the title of each panel, the parameters of the scene; a second line of the title stands below the panel
-    cases: Mapping[str, Mapping[str, Any]],
+    cases: Mapping[str, Mapping[str, Any]],  # Parameters of the scene, by titles as in `render_panels`
     metadata: dict[str, Any],  # For the figure's pixels, besides the samples
 ) -> list[Path]:
     """Render a scene once for each panel."""
     figure, axes = panels(options, 1, len(cases))
-    rendered = []
-    for (title, parameters), axis in zip(cases.items(), axes.flat, strict=True):
-        name_of_part, _, caption = title.partition("\n")
-        options.report(title.replace("\n", ", "))
-        scene = load_stage(name, **parameters, resolution=options.resolution)
-        rendered.append(render(scene, options, name_of_part)[..., :3])
-        show(axis, in_8_bits(rendered[-1]), name_of_part, caption)
-    pixels = np.concatenate(rendered, axis=1)
+    scenes = ((title, load_stage(name, **case, resolution=options.resolution)) for title, case in cases.items())
+    pixels = render_panels(options, axes, scenes)
     return write_plot(options, name, figure) + write_pixels(options, name, pixels, {**metadata, "spp": options.spp})

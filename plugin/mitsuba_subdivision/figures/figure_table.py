@@ -13,12 +13,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from .output import COLUMN, PAGE, FigureOptions
+from .output import COLUMN, PAGE, FigureError, FigureOptions
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure; call it with `FigureOptions` to draw it, and get the files written."""
+    """A figure; call it with `FigureOptions` to draw it, and get the files written.
+
+    A call raises FigureError if matplotlib is not installed; the message names the extra that brings it.
+    """
 
     module: str  # Module of this package that draws the figure. It imports Mitsuba, so it is imported only then.
     shows: str  # What the figure shows, for the help
@@ -32,6 +35,10 @@ class Figure:
         return FigureOptions.formats if "spp" in self.options else FigureOptions.formats[:-1]
 
     def __call__(self, options: FigureOptions) -> list[Path]:
+        try:
+            import matplotlib  # noqa: F401 - only to find out whether it is there
+        except ImportError as error:
+            raise FigureError("figures need matplotlib: pip install 'mitsuba-subdivision[figures]'") from error
         draw: Callable[[FigureOptions], list[Path]] = importlib.import_module(f".{self.module}", __package__).draw
         return draw(options)
 

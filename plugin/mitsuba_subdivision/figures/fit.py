@@ -6,23 +6,25 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
+from ..mesh.connectivity import IntArray
+from ..schemes.domain import FloatArray
 from ..variants import SceneNode
 from .ball_fits import GREY, VIEWS, Course, Measurement, fit_cage, fit_mesh, target, views_of
 from .crease_fit import FIRST, HIGHEST, CreaseFit, fit_creases
-from .figure_scenes import in_8_bits, load_stage, make_mesh, paint, render, staged
+from .figure_scenes import edge_rods, in_8_bits, load_stage, make_mesh, render, staged
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_pixels, write_plot
-from .projection import project
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from .projection import camera_matrix, project
 
 STEPS, CREASE_STEPS = 100, 100
 # When the cage is refined, and when it is shown on its way, as parts of the steps.
@@ -62,9 +64,8 @@ def draw(options: FigureOptions) -> list[Path]:
         shape = target()
         views = views_of(make_mesh(shape.positions, shape.triangles, GREY))
         measure = Measurement(shape, STEPS)
-        courses = {}
         options.report(f"{STEPS} steps with a cage of one size")
-        courses["cage"] = fit_cage([], views, STEPS, measure)
+        courses = {"cage": fit_cage([], views, STEPS, measure)}
         options.report(f"{STEPS} steps with a cage that is refined")
         courses["refined"] = fit_cage([round(REFINED * STEPS)], views, STEPS, measure)
         options.report(f"{STEPS} steps with a dense mesh")
@@ -103,15 +104,16 @@ def in_order() -> Iterator[None]:
 
 def ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
     """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
-    shown: list[Panel] = [
-        (f"target\nseen in\n{VIEWS} pictures", {"mesh": make_mesh(shape.positions, shape.triangles, CLAY)})
-    ]
-    cages = courses["refined"].cages
+    cages, mesh = courses["refined"].cages, courses["mesh"].cages[STEPS]
+    shown: list[Panel] = [(f"target\nseen in\n{VIEWS} pictures", _mesh(shape))]
     for step in (0, *(min(cages, key=lambda each: abs(each - part * STEPS)) for part in SHOWN), STEPS):
         name = "start" if step == 0 else "result" if step == STEPS else "on the way"
         shown.append((_title(name, step, cages[step]), with_cage(cages[step])))
-    mesh = courses["mesh"].cages[STEPS]
-    return [*shown, (_title("dense mesh", STEPS, mesh), {"mesh": make_mesh(mesh.positions, mesh.triangles, CLAY)})]
+    return [*shown, (_title("dense mesh", STEPS, mesh), _mesh(mesh))]
+
+
+def _mesh(cage: ControlCage) -> SceneNode:
+    return {"mesh": make_mesh(cage.positions, cage.triangles, CLAY)}
 
 
 def _title(name: str, step: int, cage: ControlCage) -> str:
@@ -120,55 +122,37 @@ def _title(name: str, step: int, cage: ControlCage) -> str:
 
 def with_cage(cage: ControlCage) -> SceneNode:
     """A limit surface, and the cage's edges as rods."""
-    surface = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE}
+    ends = cage.positions[cage.edges].tolist()
+    # A file of curves: both ends of each edge, and an empty line.
+    curves = ("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "edges.txt"
-        path.write_text(_rods(cage), encoding="ascii")
+        path.write_text("\n\n".join(curves), encoding="ascii")
         rods = mi.load_dict({"type": "linearcurve", "filename": str(path), "bsdf": RODS})
-    return {"surface": mi.load_dict({**surface, "bsdf": CLAY}), "rods": rods}
+    return {"surface": _surface(cage), "rods": rods}
 
 
-def _rods(cage: ControlCage) -> str:
-    """Text of a file of curves: both ends of each edge, and an empty line."""
-    ends = cage.positions[cage.edges].tolist()
-    return "\n\n".join("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
+def _surface(cage: ControlCage) -> mi.Shape:
+    return mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": CLAY})
 
 
 def box_panels(fit: CreaseFit) -> list[Panel]:
     """Panels of the last row: the target with its creases, the start, and the result."""
     shown: list[Panel] = []
-    for title, cage, sharpness in (
-        ("target\nthree kinds\nof creases", fit.target, fit.truth),
-        (f"start\nall creases\n{FIRST:g}", fit.start, fit.sharpness[0]),
-        (f"found\n{VIEWS * CREASE_STEPS:,} renders", fit.found, fit.sharpness[-1]),
-    ):
-        surface = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": CLAY}
-        rods = creases_as_rods(cage, fit.edges, sharpness)
-        shown.append((title, {"surface": mi.load_dict(surface), **rods}))
+    titles = "target\nthree kinds\nof creases", f"start\nall creases\n{FIRST:g}"
+    last = f"found\n{VIEWS * CREASE_STEPS:,} renders"
+    for title, (cage, sharpness) in zip((*titles, last), fit.shown(), strict=True):
+        # Rods are thicker, and of another colour, where creases are sharper.
+        looks = [(sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
+        shown.append((title, {"surface": _surface(cage), **edge_rods(cage, fit.edges, sharpness, looks)}))
     return shown
-
-
-def creases_as_rods(cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]) -> SceneNode:
-    """Rods along edges of a cage, thicker and of another colour where creases are sharper."""
-    shapes: SceneNode = {}
-    # The sharpest edge comes last: a vertex keeps the joint of that edge.
-    for edge in np.argsort(sharpness, kind="stable"):
-        value = float(sharpness[edge])
-        rod = {"radius": CREASE_RADIUS + CREASE_GROWTH * value, "bsdf": paint(sharpness_colour(value))}
-        p0, p1 = cage.positions[edges[edge]].tolist()
-        shapes[f"edge{edge}"] = {"type": "cylinder", "p0": p0, "p1": p1, **rod}
-        for end, at in zip(edges[edge], (p0, p1), strict=True):
-            shapes[f"joint{end}"] = {"type": "sphere", "center": at, **rod}
-    return shapes
 
 
 def sharpness_colour(sharpness: float) -> tuple[float, float, float]:
     """Colour in sRGB between those of `SHARPNESS_COLOURS`, for 0 to the highest sharpness."""
-    from matplotlib.colors import to_rgb
-
-    colours = np.array([to_rgb(colour) for colour in SHARPNESS_COLOURS])
-    at = sharpness / HIGHEST * (len(colours) - 1)
-    r, g, b = (float(np.interp(at, np.arange(len(colours)), channel)) for channel in colours.T)
+    channels = np.array([to_rgb(colour) for colour in SHARPNESS_COLOURS]).T
+    at = np.linspace(0, HIGHEST, len(SHARPNESS_COLOURS))
+    r, g, b = (float(np.interp(sharpness, at, channel)) for channel in channels)
     return r, g, b
 
 
@@ -188,32 +172,22 @@ def composed(
     *of_balls, losses, distances, sharpness = left
     for axis, (title, pixels) in zip((*of_balls, *of_box), (*balls, *boxes), strict=True):
         show(axis, in_8_bits(pixels), *title.split("\n", 1))
-    cages = creases.target, creases.start, creases.found
-    sharpnesses = creases.truth, creases.sharpness[0], creases.sharpness[-1]
-    for axis, cage, values in zip(of_box, cages, sharpnesses, strict=True):
+    for axis, (cage, values) in zip(of_box, creases.shown(), strict=True):
         _label(axis, sensor, cage, creases.edges, values)
-    _plot_losses(losses, courses)
-    _plot_distances(distances, courses)
+    _plot_courses(losses, distances, courses)
     _plot_sharpness(sharpness, creases)
     figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
     return figure
 
 
-def _plot_losses(axis: Axes, courses: Mapping[str, Course]) -> None:
-    for (colour, _), course in zip(SERIES, courses.values(), strict=True):
-        axis.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=colour)
-    _finish(axis, "loss (thousandths)")
-    _plain(axis)
-
-
-def _plot_distances(axis: Axes, courses: Mapping[str, Course]) -> None:
+def _plot_courses(losses: Axes, distances: Axes, courses: Mapping[str, Course]) -> None:
     for (colour, marker), (name, course) in zip(SERIES, courses.items(), strict=True):
-        steps = np.array(list(course.distances))
-        values = 100 * np.array(list(course.distances.values()))
+        losses.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=colour)
+        steps, values = np.array([*course.distances.items()])[1:].T
         label = f"{LABELS[name]}, {course.cages[STEPS].vertex_count:,} points"
-        axis.loglog(VIEWS * steps[1:], values[1:], marker=marker, color=colour, label=label)
-    _finish(axis, "distance (%)")
-    _plain(axis)
+        distances.loglog(VIEWS * steps, 100 * values, marker=marker, color=colour, label=label)
+    _finish(losses, "loss (thousandths)", is_logarithmic=True)
+    _finish(distances, "distance (%)", is_logarithmic=True)
 
 
 def _plot_sharpness(axis: Axes, fit: CreaseFit) -> None:
@@ -222,35 +196,25 @@ def _plot_sharpness(axis: Axes, fit: CreaseFit) -> None:
         axis.plot(renders, values, color=sharpness_colour(truth), linewidth=0.6)
     for truth in np.unique(fit.truth):
         axis.axhline(truth, color=sharpness_colour(truth), linestyle=(0, (5, 3)))
-    axis.set_xlim(0, renders[-1])
-    axis.set_ylim(0, HIGHEST)
+    axis.set(xlim=(0, renders[-1]), ylim=(0, HIGHEST))
     _finish(axis, "sharpness")
 
 
-def _finish(axis: Axes, quantity: str) -> None:
-    axis.set_title(quantity)
-    axis.set_xlabel("renders")
-    axis.set_box_aspect(1)
+def _finish(axis: Axes, quantity: str, *, is_logarithmic: bool = False) -> None:
+    """Label a plot; logarithmic axes by 1, 2 and 5, without powers."""
+    axis.set(title=quantity, xlabel="renders", box_aspect=1, axisbelow=True)
     axis.grid()
-    axis.set_axisbelow(True)
+    if is_logarithmic:
+        for each in (axis.xaxis, axis.yaxis):
+            each.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            each.set_major_formatter(StrMethodFormatter("{x:g}"))
+            each.set_minor_formatter(NullFormatter())
+        axis.set_xlim(VIEWS, VIEWS * STEPS)
 
 
-def _plain(axis: Axes) -> None:
-    """Label logarithmic axes by 1, 2 and 5, without powers."""
-    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
-
-    for each in (axis.xaxis, axis.yaxis):
-        each.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        each.set_major_formatter(StrMethodFormatter("{x:g}"))
-        each.set_minor_formatter(NullFormatter())
-    axis.set_xlim(VIEWS, VIEWS * STEPS)
-
-
-def _label(
-    axis: Axes, sensor: mi.Sensor, cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating]
-) -> None:
+def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, edges: IntArray, sharpness: FloatArray) -> None:
     """Write their sharpness on the edges that the camera sees."""
-    camera = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+    camera = camera_matrix(sensor)[:3, 3]
     width = int(sensor.film().crop_size()[0])
     box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
     for edge in np.flatnonzero(in_front(cage, edges, camera)):
@@ -258,7 +222,7 @@ def _label(
         axis.text(x, y, f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
 
 
-def in_front(cage: ControlCage, edges: NDArray[np.integer], camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+def in_front(cage: ControlCage, edges: IntArray, camera: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether one of an edge's two faces is turned to the camera."""
     faces = cage.face_vertices.reshape(-1, 4)
     a, b, c = (cage.positions[faces[:, corner]] for corner in range(3))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
@@ -16,12 +17,10 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
 from ..regression.probe import normal_angle
 from ..schemes import scheme_named
+from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_plot
 from .own_cage import around_vertices, frame
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 VALENCES = (3, 5)
 OFFSETS = (0, 1, 100)
@@ -60,17 +59,13 @@ def draw(options: FigureOptions) -> list[Path]:
 
 def _draw_panel(axis: Axes, cage: ControlCage) -> None:
     exact = exact_normals(cage)
-    for i, (evaluator, label) in enumerate(EQUATIONS.items()):
-        colour, marker = SERIES[i]
+    for i, ((evaluator, label), (colour, marker)) in enumerate(zip(EQUATIONS.items(), SERIES, strict=True)):
         for dtype, style in PRECISIONS.items():
             error = np.maximum(normal_errors(cage, exact, evaluator, dtype), 1e-15)
             marked = (MARKED * i // len(EQUATIONS), MARKED)
             look = {"color": colour, "marker": marker, "markevery": marked, "mfc": colour if style == "-" else "white"}
             axis.semilogy(LEVELS, error, style, **look, label=f"{label}, {dtype.__name__}")
-    axis.set_box_aspect(1)
-    axis.set_ylim(1e-15, 1e3)
-    axis.set_xlim(LEVELS[0], LEVELS[-1])
-    axis.set_yticks(10.0 ** np.arange(-15, 4, 6))
+    axis.set(box_aspect=1, xlim=(LEVELS[0], LEVELS[-1]), yticks=10.0 ** np.arange(-15, 4, 6), ylim=(1e-15, 1e3))
     label_powers(axis.yaxis)
     axis.grid()
 
@@ -87,9 +82,7 @@ def offset_cage(cage: ControlCage, offset: float) -> ControlCage:
     return cage.with_positions(moved.astype(np.float32).astype(np.float64))
 
 
-def normal_errors(
-    cage: ControlCage, exact: NDArray[np.float64], evaluator: Evaluator, dtype: Any
-) -> NDArray[np.float64]:
+def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dtype: Any) -> FloatArray:
     """Largest angle in degrees between computed and exact normal over the samples of each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     found = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
@@ -116,17 +109,15 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
 
     with mpmath.workdps(DIGITS):
         # Rows are made to sum to one exactly: otherwise, rounding of the entries would add up over the levels.
-        matrix, *children = (
-            _rows_to_one(mpmath.matrix(table.tolist())) for table in (structure.matrix, *structure.children)
-        )
+        tables = structure.matrix, *structure.children
+        matrix, *children = (_rows_to(1, mpmath.matrix(table.tolist())) for table in tables)
         points = mpmath.matrix(cage.positions[controls].tolist())
         tangents = []
         for direction in DIRECTIONS:
-            inside = [scheme.domain.inside(child(direction)) for child in scheme.domain.children[1:]]
-            child = int(np.argmax(inside))
-            local = scheme.domain.children[child + 1](direction)[None]
-            basis = mpmath.matrix(scheme.regular_basis(local, 1)[1:, 0].tolist())
-            tangents.append(_rows_to_zero(_rows_to_zero(basis) * children[child]))
+            in_children = [child(direction) for child in scheme.domain.children[1:]]
+            child = int(np.argmax([scheme.domain.inside(local) for local in in_children]))
+            basis = mpmath.matrix(scheme.regular_basis(in_children[child][None], 1)[1:, 0].tolist())
+            tangents.append(_rows_to(0, _rows_to(0, basis) * children[child]))
         normals = []
         for _ in LEVELS:
             normals += [_unit_normal(each * points, mpmath) for each in tangents]
@@ -134,17 +125,10 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
     return np.array(normals, dtype=np.float64)
 
 
-def _rows_to_one(matrix: Any) -> Any:
-    """Correct the first entry of each row of an mpmath matrix, so that the row sums to one exactly."""
+def _rows_to(total: int, matrix: Any) -> Any:
+    """Correct the first entry of each row of an mpmath matrix, so that the row sums to a number exactly."""
     for i in range(matrix.rows):
-        matrix[i, 0] += 1 - sum(matrix[i, :])
-    return matrix
-
-
-def _rows_to_zero(matrix: Any) -> Any:
-    """Correct the first entry of each row of an mpmath matrix, so that the row sums to zero exactly."""
-    for i in range(matrix.rows):
-        matrix[i, 0] -= sum(matrix[i, :])
+        matrix[i, 0] += total - sum(matrix[i, :])
     return matrix
 
 

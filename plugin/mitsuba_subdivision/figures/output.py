@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,10 +58,6 @@ class FigureError(RuntimeError):
     """A figure cannot be drawn: something it needs is missing."""
 
 
-def _to_terminal(line: str) -> None:
-    sys.stderr.write(f"{line}\n")
-
-
 @dataclass(frozen=True)
 class FigureOptions:
     """Options of a figure."""
@@ -75,7 +71,8 @@ class FigureOptions:
     scheme: str = "catmull_clark"  # Subdivision scheme, for the figures that show one scheme of several
     # File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one
     cage: Path | None = None
-    report: Callable[[str], None] = field(default=_to_terminal)  # Is called with a line of text for each step
+    # Is called with a line of text for each step
+    report: Callable[[str], Any] = lambda line: sys.stderr.write(f"{line}\n")
 
     def paths(self, name: str, *formats: str) -> list[Path]:
         """Files to write, in the requested formats."""
@@ -92,13 +89,10 @@ def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tupl
     """Make axes in rows and columns over the width of the figure; their heights follow when it is written.
 
     More options are for `matplotlib.pyplot.subplots`.
-
-    Raises FigureError if matplotlib is not installed; the message names the extra that brings it.
     """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise FigureError("figures need matplotlib: pip install 'mitsuba-subdivision[figures]'") from error
+    # Not above, as the command line imports this module for every command.
+    import matplotlib
+
     matplotlib.use("Agg")
     # Fixed dates and identifiers in files, so that the same command twice gives the same file.
     os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
@@ -126,8 +120,7 @@ def write_plot(
     """Write a figure as PNG and as PDF, if these formats are wanted, and close it.
 
     The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
-
-    Returns list of Path: the files written, each of which appears whole or not at all.
+    Returns the files written, each of which appears whole or not at all.
     """
     from matplotlib.image import AxesImage
     from matplotlib.pyplot import close
@@ -154,7 +147,6 @@ def write_pixels(
     options: FigureOptions, name: str, pixels: NDArray[np.floating], metadata: dict[str, Any]
 ) -> list[Path]:
     """Write linear RGB pixels as OpenEXR, if that format is wanted; returns the file written, if any."""
-    # Imported here, as the command line imports this module for every command.
     from ..regression.image import write_exr
 
     paths = options.paths(name, "exr")
@@ -166,8 +158,7 @@ def write_pixels(
 def show(axis: Axes, pixels: NDArray[np.uint8], title: str = "", caption: str = "") -> None:
     """Draw a picture in a panel, with a title above and a caption below it."""
     axis.imshow(pixels, interpolation="lanczos")
-    axis.set_title(title)
-    axis.set_xlabel(caption)
+    axis.set(title=title, xlabel=caption)
     hide_frame(axis)
 
 
@@ -185,7 +176,5 @@ def label_powers(axis: Axis) -> None:
 
 def hide_frame(axis: Axes) -> None:
     """Draw no frame and no ticks around a panel; unlike `set_axis_off`, this keeps its labels."""
-    axis.set_xticks([])
-    axis.set_yticks([])
-    for spine in axis.spines.values():
-        spine.set_visible(False)
+    axis.set(xticks=[], yticks=[])
+    axis.spines[:].set_visible(False)

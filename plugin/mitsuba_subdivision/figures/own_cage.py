@@ -29,7 +29,6 @@ def around_vertices(
 
     Vertex 0 of each is extraordinary, the first faces lie around it, and each of them begins with it. The cage is
     moved, turned and scaled so that `frame` of the vertex becomes another one.
-
     Raises FigureError if the cage has no extraordinary vertex inside of its surface whose faces have no creases.
     """
     cage = read(path)
@@ -56,8 +55,8 @@ def frame(surface: LimitSurface, face: int = 0, corner: int = 0) -> tuple[NDArra
     samples = surface.evaluate(face, [[0.0, 0.0], [1.0, 0.0]], corner)
     normal, along = samples.n[0], samples.dp_du[0] - (samples.dp_du[0] @ samples.n[0]) * samples.n[0]
     along = along / np.linalg.norm(along)
-    length = np.linalg.norm(samples.p[1] - samples.p[0])
-    return samples.p[0], np.stack([along, np.cross(normal, along), normal], axis=1), np.asarray(length)
+    length = np.asarray(np.linalg.norm(samples.p[1] - samples.p[0]))
+    return samples.p[0], np.stack([along, np.cross(normal, along), normal], axis=1), length
 
 
 def fitted(cage: ControlCage, low: NDArray[np.floating], high: NDArray[np.floating]) -> ControlCage:
@@ -80,8 +79,7 @@ def _isolated_fans(cage: ControlCage) -> dict[int, NDArray[np.integer]]:
     if (cage.face_sizes != 4).any():
         return {}
     is_tagged = np.zeros(cage.vertex_count, dtype=bool)
-    for vertices in (contents.creases[:, :2], contents.corners[:, 0]):
-        is_tagged[vertices.astype(int).ravel()] = True
+    is_tagged[[*contents.creases[:, :2].astype(int).ravel(), *contents.corners[:, 0].astype(int)]] = True
     is_irregular = (topology.vertex_face_count != 4) | topology.is_border_vertex | is_tagged
     is_apart = is_irregular[topology.face_vertices.reshape(-1, 4)].sum(axis=1) == 1
     offsets, half_edges = topology.vertex_fans

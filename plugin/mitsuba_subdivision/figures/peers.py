@@ -29,16 +29,17 @@ BLENDER_SCRIPT = Path(__file__).with_name("blender_script.py")
 def osd_peer() -> Path | None:
     """The program `osd_peer`: in the folder that `VARIABLE` names, on the path, or as the tests compiled it last."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
-    return _program("osd_peer", os.environ.get(VARIABLE), os.environ.get("PATH"), str(cache))
+    return _program("osd_peer", str(cache))
 
 
 def blender() -> Path | None:
     """The program `blender`: in the folder that `VARIABLE` names, or on the path."""
-    return _program("blender", os.environ.get(VARIABLE), os.environ.get("PATH"))
+    return _program("blender")
 
 
-def _program(name: str, *folders: str | None) -> Path | None:
-    found = shutil.which(name, path=os.pathsep.join(filter(None, folders)))
+def _program(name: str, *more: str) -> Path | None:
+    folders = filter(None, (os.environ.get(VARIABLE), os.environ.get("PATH"), *more))
+    found = shutil.which(name, path=os.pathsep.join(folders))
     return Path(found) if found else None
 
 
@@ -55,15 +56,12 @@ def osd_samples(
     """Evaluate OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
 
     Raises FigureError if the program fails.
-
     Returns points, normals, (s, 3): unit normals, not a number where derivatives are parallel or vanish.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
-    records: dict[str, NDArray] = {
+    records = {
         "widths": np.array([3, 0], dtype=np.int32),
-        "values": cage.positions,
-        "sizes": cage.face_sizes.astype(np.int32),
-        "corners": cage.face_vertices.astype(np.int32),
+        **_records_of(cage),
         "face": element.astype(np.int32),
         "sub": np.zeros(element.size, dtype=np.int32),
         "uv": np.stack([u, v], axis=-1).astype(np.float64),
@@ -73,6 +71,11 @@ def osd_samples(
     cross = np.cross(along_u, along_v)
     with np.errstate(invalid="ignore"):
         return points, cross / np.linalg.norm(cross, axis=1, keepdims=True)
+
+
+def _records_of(cage: ControlCage) -> dict[str, NDArray]:
+    sizes, corners = cage.face_sizes.astype(np.int32), cage.face_vertices.astype(np.int32)
+    return {"values": cage.positions, "sizes": sizes, "corners": corners}
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +95,10 @@ def blender_mesh(
     level: int,  # Edges of quads become `2 ** level` segments
 ) -> BlenderMesh:
     """Subdivide a cage in Blender, by default options but for the level. Raises FigureError if Blender fails."""
-    records: dict[str, NDArray] = {
-        "values": cage.positions,
-        "sizes": cage.face_sizes.astype(np.int32),
-        "corners": cage.face_vertices.astype(np.int32),
-    }
     # Several threads race for the last bits of points that faces share.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]
-    found = _answers(program, options, records, [str(level)])
+    found = _answers(program, options, _records_of(cage), [str(level)])
     version = ".".join(map(str, found["version"][:2]))
     points, normals = (found[name].reshape(-1, 3) for name in ("p", "n"))
     return BlenderMesh(points, normals, found["corners"].reshape(-1, 4), version)

@@ -23,36 +23,33 @@ def project(sensor: mi.Sensor, points: NDArray[np.floating], resolution: int) ->
     return (1 - camera[..., :2] / half_width) / 2 * resolution
 
 
-def visible(scene: mi.Scene, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Whether nothing of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
     sensor = scene.sensors()[0]
-    to_world = _matrix(sensor)
-    towards = -to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
-    distance = np.linalg.norm(to_world[:3, 2]) * _in_camera(sensor, points)[:, 2:]
-    start = points + LIFT * distance * towards
+    backward = -camera_matrix(sensor)[:3, 2]
+    start = points + LIFT * _in_camera(sensor, points)[:, 2:] * backward
+    towards = mi.Vector3f(*(backward / np.linalg.norm(backward)).tolist())
     if "scalar" in str(mi.variant()):
-        return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), mi.Vector3f(towards))) for p in start], dtype=bool)
-    directions = np.broadcast_to(towards, start.shape)
-    rays = mi.Ray3f(upload(mi.Point3f, start), upload(mi.Vector3f, directions))
-    return ~np.array(scene.ray_test(rays))
+        return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), towards)) for p in start], dtype=bool)
+    return ~np.array(scene.ray_test(mi.Ray3f(upload(mi.Point3f, start), towards)))
 
 
-def visible_runs(scene: mi.Scene, lines: NDArray[np.float64], resolution: int) -> list[NDArray[np.float64]]:
+def visible_runs(scene: mi.Scene, lines: NDArray[np.floating], resolution: int) -> list[NDArray[np.float64]]:
     """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
     positions = project(scene.sensors()[0], lines, resolution)
     runs = []
     for line, shown in zip(positions, seen, strict=True):
-        for run in np.split(np.arange(len(line)), 1 + np.flatnonzero(np.diff(shown))):
-            if shown[run[0]] and len(run) > 1:
-                runs.append(line[run])
-    return runs
+        changes = 1 + np.flatnonzero(np.diff(shown))
+        runs += np.split(line, changes)[0 if shown[0] else 1 :: 2]
+    return [run for run in runs if len(run) > 1]
 
 
-def _matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
+def camera_matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
+    """Transform ``(4, 4)`` from the camera to the world."""
     return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
 
 
 def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    to_camera = np.linalg.inv(_matrix(sensor))
+    to_camera = np.linalg.inv(camera_matrix(sensor))
     return points @ to_camera[:3, :3].T + to_camera[:3, 3]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import Topology
@@ -50,15 +51,9 @@ class RefinementStep:
         # Refined points without such a stencil belong to neighbouring patches.
         distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
         needed = (distance < 10.0**-DECIMALS).any(axis=1)
-        edges = _edges(refinement.topology)
-        old = characteristic.control_points
-        return cls(
-            characteristic,
-            old,
-            stencils @ old,
-            old[_edges(ring)],
-            refinement.apply(old)[edges[needed[edges].all(axis=1)]],
-        )
+        edges, old = _edges(refinement.topology), characteristic.control_points
+        new_edges = refinement.apply(old)[edges[needed[edges].all(axis=1)]]
+        return cls(characteristic, old, stencils @ old, old[_edges(ring)], new_edges)
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -67,8 +62,6 @@ def draw(options: FigureOptions) -> list[Path]:
     The points lie where the characteristic map puts them. The refined points come from the evaluator's subdivision
     matrices.
     """
-    from matplotlib.collections import LineCollection
-
     step = RefinementStep.at_valence(VALENCE)
     domain = step.characteristic.patch.scheme.domain
     options.report(f"valence {VALENCE}: {len(step.old)} control points, {len(step.new)} after one refinement")
@@ -89,10 +82,8 @@ def draw(options: FigureOptions) -> list[Path]:
         after.text(*child.mean(axis=0), rf"$\Omega_{k}$", **label)
     after.add_collection(LineCollection(list(step.new_edges), colors=NEW_EDGE, linewidths=0.5, zorder=3))
     after.plot(*step.new.T, "o", mfc="white", mec="black", mew=0.6, markersize=3, zorder=5)
-    before.set_title(f"a patch of valence {VALENCE}")
-    after.set_title("one refinement")
-    before.set_xlabel(f"$K$ = {len(step.old)} control points")
-    after.set_xlabel(f"$M$ = {len(step.new)} new control points")
+    before.set(title=f"a patch of valence {VALENCE}", xlabel=f"$K$ = {len(step.old)} control points")
+    after.set(title="one refinement", xlabel=f"$M$ = {len(step.new)} new control points")
     return write_plot(options, "refinement", figure)
 
 

@@ -13,8 +13,6 @@ TITLES = {"vertex": "normals of vertices", "exact": "exact at every hit"}
 
 def draw(options: FigureOptions) -> list[Path]:
     """Render one scene by both kinds of shading, side by side."""
-    panels = {
-        f"{TITLES[shading]}\n{rate} segments per edge": {"shading": shading, "rate": rate} for shading, rate in PANELS
-    }
+    panels = {f"{TITLES[kind]}\n{rate} segments per edge": {"shading": kind, "rate": rate} for kind, rate in PANELS}
     metadata = {"shading": [shading for shading, _ in PANELS], "rate": [rate for _, rate in PANELS]}
     return draw_row(options, "shading", panels, metadata)

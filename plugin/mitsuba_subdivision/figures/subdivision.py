@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
@@ -17,9 +18,6 @@ from .figure_scenes import load_stage, make_mesh, on_white, render, staged
 from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
 from .own_cage import in_ball, read
 from .projection import project, visible, visible_runs
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 LEVELS = 4
 # Of the ball that fills the picture, for cages of users.
@@ -48,23 +46,28 @@ def draw(options: FigureOptions) -> list[Path]:
         axis.set_axis_off()
     axes, rendered = axes.flat[: LEVELS + 1], []
     for level, (cage, axis) in enumerate(zip(cages, axes, strict=False)):
-        surface = LimitSurface(cage)
-        regular = regular_elements(surface)
-        share = area_share(surface, regular)
+        limit = LimitSurface(cage)
+        regular = regular_elements(limit)
+        share = area_share(limit, regular)
         options.report(f"level {level}: {cage.face_count} faces, {100 * share:.1f} % of the area regular")
         pixels, scene = _render_cage(stage, cage, regular, options, f"level {level}")
-        lines, points = _edges(cage, EDGE_SEGMENTS >> level), _extraordinary_points(cage)
+        t = cage.topology
+        ends = cage.positions[t.face_vertices[[t.edge_half_edge, t.next[t.edge_half_edge]]]]
+        along = np.linspace(0, 1, (EDGE_SEGMENTS >> level) + 1)[None, :, None]
+        lines = (1 - along) * ends[0][:, None] + along * ends[1][:, None]
+        points = np.concatenate([cage.positions[_is_extraordinary(t)], _centres(cage)[t.face_sizes != 4]])
         _draw(axis, scene, pixels, lines, points, 0.55 - 0.12 * level, options.resolution)
-        axis.set_title(f"level {level}")
-        axis.set_xlabel(f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
+        axis.set(title=f"level {level}", xlabel=f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
         rendered.append(pixels)
     options.report("limit surface")
-    limit = LimitSurface(cages[-1])
-    pixels, scene = _render_limit(stage, limit, options)
-    lines, points = _isolines(limit, EDGE_SEGMENTS >> (LEVELS - 1)), _limit_points(limit)
+    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
+    shape = {"type": "subdivision", **limit.cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": bsdf}
+    scene = staged(stage, surface=mi.load_dict(shape))
+    pixels = render(scene, options, "limit surface")
+    lines = edge_curves(limit, t.edge_half_edge, EDGE_SEGMENTS >> (LEVELS - 1))
+    points = edge_curves(limit, t.vertex_half_edge[_is_extraordinary(t)], 1)[:, 0]
     _draw(axes[-1], scene, pixels, lines, points, 0.17, options.resolution)
-    axes[-1].set_title("limit surface")
-    axes[-1].set_xlabel(f"regular but for {counts.pop()} points")
+    axes[-1].set(title="limit surface", xlabel=f"regular but for {counts.pop()} points")
     rendered.append(pixels)
     written = write_plot(options, "subdivision", figure)
     metadata = {"levels": LEVELS, "spp": options.spp}
@@ -89,7 +92,7 @@ def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
 def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
     """Share of the chosen elements in the area of the limit surface."""
     found = surface.tessellate(RATE)
-    a, b, c = (found.positions[found.triangles[:, i]] for i in range(3))
+    a, b, c = found.positions[found.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return float(area[elements[found.element]].sum() / area.sum())
 
@@ -100,10 +103,8 @@ def _render_cage(
     """Render the cage as a polyhedron with flat faces; returns the pixels and the scene."""
     t = cage.topology
     # Every face becomes a fan of triangles around its centre. Its vertices are its own, and have its normal.
-    corners = cage.positions[t.face_vertices]
-    centres = np.add.reduceat(corners, t.face_offsets[:-1]) / t.face_sizes[:, None]
-    ends = cage.positions[t.face_vertices[t.next]]
-    cross = np.cross(corners - centres[t.face], ends - centres[t.face])
+    corners, centres = cage.positions[t.face_vertices], _centres(cage)
+    cross = np.cross(corners - centres[t.face], corners[t.next] - centres[t.face])
     normals = np.add.reduceat(cross, t.face_offsets[:-1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     half_edges = np.arange(t.half_edge_count)
@@ -118,31 +119,22 @@ def _render_cage(
     return render(scene, options, name), scene
 
 
-def _render_limit(
-    stage: mi.Scene, surface: LimitSurface, options: FigureOptions
-) -> tuple[NDArray[np.float32], mi.Scene]:
-    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
-    shape = {"type": "subdivision", **surface.cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": bsdf}
-    scene = staged(stage, surface=mi.load_dict(shape))
-    return render(scene, options, "limit surface"), scene
-
-
-def _edges(cage: ControlCage, segments: int) -> NDArray[np.float64]:
-    """Points along the straight edges of a cage: ``(n_e, segments + 1, 3)``."""
+def _centres(cage: ControlCage) -> NDArray[np.float64]:
     t = cage.topology
-    begin, end = t.face_vertices[t.edge_half_edge], t.face_vertices[t.next[t.edge_half_edge]]
-    along = np.linspace(0, 1, segments + 1)[None, :, None]
-    return (1 - along) * cage.positions[begin, None] + along * cage.positions[end, None]
+    return np.add.reduceat(cage.positions[t.face_vertices], t.face_offsets[:-1]) / t.face_sizes[:, None]
 
 
-def _isolines(surface: LimitSurface, segments: int) -> NDArray[np.float64]:
-    """The edges on the limit surface, where they are lines of constant u or v: ``(n_e, segments + 1, 3)``."""
-    t = surface.cage.topology
+def edge_curves(
+    surface: LimitSurface,
+    half_edges: NDArray[np.integer],  # (n,): of `patches.elements`; curves begin at their first ends
+    segments: int,
+) -> NDArray[np.floating]:
+    """Points ``(n, segments + 1, 3)`` along edges on the limit surface, or halves of edges."""
+    elements = surface.patches.elements
     along = np.stack([np.linspace(0, 1, segments + 1), np.zeros(segments + 1)], axis=1)
-    face = np.repeat(t.face[t.edge_half_edge], segments + 1)
-    corner = np.repeat(t.edge_half_edge, segments + 1) - t.face_offsets[face]
-    found = surface.evaluate(face, np.tile(along, (t.edge_count, 1)), corner)
-    return found.p.reshape(-1, segments + 1, 3).astype(np.float64, copy=False)
+    element = elements.face[half_edges]
+    corner = half_edges - elements.face_offsets[element]
+    return surface.evaluate(element[:, None], along, corner[:, None]).p.reshape(-1, segments + 1, 3)
 
 
 def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
@@ -150,37 +142,20 @@ def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
     return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
 
 
-def _extraordinary_points(cage: ControlCage) -> NDArray[np.float64]:
-    t = cage.topology
-    centres = np.add.reduceat(cage.positions[t.face_vertices], t.face_offsets[:-1]) / t.face_sizes[:, None]
-    return np.concatenate([cage.positions[_is_extraordinary(t)], centres[t.face_sizes != 4]])
-
-
-def _limit_points(surface: LimitSurface) -> NDArray[np.float64]:
-    t = surface.cage.topology
-    half_edge = t.vertex_half_edge[_is_extraordinary(t)]
-    face = t.face[half_edge]
-    found = surface.evaluate(face, np.zeros((len(face), 2)), half_edge - t.face_offsets[face])
-    return found.p.astype(np.float64, copy=False)
-
-
 def _draw(
     axis: Axes,
     scene: mi.Scene,
     pixels: NDArray[np.float32],
-    lines: NDArray[np.float64],
-    points: NDArray[np.float64],
+    lines: NDArray[np.floating],
+    points: NDArray[np.floating],
     width: float,
     resolution: int,
 ) -> None:
     """Draw a rendered image, and the lines and points on its surface that the camera sees."""
-    from matplotlib.collections import LineCollection
-
     show(axis, on_white(pixels))
     runs = visible_runs(scene, lines, resolution)
     axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
     seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
     axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
     # The part of the square image that the surface fills.
-    axis.set_xlim(0, resolution)
-    axis.set_ylim(0.84 * resolution, 0.13 * resolution)
+    axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))

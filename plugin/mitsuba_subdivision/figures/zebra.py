@@ -6,10 +6,12 @@ The others are a refined mesh, and OpenSubdiv and Blender where their programs a
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
@@ -17,14 +19,11 @@ from ..cage.named_cages import cube
 from ..regression.probe import normal_angle
 from ..regression.scene import render_pixels
 from ..surface import LimitSurface
-from .figure_scenes import grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
+from .figure_scenes import grid_points, grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
 from .own_cage import around_vertices, frame
 from .peers import blender, blender_mesh, osd_peer, osd_samples
-from .projection import project
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from .projection import camera_matrix, project
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3
@@ -72,12 +71,8 @@ def draw(options: FigureOptions) -> list[Path]:
         pixels[name] = render(scene, options, f"reflection lines: {name}")
         normals[name] = _pixel_normals(scene)
     # All surfaces get the same rays. The median leaves out a ray that slips between two triangles.
-    angles = {
-        name: np.median(np.nan_to_num(normal_angle(normals["exact"], normals[name])), axis=0)
-        for name in shapes
-        if name != "exact"
-    }
-    largest = max(float(angle.max()) for angle in angles.values())
+    exact = normals.pop("exact")
+    angles = {name: np.median(np.nan_to_num(normal_angle(exact, n)), axis=0) for name, n in normals.items()}
     for name, angle in angles.items():
         options.report(f"{' '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
     tip = surface.evaluate(at[0], np.zeros((1, 2)), at[1]).p
@@ -85,13 +80,13 @@ def draw(options: FigureOptions) -> list[Path]:
     figure, axes = panels(options, 2, len(shapes))
     for axis, name in zip(axes[0], shapes, strict=True):
         _draw_bands(axis, pixels[name], pixels["exact"], *titles[name])
-    shown = _draw_angles(axes[1, 1:], angles, largest)
+    shown = _draw_angles(axes[1, 1:], angles)
     _draw_overview(axes[1, 0], options, shapes["exact"])
     figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22, label="degrees")
     corner = project(stage.sensors()[0], tip, options.resolution)[0]
     for axis in (*axes[0], *axes[1, 1:]):
-        axis.plot(*corner, "o", markersize=5, markerfacecolor="none", markeredgecolor="white", markeredgewidth=2)
-        axis.plot(*corner, "o", markersize=5, markerfacecolor="none", markeredgecolor=RING, markeredgewidth=1)
+        for colour, line in (("white", 2), (RING, 1)):
+            axis.plot(*corner, "o", markersize=5, mfc="none", mec=colour, mew=line)
     written = write_plot(options, "zebra", figure)
     strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
     metadata = {"pictures": titles, "level": LEVEL, "rate": 2**level, "stripes": STRIPES, "spp": options.spp}
@@ -101,8 +96,12 @@ def draw(options: FigureOptions) -> list[Path]:
 def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
     """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
     properties = {**cage.as_properties(mi), "tessellation_rate": 2**level}
-    exact = mi.load_dict({"type": "subdivision", **properties, "bsdf": MIRROR})
-    shapes = {"exact": exact, "mesh": _refined_mesh(cage)}
+    exact, refined = mi.load_dict({"type": "subdivision", **properties, "bsdf": MIRROR}), cage
+    for _ in range(LEVEL):
+        refined = refined.refined()
+    quads = refined.face_vertices.reshape(-1, 4)[~refined.is_hole]
+    # Mitsuba averages its normals at the vertices.
+    shapes = {"exact": exact, "mesh": make_mesh(refined.positions, split_quads(quads), MIRROR)}
     averaged = f"level {LEVEL},\naveraged normals"
     titles = {"exact": ("This package", "exact\nnormals"), "mesh": ("Refined mesh", averaged)}
     if program := osd_peer():
@@ -124,10 +123,11 @@ def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float
     show(axis, marked.round().astype(np.uint8), title, f"{caption}\n{share}")
 
 
-def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]], largest: float) -> Any:
+def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]]) -> Any:
     """Draw maps of angles in degrees, in one scale of colours; returns the last."""
+    largest = max(angle.max() for angle in angles.values()) or 1
     for axis, angle in zip(axes, angles.values(), strict=True):
-        shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest or 1, interpolation="nearest")
+        shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest, interpolation="nearest")
         axis.set_xlabel(f"up to {angle.max():.1f}°")
         hide_frame(axis)
     return shown
@@ -135,42 +135,29 @@ def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]], largest: flo
 
 def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
     """Draw the whole surface, with a frame where the close-up is."""
-    from matplotlib.patches import Rectangle
-
     stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
     scene = staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
     caption = "around the vertex" if options.cage else "whole surface"
     show(axis, on_white(render(scene, options, "whole surface")), caption=caption)
-    half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * options.resolution / 2
     middle = options.resolution / 2
+    half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * middle
     corner = (middle - half, middle - half)
     axis.add_patch(Rectangle(corner, 2 * half, 2 * half, facecolor="none", edgecolor=RING, linewidth=1))
 
 
-def _refined_mesh(cage: ControlCage) -> mi.Mesh:
-    """The cage refined `LEVEL` times, as triangles; Mitsuba averages their normals at the vertices."""
-    for _ in range(LEVEL):
-        cage = cage.refined()
-    return make_mesh(cage.positions, split_quads(cage.face_vertices.reshape(-1, 4)[~cage.is_hole]), MIRROR)
-
-
 def _opensubdiv_mesh(program: Path, cage: ControlCage, rate: int) -> mi.Mesh:
     """OpenSubdiv's points and normals, on a grid as fine as that of the exact surface, for each face alone."""
-    u, v = np.meshgrid(np.linspace(0, 1, rate + 1), np.linspace(0, 1, rate + 1))
-    uv, shown = np.stack([u.ravel(), v.ravel()], axis=1), np.flatnonzero(~cage.is_hole)
-    element, parameters = np.repeat(shown, len(uv)), np.tile(uv, (len(shown), 1))
-    points, normals = osd_samples(program, cage, element, parameters, "bfr", OPENSUBDIV_LEVEL)
-    first = (len(uv) * np.arange(len(shown)))[:, None, None]
-    return make_mesh(points, (grid_triangles(rate) + first).reshape(-1, 3), MIRROR, normals=normals)
+    uv, shown = grid_points(np.linspace(0, 1, rate + 1)), np.flatnonzero(~cage.is_hole)
+    points, normals = osd_samples(program, cage, shown[:, None], uv, "bfr", OPENSUBDIV_LEVEL)
+    return make_mesh(points, grid_triangles(rate, len(shown)), MIRROR, normals=normals)
 
 
 def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:
     """Environment of dark and light bands, at right angles to an axis parallel to the image plane."""
     height = (np.arange(STRIPE_PIXELS) + 0.5) / STRIPE_PIXELS
-    lit = np.floor(height * count) % 2 == 0
-    bands = np.where(lit[:, None, None], LIGHT, DARK) * np.ones((1, 4, 3))
+    bands = np.where(np.floor(height * count) % 2 == 0, LIGHT, DARK)[:, None, None] * np.ones((1, 4, 3))
     # The poles of an environment map lie on its y axis.
-    x, y, z = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, :3].T
+    x, y, z = camera_matrix(sensor)[:3, :3].T
     cos, sin = np.cos(np.radians(AXIS_ANGLE)), np.sin(np.radians(AXIS_ANGLE))
     turn = np.eye(4)
     turn[:3, :3] = np.stack([sin * x - cos * y, cos * x + sin * y, z], axis=1)

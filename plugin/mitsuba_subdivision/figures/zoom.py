@@ -8,10 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -20,20 +25,20 @@ from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
 from ..regression.probe import normal_angle
 from ..schemes import scheme_named
+from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
-from .figure_scenes import grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
+from .figure_scenes import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
 from .normal_error import EQUATIONS, offset_cage
 from .output import FigureError, FigureOptions, label_powers, panels, scientific, write_pixels, write_plot
+from .own_cage import frame
 from .peers import osd_peer, osd_samples
 from .projection import project
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 VALENCE = 5
 OFFSET = 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
+Method = Evaluator | Literal["opensubdiv"]
 EVALUATORS: tuple[Evaluator, Evaluator] = ("stam", "stabilized")
 # The deepest level at which OpenSubdiv's patch tables can isolate extraordinary vertices.
 OPENSUBDIV: Literal["opensubdiv"] = "opensubdiv"
@@ -47,7 +52,7 @@ HALF_WIDTH = 0.19
 BAR = 0.1
 # Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
-COLOURS = "YlOrRd"
+COLOURS, ERROR_SCALE = "YlOrRd", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
 LINE_POINTS = 33
 
 
@@ -62,11 +67,7 @@ class TangentView:
     @classmethod
     def of(cls, cage: ControlCage) -> TangentView:
         surface = LimitSurface(cage)
-        at = surface.evaluate(0, np.zeros((1, 2)))
-        normal = at.n[0]
-        along = at.dp_du[0] - (at.dp_du[0] @ normal) * normal
-        along /= np.linalg.norm(along)
-        return cls(surface, at.p[0], np.stack([along, np.cross(normal, along), normal], axis=1))
+        return cls(surface, *frame(surface)[:2])
 
     def on_stage(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
         """Points on the stage, where the image reaches from -1 to 1."""
@@ -83,8 +84,6 @@ def draw(options: FigureOptions) -> list[Path]:
     from float64: this far from the origin, float32 cannot tell the points of the last panels apart. OpenSubdiv's
     normals come from its patch tables (Far), where its program is found.
     """
-    from matplotlib.cm import ScalarMappable
-
     view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
     stage = load_stage("zoom", resolution=options.resolution)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
@@ -93,7 +92,10 @@ def draw(options: FigureOptions) -> list[Path]:
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         extent = parameter_extent(magnification)
         samples = _sample(view, magnification, max(options.resolution // 2, 8))
-        nearest = _nearest(stage, samples, options.resolution)
+        # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
+        projected = project(stage.sensors()[0], samples.positions.reshape(-1, 3), options.resolution)
+        centres = grid_points(np.arange(options.resolution) + 0.5).reshape(options.resolution, -1, 2)
+        nearest = np.asarray(cKDTree(projected).query(centres)[1])
         lines = project(stage.sensors()[0], _level_lines(view, magnification), options.resolution)
         for evaluator, axis in zip(rows, column, strict=True):
             found = _magnified(stage, view, samples, evaluator)
@@ -108,7 +110,7 @@ def draw(options: FigureOptions) -> list[Path]:
         column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(extent)}")
     for axis, evaluator in zip(axes[:, 0], rows, strict=True):
         axis.set_ylabel(LABELS[evaluator])
-    scale = ScalarMappable(_error_scale(), COLOURS)
+    scale = ScalarMappable(ERROR_SCALE, COLOURS)
     bar = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
     bar.set_label("error of the normal in degrees; medians below panels")
     label_powers(bar.ax.yaxis)
@@ -129,60 +131,45 @@ class _Samples:
     """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage."""
 
     uv: NDArray[np.float64]  # (s, 2): parameters, the same in each element
-    triangles: NDArray[np.integer]  # (m, 3)
+    triangles: NDArray[np.integer]  # (m, 3): of all elements
     # (valence, s, 3)
     positions: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
 def _sample(view: TangentView, magnification: float, count: int) -> _Samples:
-    u, v = np.meshgrid(np.linspace(0, 1, count + 1), np.linspace(0, 1, count + 1))
+    uv = grid_points(np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
-    u[0, 0] = v[0, 0] = 0.1 / count
-    uv = np.stack([u.ravel(), v.ravel()], axis=1) * parameter_extent(magnification)
+    uv[0] = 0.1 / count
+    uv *= parameter_extent(magnification)
     exact = [view.surface.evaluate(element, uv) for element in range(VALENCE)]
     positions = np.stack([view.on_stage(found.p, magnification) for found in exact])
-    return _Samples(uv, grid_triangles(count), positions, np.stack([found.n for found in exact]))
-
-
-def _nearest(stage: mi.Scene, samples: _Samples, resolution: int) -> NDArray[np.int64]:
-    """Index of the sample, of all elements, that is nearest to the centre of each pixel: ``(height, width)``."""
-    projected = project(stage.sensors()[0], samples.positions.reshape(-1, 3), resolution)
-    centres = np.arange(resolution) + 0.5
-    return np.asarray(cKDTree(projected).query(np.stack(np.meshgrid(centres, centres), axis=-1))[1])
+    return _Samples(uv, grid_triangles(count, VALENCE), positions, np.stack([found.n for found in exact]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Magnified:
     """The magnified surface with normals by one method."""
 
-    scene: mi.Scene  # Scene of Mitsuba
+    scene: mi.Scene
     # (valence, s): angles between the normals and the exact normals of the samples, in degrees
     errors: NDArray[np.float64]
-    median: float  # Median of the errors inside the image
+    median: float  # Of the errors inside the image
 
 
-def _magnified(
-    stage: mi.Scene, view: TangentView, samples: _Samples, evaluator: Evaluator | Literal["opensubdiv"]
-) -> _Magnified:
+def _magnified(stage: mi.Scene, view: TangentView, samples: _Samples, evaluator: Method) -> _Magnified:
     found = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
     normals = np.nan_to_num(np.stack(found))
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
     angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
     inside = np.abs(samples.positions[..., :2]).max(axis=-1) < 1
-    first = (len(samples.uv) * np.arange(VALENCE))[:, None, None]
-    mesh = make_mesh(
-        samples.positions.reshape(-1, 3),
-        (samples.triangles + first).reshape(-1, 3),
-        {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}},
-        normals=(normals @ view.frame).reshape(-1, 3),
-    )
+    clay = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
+    positions, turned = (each.reshape(-1, 3) for each in (samples.positions, normals @ view.frame))
+    mesh = make_mesh(positions, samples.triangles, clay, normals=turned)
     return _Magnified(staged(stage, mesh=mesh), angle, float(np.median(angle[inside])))
 
 
-def _normals(
-    surface: LimitSurface, element: int, uv: NDArray[np.float64], evaluator: Evaluator | Literal["opensubdiv"]
-) -> NDArray[np.float64]:
+def _normals(surface: LimitSurface, element: int, uv: FloatArray, evaluator: Method) -> FloatArray:
     """Normals in float32 arithmetic, by one of our evaluators or by OpenSubdiv: ``(s, 3)``."""
     if evaluator == OPENSUBDIV:
         program = osd_peer()
@@ -195,47 +182,32 @@ def _normals(
 def _level_lines(view: TangentView, magnification: float) -> NDArray[np.float64]:
     """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
     along = np.linspace(0, 1, LINE_POINTS)
-    one, zero = np.ones_like(along), np.zeros_like(along)
+    line = np.stack([np.ones_like(along), along], axis=1)
+    extent = parameter_extent(magnification)
     # The lines u = 1/2^n and v = 1/2^n of every level n that the image resolves.
-    first = int(np.floor(-np.log2(parameter_extent(magnification)))) - 1
+    first = int(np.floor(-np.log2(extent))) - 1
     curves = []
     for level in range(max(first, 0), first + 7):
-        size = 2.0**-level
-        curves += [np.stack([one, along], axis=1) * size, np.stack([along, one], axis=1) * size]
-    curves.append(np.stack([along, zero], axis=1) * parameter_extent(magnification))
+        curves += [line * 2.0**-level, line[:, ::-1] * 2.0**-level]
+    curves.append(np.stack([along, np.zeros_like(along)], axis=1) * extent)
     uv = np.concatenate(curves)
     lines = [view.on_stage(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
     return np.concatenate(lines).reshape(-1, LINE_POINTS, 3)
 
 
-def _error_scale() -> Any:
-    from matplotlib.colors import LogNorm
-
-    return LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
-
-
-def _draw_halves(
-    axis: Axes, pixels: NDArray[np.float32], errors: NDArray[np.float64], lines: NDArray[np.float64]
-) -> None:
+def _draw_halves(axis: Axes, pixels: NDArray[np.float32], errors: FloatArray, lines: FloatArray) -> None:
     """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
-    from matplotlib.collections import LineCollection
-
     height, width = errors.shape
     axis.imshow(in_8_bits(pixels), interpolation="lanczos")
     right = (width // 2, width, height, 0)
-    axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=_error_scale(), interpolation="nearest", extent=right)
+    axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=ERROR_SCALE, interpolation="nearest", extent=right)
     axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.3, alpha=0.6))
     axis.axvline(width / 2, color="white")
-    axis.set_xlim(0, width)
-    axis.set_ylim(height, 0)
-    axis.set_xticks([])
-    axis.set_yticks([])
+    axis.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
 
 
 def _draw_bar(axis: Axes, magnification: float, resolution: int) -> None:
     """Draw a scale bar: a length on the surface, whose cage has the radius 1."""
-    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ignore[import-untyped]
-
     length = BAR / HALF_WIDTH / 2 * resolution
     bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
     bar.patch.set(alpha=0.85, linewidth=0)

@@ -1,4 +1,4 @@
-"""The table of file formats, and reading and writing of control cages by the suffix of the file.
+"""The table of file formats, and reading and writing of control cages and of triangles by the suffix of the file.
 
 A new format is one module with its functions, and one line in `FORMATS`.
 """
@@ -11,13 +11,13 @@ import os
 import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
-from ..cage.errors import CageError
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from ..cage.errors import CageError, warn
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Format:
     # the file's own, as `ControlCage.from_file` does.
     read: str
     write: str | None = None  # Takes `CageContents` and a path
-    write_triangles: str | None = None  # Has the parameters of `files.triangle_writer.write_triangles`
+    write_triangles: str | None = None  # Has the parameters of `write_triangles`, none with a default
     has_prims: bool = False  # Whether a file may hold several meshes, and values at several times
     refers_to_files: bool = False  # Whether what a file says may depend on other files
     # Axis, "y" or "z", that points up in the files that modelling programs write by default; None if files store it
@@ -70,6 +70,51 @@ def write_file(contents: CageContents, path: str | Path) -> None:
     """Write a file of any known format; see `ControlCage.save`."""
     writers = {suffix: each.write for suffix, each in FORMATS.items() if each.write is not None}
     function_named(writers[_known_suffix(path, list(writers))])(contents, path)
+
+
+def triangle_writers() -> dict[str, str]:
+    """Names of the functions that write triangles, by the suffixes of their formats."""
+    return {suffix: each.write_triangles for suffix, each in FORMATS.items() if each.write_triangles is not None}
+
+
+def require_triangle_format(path: str | Path) -> str:
+    """The suffix of a file of triangles. Raises ValueError if the format is unknown."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"path {path!r}; expected a str or Path")
+    suffix, known = Path(path).suffix.lower(), triangle_writers()
+    if suffix not in known:
+        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(known)}')
+    return suffix
+
+
+def write_triangles(
+    # `.obj`, with every digit; `.ply`, binary and in single precision; or `.usd`, `.usda` or `.usdc`, in single
+    # precision, as a mesh that is not to be subdivided
+    path: str | Path,
+    positions: NDArray,  # (n, 3) float32 or float64
+    normals: NDArray,  # The same
+    triangles: NDArray,  # (m, 3) int: 0-based rows of positions, normals, texture coordinates and attributes
+    texcoords: NDArray | None = None,  # (n, 2)
+    attributes: Mapping[str, NDArray] | None = None,  # (n, k) each
+) -> None:
+    """Write triangles on a limit surface and the data at their vertices. The file appears whole or not at all.
+
+    Raises ValueError if the format is unknown. Raises CageError if the package usd-core, which writes USD files, is
+    missing. Raises OSError if the file cannot be written. Warns if the format cannot hold an attribute, or its name.
+    """
+    write = function_named(triangle_writers()[require_triangle_format(path)])
+    write(path, positions, normals, triangles, texcoords, attributes or {})
+
+
+def warn_of_losses(
+    path: str | Path,
+    parts: Mapping[str, bool],  # Names of parts, and whether each is lost
+) -> None:
+    """Warn of the parts of a cage that a file of this format cannot hold."""
+    lost = [name for name, is_lost in parts.items() if is_lost]
+    if lost:
+        suffix = os.path.splitext(path)[1]
+        warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')
 
 
 def function_named(name: str) -> Callable[..., Any]:

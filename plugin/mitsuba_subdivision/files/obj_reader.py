@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,6 @@ from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .obj_text import SPACE, Arguments, ObjText, parsed, require_text, run_starts
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _SLASH = ord("/")
 # Patterns for messages; compiled when there is an error.
@@ -46,8 +44,7 @@ def read_obj(path: str | Path) -> CageContents:
     there are no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture
     coordinates.
     """
-    with open(path, "rb") as file:
-        content = file.read()
+    content = Path(path).read_bytes()
     require_text(f'"{path}"', content)
     obj = ObjText.split(f'"{path}"', content)
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
@@ -86,7 +83,7 @@ def _read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
     for statement in statements[~is_taken]:
         start = bounds[statement]
         arguments = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
-        parse_tag(tags, obj.name, obj.line(start), arguments)
+        parse_tag(tags, obj.name, int(obj.lines(start)), arguments)
     return tags.as_contents(), tags.lines
 
 
@@ -187,7 +184,7 @@ def _texcoords(
     indices = corners.checked(corners.texcoords, is_texcoord, "texture coordinate", "texture coordinates", has)
     if not has.all():
         face = np.repeat(np.arange(len(corners.sizes)), corners.sizes)[~has]
-        first = obj.line(int(obj.statement_start[corners.is_face][face[0]]))
+        first = obj.lines(obj.statement_start[corners.is_face][face[0]])
         warn(
             f"{obj.name}: {len(np.unique(face))} of {len(corners.sizes)} faces have corners without texture "
             f"coordinates, the first in line {first}; the cage is read without any (expected them at all corners)"

@@ -89,7 +89,7 @@ class ObjText:
         heads = tuple(np.frombuffer(text, np.uint8)[place:].take(statement_start) for place in range(3))
         return cls(name, text, line_end, statement_start, argument_count, heads, not content.endswith(b"\n"))
 
-    def lines(self, positions: IntArray) -> IntArray:
+    def lines(self, positions: IntArray | int) -> IntArray:
         """1-based line of each byte position."""
         return np.searchsorted(self.line_end, positions) + 1
 
@@ -99,10 +99,6 @@ class ObjText:
             # There is one in every line.
             return np.arange(1, len(self.line_end) + 1)
         return self.lines(self.statement_start)
-
-    def line(self, position: int) -> int:
-        """1-based line of one byte position."""
-        return int(np.searchsorted(self.line_end, position)) + 1
 
     def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
         """Which statements have this keyword of one or two letters."""
@@ -149,7 +145,7 @@ class ObjText:
         """An error that names the line of a byte position."""
         cut = " (the file ends here without a newline: is it cut short?)"
         is_last = self.is_cut and position >= self.statement_start[-1]
-        return CageError(f"{self.name}, line {self.line(position)}: {message}{cut if is_last else ''}")
+        return CageError(f"{self.name}, line {self.lines(position)}: {message}{cut if is_last else ''}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..whole_file import whole_file
-from .losses import warn_of_losses
+from .formats import warn_of_losses
 from .obj_tags import rules_without_tag, tag_statements
 
 # Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
@@ -55,7 +55,7 @@ def write_obj_triangles(
     texcoords: NDArray | None,
     attributes: Mapping[str, NDArray],
 ) -> None:
-    """Write triangles to an OBJ file; see `triangle_writer.write_triangles`.
+    """Write triangles to an OBJ file; see `formats.write_triangles`.
 
     Numbers have all digits that distinguish numbers of their type, float32 or float64.
     """

@@ -14,7 +14,7 @@ from ..cage.contents import CageContents
 from ..cage.rules import RULES
 from ..mesh import ragged
 from ..whole_file import whole_file
-from .losses import warn_of_losses
+from .formats import warn_of_losses
 from .ply_reader import MATERIAL, NORMAL, POSITION, TEXCOORDS, columns, is_possible
 
 _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}
@@ -76,7 +76,7 @@ def write_ply_triangles(
     texcoords: NDArray | None,
     attributes: Mapping[str, NDArray],
 ) -> None:
-    """Write triangles to a PLY file in single precision; see `triangle_writer.write_triangles`."""
+    """Write triangles to a PLY file in single precision; see `formats.write_triangles`."""
     possible = {name: value for name, value in attributes.items() if is_possible(name)}
     warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
     properties = dict(zip((*POSITION, *NORMAL), [*positions.T, *normals.T], strict=True))

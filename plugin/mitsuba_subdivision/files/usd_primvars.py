@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute, Interpolation
+from ..cage.attributes import Attribute
 from ..cage.errors import CageError, shortened
 from ..cage.source import CageSource
 from ..cage.validation import require_range
@@ -158,32 +158,22 @@ def _read(
         if len(faces) != len(sizes):
             raise CageError(f"{where} has {len(faces)} values or indices; expected {len(sizes)}, one per face")
         attribute = Attribute(values, "face_varying", np.repeat(faces, sizes))
-    else:
-        interpolation = INTERPOLATIONS[primvar.GetInterpolation()]
-        if indices is None and interpolation == "face_varying":
+    elif INTERPOLATIONS[primvar.GetInterpolation()] == "face_varying":
+        if indices is None:
             corners = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr())
             values, indices = with_shared_values(values, *(reader.array(each, np.int64) for each in corners))
-        attribute = _attribute(values, interpolation, indices, order, where)
-    if topology is None:
-        return attribute
-    return attribute.validated(primvar.GetPrimvarName(), topology, CageSource(reader.location), width)
-
-
-def _attribute(
-    values: NDArray[np.float64],
-    interpolation: Interpolation,
-    indices: IntArray | None,
-    order: IntArray | None,
-    where: str,
-) -> Attribute:
-    if interpolation != "face_varying":
+        if order is not None:
+            indices = np.arange(len(values)) if indices is None else indices
+            if len(indices) != len(order):
+                found = f"{where} has {len(indices)} values or indices"
+                raise CageError(f"{found}; expected {len(order)}, one per face corner")
+            indices = indices[order]
+        attribute = Attribute(values, "face_varying", indices)
+    else:
         if indices is not None:
             require_range(indices, len(values), f"{where} has")
             values = values[indices]
-        return Attribute(values, interpolation)
-    if order is not None:
-        indices = np.arange(len(values)) if indices is None else indices
-        if len(indices) != len(order):
-            raise CageError(f"{where} has {len(indices)} values or indices; expected {len(order)}, one per face corner")
-        indices = indices[order]
-    return Attribute(values, interpolation, indices)
+        attribute = Attribute(values, INTERPOLATIONS[primvar.GetInterpolation()])
+    if topology is None:
+        return attribute
+    return attribute.validated(primvar.GetPrimvarName(), topology, CageSource(reader.location), width)

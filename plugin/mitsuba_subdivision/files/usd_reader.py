@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 Read = TypeVar("Read")
 
-_NO_FACES: IntArray = np.zeros(0, np.int64)
-
 
 def read_usd(
     path: str | Path,
@@ -63,17 +61,19 @@ def read_usd(
     with Path(path).open("rb"):
         pass  # So that a missing file is an OSError, as for other formats.
     require_usd(name)
-    rules = rules or {}
+    from pxr import Usd
+
+    rules, code = rules or {}, Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
     with usd_errors_at(name), usd_messages_of(name):
         stage = open_stage(path, name)
-        meshes = chosen_meshes(stage, prim, name, time, rules.get("scheme"))
+        meshes = chosen_meshes(stage, prim, name, code, rules.get("scheme"))
         locations = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
-        skinning = Skinning(time, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))
+        skinning = Skinning(code, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))
     found = []
     for mesh, location in zip(meshes, locations, strict=True):
         # When the cage is validated, numbers that are not finite become errors that name their location.
         with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-            found.append(MeshReader(mesh, location, time, skinning, rules).contents())
+            found.append(MeshReader(mesh, location, skinning, rules).contents())
     return joined(found, name)
 
 
@@ -84,22 +84,14 @@ class MeshReader:
         self,
         mesh: UsdGeom.Mesh,
         location: str,  # Beginning of messages
-        # As for `read_usd`
-        time: float | None,
-        skinning: Skinning,  # Of the stage, at the time
-        rules: Mapping[str, str] | None = None,
+        skinning: Skinning,  # Of the stage, at the time at which the mesh is read
+        rules: Mapping[str, str] | None = None,  # As for `read_usd`
         # Gets messages about attributes that do not fit the mesh, which are then left out, and their paths.
         # By default, these are errors.
         report: Callable[[str, object], None] | None = None,
     ) -> None:
-        from pxr import Usd
-
-        self.mesh = mesh
-        self.location = location
-        self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
-        self.skinning = skinning
-        self.rules = rules or {}
-        self._report = report
+        self.mesh, self.location, self.skinning = mesh, location, skinning
+        self.rules, self._report = rules or {}, report
 
     def contents(
         self,
@@ -140,8 +132,9 @@ class MeshReader:
         corners = self.fitting(
             mesh.GetCornerIndicesAttr(), "the corners are left out", lambda: self.corners(len(points)), np.zeros((0, 2))
         )
+        no_faces: IntArray = np.zeros(0, np.int64)
         holes = self.fitting(
-            mesh.GetHoleIndicesAttr(), "the holes are left out", lambda: self.holes(topology), _NO_FACES
+            mesh.GetHoleIndicesAttr(), "the holes are left out", lambda: self.holes(topology), no_faces
         )
         rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
         texcoords, attributes = read_primvars(self, mesh, order, topology, choice)
@@ -198,15 +191,15 @@ class MeshReader:
 
         if self.first_time is not None and attribute.GetNumTimeSamples():
             return Usd.TimeCode(self.first_time)
-        return time_of(attribute, self._code)
+        return time_of(attribute, self.skinning.time)
 
     @cached_property
     def first_time(self) -> float | None:
         """First time at which the mesh has points and faces; None if it has them anyway, or a time is given."""
-        mesh = self.mesh
+        mesh, code = self.mesh, self.skinning.time
         # Points come last, as they take longest to read.
         needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
-        if not self._code.IsEarliestTime() or all(_size(value_at(each, self._code)) for each in needed):
+        if not code.IsEarliestTime() or all(_size(value_at(each, code)) for each in needed):
             return None
         times = sorted({time for each in needed for time in each.GetTimeSamples()})
         return next((time for time in times if all(_size(each.Get(time)) for each in needed)), None)
@@ -291,7 +284,7 @@ class MeshReader:
         is_start[np.cumsum(lengths) - 1] = False
         start = np.flatnonzero(is_start)
         rows = np.stack([indices[start], indices[start + 1], sharpness], axis=1)
-        return self._own_rows(rows, vertex_count, "crease", mesh.GetCreaseIndicesAttr().GetPath())
+        return self._own_rows(rows, vertex_count, "crease")
 
     def corners(self, vertex_count: int) -> NDArray[np.float64]:
         """Rows (vertex, sharpness)."""
@@ -303,10 +296,9 @@ class MeshReader:
             found = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
             raise self.error(found, "as many")
         require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
-        path = self.mesh.GetCornerIndicesAttr().GetPath()
-        return self._own_rows(np.stack([indices, sharpness], axis=1), vertex_count, "corner", path)
+        return self._own_rows(np.stack([indices, sharpness], axis=1), vertex_count, "corner")
 
-    def _own_rows(self, rows: NDArray[np.float64], vertex_count: int, noun: str, path: object) -> NDArray[np.float64]:
+    def _own_rows(self, rows: NDArray[np.float64], vertex_count: int, noun: str) -> NDArray[np.float64]:
         """Rows of creases or corners that name vertices of the mesh; among other meshes, others would be theirs."""
         vertices = rows[:, :-1]
         is_own = ((vertices >= 0) & (vertices < vertex_count)).all(axis=1)
@@ -314,6 +306,7 @@ class MeshReader:
             numbers = ", ".join(f"{vertex:.0f}" for vertex in vertices[row])
             such = number_of_such(int((~is_own).sum()), noun)
             expected = f"expected vertices from 0 to {vertex_count - 1}"
+            path = self.mesh.GetPrim().GetAttribute(f"{noun}Indices").GetPath()
             self.tell(f"{self.location}: {noun} at ({numbers}) is ignored; {expected} ({such})", path)
         return rows[is_own]
 

@@ -19,15 +19,14 @@ class Skinning:
 
     def __init__(
         self,
-        time: float | None,  # Time code; by default, the first one of each value
+        time: Usd.TimeCode,
         report: Callable[[str, object], None],  # Gets what is ignored, and the path of the mesh
     ) -> None:
-        from pxr import Usd, UsdGeom, UsdSkel
+        from pxr import UsdGeom, UsdSkel
 
-        self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
-        self._report = report
+        self.time, self._report = time, report
         self._cache, self._roots = UsdSkel.Cache(), set[str]()
-        self._transforms = UsdGeom.XformCache(self._code)
+        self._transforms = UsdGeom.XformCache(time)
 
     def points(self, mesh: UsdGeom.Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points ``(n, 3)`` after blend shapes and joints, in the mesh's space; float32 where anything moves them."""
@@ -100,7 +99,7 @@ class Skinning:
         prim, mapper = query.GetPrim(), query.GetBlendShapeMapper()
         skeleton = self._skeleton(prim)
         animation = skeleton.GetAnimQuery() if skeleton else None
-        weights = animation.ComputeBlendShapeWeights(self._code) if animation else None
+        weights = animation.ComputeBlendShapeWeights(self.time) if animation else None
         if not weights or mapper is None:
             return points
         shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
@@ -117,11 +116,11 @@ class Skinning:
 
         prim = query.GetPrim()
         skeleton = self._skeleton(prim)
-        joints = skeleton.ComputeSkinningTransforms(self._code) if skeleton else None
+        joints = skeleton.ComputeSkinningTransforms(self.time) if skeleton else None
         placed = np.array(self._transforms.GetLocalToWorldTransform(prim))
         moved = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
         is_placed = np.isfinite(placed).all() and np.linalg.det(placed[:3, :3]) != 0
-        if not joints or not is_placed or not query.ComputeSkinnedPoints(joints, moved, self._code):
+        if not joints or not is_placed or not query.ComputeSkinnedPoints(joints, moved, self.time):
             self._report("joints that do not match their mesh are ignored", prim.GetPath())
             return points
         # USD skins in the skeleton's space.

@@ -127,7 +127,7 @@ def chosen_meshes(
     # Path of the mesh, or of a prim with one mesh below it; "*" for all meshes; None for the only mesh of the stage
     path: str | None,
     name: str,  # Of the file in messages
-    time: float | None,  # Time code at which visibility and schemes are read
+    time: Usd.TimeCode,  # At which visibility and schemes are read
     scheme: str | None,  # Replaces the meshes' own
 ) -> list[UsdGeom.Mesh]:
     """The mesh to read, or all meshes.
@@ -154,12 +154,11 @@ def chosen_meshes(
         found = stage.GetPrimAtPath(path)
         what = f'is a prim of the type "{found.GetTypeName()}" without meshes' if found else "is not in the file"
         raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
-    at = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
     if path == ALL:
-        hidden = {each for each in below if not _is_shown(meshes[each], at)}
+        hidden = {each for each in below if not _is_shown(meshes[each], time)}
         below = _without(below, hidden, "as they are invisible, guides or proxies; expected meshes to be seen", name)
     if scheme is None:
-        flat = {each for each in below if str(value_at(meshes[each].GetSubdivisionSchemeAttr(), at)) in FLAT_SCHEMES}
+        flat = {each for each in below if str(value_at(meshes[each].GetSubdivisionSchemeAttr(), time)) in FLAT_SCHEMES}
         given, expected = " or ".join(FLAT_SCHEMES), " or ".join(SCHEMES)
         why = f"as their subdivisionScheme is {given}; expected {expected}, or a scheme given"
         below = _without(below, flat, why, name)
@@ -172,8 +171,8 @@ def chosen_meshes(
     return [meshes[each] for each in below]
 
 
-def _is_shown(mesh: UsdGeom.Mesh, at: Usd.TimeCode) -> bool:
-    return mesh.ComputeVisibility(at) != "invisible" and mesh.ComputePurpose() not in HIDDEN_PURPOSES
+def _is_shown(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> bool:
+    return mesh.ComputeVisibility(time) != "invisible" and mesh.ComputePurpose() not in HIDDEN_PURPOSES
 
 
 def _without(paths: list[Any], skipped: set[Any], why: str, name: str) -> list[Any]:

@@ -15,7 +15,7 @@ from ..cage.contents import CageContents
 from ..cage.errors import CageError
 from ..cage.rules import RULES
 from ..whole_file import whole_file
-from .losses import warn_of_losses
+from .formats import warn_of_losses
 from .usd_values import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def write_usd_triangles(
     texcoords: NDArray | None,
     attributes: Mapping[str, NDArray],
 ) -> None:
-    """Write triangles that are not to be subdivided to a USD file; see `triangle_writer.write_triangles`."""
+    """Write triangles that are not to be subdivided to a USD file; see `formats.write_triangles`."""
     with _new_mesh(path, "surface", positions, np.full(len(triangles), 3), triangles) as mesh:
         from pxr import UsdGeom
 

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..cage import Attribute, ControlCage
+from ..cage import ControlCage
 from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built
@@ -19,7 +19,7 @@ from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State, adam_state, restore_adam
 from .fitting import Fit, Schedulable, Schedule
-from .large_steps import LargeSteps
+from .large_steps import LargeSteps, rows
 from .regularizers import regularizer
 from .unknown_creases import UnknownCreases
 from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
@@ -134,6 +134,8 @@ class CageFit(Fit):
         self._smoothing, self._laplacian, self._seed = smoothing, laplacian, seed
         self._weights = {name: Schedule.of(each, f"regularizer {name}") for name, each in (regularizers or {}).items()}
         self._other_rates = {name: Schedule.of(each, f"others {name}") for name, each in (others or {}).items()}
+        # Without the sharpness of creases.
+        self._other_names = tuple(self._other_rates)
         self._creases: UnknownCreases | None = None
         if sharp_edges is not None:
             creases = _checked_creases(crease_of, len(np.atleast_2d(sharp_edges)))
@@ -158,53 +160,42 @@ class CageFit(Fit):
         flat = upload(mi.Float, positions)
         self._optimizer[U] = flat if self._steps is None else self._steps.to_differential(flat)
         self._initial_extent = self._extent()
-        self._load_others()
+        params = self._pictures.params
+        for name in self._other_names:
+            if name not in params:
+                raise ValueError(f'others has "{name}"; expected one of {", ".join(params.keys())}')
+            if name.startswith(CAGE_VALUES) and creases is not None:
+                raise ValueError(f'others has "{name}", and sharp_edges are given; expected one of them')
+            # An earlier start may have set it in the same size.
+            if name not in self._others or self._others[name].shape != params[name].shape:
+                self._others[name] = params[name]
 
     def _follow(self, refinement: CageRefinement) -> None:
         if self._creases is not None:
             self._creases = self._creases.after(refinement)
 
-    def _load_others(self) -> None:
-        """Start the other parameters from the scene's values, unless an earlier start has set them in the same size."""
-        params = self._pictures.params
-        for name in self._other_rates:
-            if name == SHARPNESS:
-                continue
-            if name not in params:
-                raise ValueError(f'others has "{name}"; expected one of {", ".join(params.keys())}')
-            if name.startswith(CAGE_VALUES) and self._creases is not None:
-                raise ValueError(f'others has "{name}", and sharp_edges are given; expected one of them')
-            if name not in self._others or self._others[name].shape != params[name].shape:
-                self._others[name] = params[name]
-
     @property
     def control_points(self) -> FloatArray:
         """``(n, 3)`` current control points."""
         with dr.suspend_grad():
-            return np.array(self._points(), dtype=np.float64).reshape(-1, 3)
+            return rows(self._points())
 
     @property
     def cage(self) -> ControlCage:
         """The current cage, with its tags and with fitted attributes and sharpness."""
         if self._creases is not None:
             return self._creases.with_sharpness(self._crease_sharpness(), self.control_points)
-        names = [name for name in self._other_rates if name.startswith(CAGE_VALUES)]
+        names = [name.removeprefix(CAGE_VALUES) for name in self._other_names if name.startswith(CAGE_VALUES)]
         if not names:
             return self._start.with_positions(self.control_points)
-        contents, attributes = self._start.contents, dict(self._start.attributes)
-        texcoords = contents.texcoords
+        contents = self._start.contents
+        known = {TEXCOORDS: contents.texcoords, **contents.attributes}
+        fitted: dict[str, Any] = {name: each for name, each in known.items() if each is not None}
         for name in names:
-            if name == f"{CAGE_VALUES}{TEXCOORDS}" and texcoords is not None:
-                texcoords = self._fitted(name, texcoords)
-            else:
-                attribute = name.removeprefix(CAGE_VALUES)
-                attributes[attribute] = self._fitted(name, attributes[attribute])
-        return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=attributes))
-
-    def _fitted(self, name: str, attribute: Attribute) -> Attribute:
-        """An attribute of the cage with its current values."""
-        values = np.array(self._others[name], dtype=np.float64).reshape(attribute.values.shape)
-        return Attribute(values, attribute.interpolation, attribute.indices)
+            values = np.array(self._others[f"{CAGE_VALUES}{name}"], dtype=np.float64)
+            fitted[name] = replace(fitted[name], values=values.reshape(fitted[name].values.shape))
+        texcoords = fitted.pop(TEXCOORDS, None)
+        return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=fitted))
 
     @property
     def sharp_edges(self) -> IntArray:
@@ -229,7 +220,7 @@ class CageFit(Fit):
 
     def values(self) -> dict[str, Any]:
         """Current values of the other fitted parameters of the scene."""
-        return {name: dr.detach(self._others[name]) for name in self._other_rates if name != SHARPNESS}
+        return {name: dr.detach(self._others[name]) for name in self._other_names}
 
     def _points(self) -> dr.ArrayBase:
         """Flat control points, computed from the optimiser's variables."""
@@ -238,10 +229,8 @@ class CageFit(Fit):
 
     def _step(self, number: int) -> float:
         points = self._points()
-        values = {name: self._others[name] for name in self._other_rates if name != SHARPNESS}
-        values[CONTROL_POINTS] = points
-        if self._creases is not None:
-            values[CONTROL_POINTS] = self._creases.points(self._others[SHARPNESS], points)
+        moved = points if self._creases is None else self._creases.points(self._others[SHARPNESS], points)
+        values = {CONTROL_POINTS: moved, **{name: self._others[name] for name in self._other_names}}
         loss = self._pictures.loss(values, self._seed + number)
         total: Any = loss
         for name, term in self._regularizers.items():
@@ -266,7 +255,7 @@ class CageFit(Fit):
 
     def _extent(self) -> float:
         """Diagonal of the box around the optimiser's variables: 0 where that around the control points is."""
-        return float(np.linalg.norm(np.ptp(np.array(self._optimizer[U]).reshape(-1, 3), axis=0)))
+        return float(np.linalg.norm(np.ptp(rows(self._optimizer[U]), axis=0)))
 
     def _states(self) -> dict[str, State]:
         others = {f"other {name}": adam_state(self._others, name) for name in self._other_rates}

@@ -6,16 +6,14 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import upload
 from ..whole_file import whole_file
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 # Raised with the layout of the file.
 FORMAT = 1

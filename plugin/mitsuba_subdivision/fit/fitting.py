@@ -74,8 +74,7 @@ class Fit(ABC):
     def _step(self, number: int) -> float:
         """Take a step, whose number counts from 0, and return the loss before it."""
 
-    @abstractmethod
-    def _follow(self, refinement: CageRefinement) -> None:
+    def _follow(self, refinement: CageRefinement) -> None:  # noqa: B027 - not all fits have any
         """Update the state that a refinement changes besides control points; `_load` comes next."""
 
     @abstractmethod

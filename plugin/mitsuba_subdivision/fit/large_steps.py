@@ -7,17 +7,15 @@ the inverse of the matrix. Here L may be that of the cage's edges, or the stiffn
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from ..device_arrays import upload
-
-if TYPE_CHECKING:
-    from scipy import sparse
+from ..schemes.domain import FloatArray
 
 
 class LargeSteps:
@@ -40,9 +38,6 @@ class LargeSteps:
     """
 
     def __init__(self, laplacian: sparse.csr_array, lambda_: float) -> None:
-        from scipy import sparse
-        from scipy.sparse.linalg import splu
-
         if not lambda_ > 0:
             raise ValueError(f"lambda_ is {lambda_}; expected a positive number")
         self.matrix = sparse.csr_array(sparse.eye_array(laplacian.shape[0]) + lambda_ * laplacian)
@@ -61,8 +56,7 @@ class LargeSteps:
         -------
         mi.Float
         """
-        given = np.array(points, dtype=np.float64).reshape(-1, 3)
-        return upload(mi.Float, self.matrix @ given)
+        return upload(mi.Float, self.matrix @ rows(points))
 
     def from_differential(self, u: dr.ArrayBase) -> mi.Float:
         """Control points, flat x, y, z, of large-step coordinates; differentiable in forward and reverse mode."""
@@ -86,5 +80,9 @@ class _Solve(dr.CustomOp):
         return "LargeSteps"
 
     def _solved(self, flat: dr.ArrayBase) -> mi.Float:
-        given = np.array(flat, dtype=np.float64).reshape(-1, 3)
-        return upload(mi.Float, self.factors.solve(given))
+        return upload(mi.Float, self.factors.solve(rows(flat)))
+
+
+def rows(points: dr.ArrayBase | NDArray) -> FloatArray:
+    """Points ``(n, 3)``, given as such or flat."""
+    return np.array(points, dtype=np.float64).reshape(-1, 3)

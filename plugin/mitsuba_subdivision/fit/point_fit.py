@@ -1,27 +1,25 @@
-"""The fit of a cage to points: from a scan, or a dense mesh, to a surface with few control points."""
+"""The fit of a cage to points, of a scan or of a dense mesh: a surface with few control points."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
 from ..mesh.connectivity import IntArray
 from ..patches import AreaSamples, ClosestPoints
-from ..refinement.cage_refinement import CageRefinement
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .checkpoint import Checkpoint, State
 from .fitting import Fit, Schedulable, Schedule
 from .regularizers import Regularizer
-
-if TYPE_CHECKING:
-    from scipy import sparse
-    from scipy.spatial import cKDTree
 
 POINTS = "points"
 # Parts of the surface have no points nearby if these are further than this many median distances of a point from
@@ -29,6 +27,8 @@ POINTS = "points"
 NEAR = 5.0
 # Weight that holds each control point where it is, relative to the mean weight of points.
 DAMPING = 1e-8
+# Points on the mesh for each control point that the fit ends with, by default.
+POINTS_PER_CONTROL_POINT = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,6 @@ class _Pairs:
 
     @classmethod
     def joined(cls, parts: Sequence[_Pairs]) -> _Pairs:
-        from scipy import sparse
-
         weights = sparse.csr_array(sparse.vstack([part.weights for part in parts]))
         columns = zip(*((part.goals, part.across) for part in parts), strict=True)
         return cls(weights, *(np.concatenate(column) for column in columns))
@@ -112,12 +110,14 @@ class PointFit(Fit):
         seed: int = 0,
         callbacks: Sequence[Callable[[PointFit], None]] = (),
     ) -> None:
-        from scipy.spatial import cKDTree
-
         self._points = _checked(points, "points")
-        self._normals = None if normals is None else _unit(_checked(normals, "normals"))
-        if self._normals is not None and self._normals.shape != self._points.shape:
-            raise ValueError(f"{len(self._normals)} normals of {len(self._points)} points; expected one of each")
+        self._normals = None
+        if normals is not None:
+            given = _checked(normals, "normals")
+            if given.shape != self._points.shape:
+                raise ValueError(f"{len(given)} normals of {len(self._points)} points; expected one of each")
+            length = np.linalg.norm(given, axis=1, keepdims=True)
+            self._normals = given / np.where(length > 0, length, 1)
         self._tree: cKDTree | None = None
         if both_ways and len(self._points) > 1:
             self._tree = cKDTree(self._points)
@@ -131,9 +131,6 @@ class PointFit(Fit):
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
         self._control_points: FloatArray = positions
         self._regularizers = {name: Regularizer.named(name, start) for name in self._rates}
-
-    def _follow(self, refinement: CageRefinement) -> None:
-        """Nothing: only control points are fitted."""
 
     @property
     def control_points(self) -> FloatArray:
@@ -151,8 +148,7 @@ class PointFit(Fit):
     def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
         """Current pairs of nearest points."""
         near = surface.closest_point(self._points)
-        every_point = np.arange(len(self._points))
-        found = [_paired(surface, near, self._points, self._normals, every_point)]
+        found = [_paired(surface, near, self._points, self._normals, np.arange(len(self._points)))]
         if self._tree is not None:
             samples = surface.sample(len(self._points), seed)
             distance, at = (np.array(each) for each in self._tree.query(samples.p))
@@ -192,9 +188,6 @@ def _least_squares(
     pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, Regularizer]], before: FloatArray
 ) -> FloatArray:
     """Control points of least mean squared distance, with tangential distances weighted less, plus regularizers."""
-    from scipy import sparse
-    from scipy.sparse.linalg import splu
-
     weights, count = pairs.weights, pairs.weights.shape[0]
     forms = pairs.forms(sliding) / count
     blocks: list[list[Any]] = [[weights.T @ weights.multiply(forms[:, i, j, None]) for j in range(3)] for i in range(3)]
@@ -222,6 +215,81 @@ def _checked(values: ArrayLike, name: str) -> FloatArray:
     return found
 
 
-def _unit(normals: FloatArray) -> FloatArray:
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0, length, 1)
+def to_mesh(
+    cage: ControlCage,
+    positions: ArrayLike,
+    triangles: ArrayLike,
+    *,
+    steps: int = 40,
+    count: int | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> ControlCage:
+    """Fit a cage to a mesh of triangles: from a scan or a sculpt to a few control points.
+
+    Parameters
+    ----------
+    cage : ControlCage
+        Where to begin, near the mesh.
+    positions : (n, 3) array
+    triangles : (m, 3) int array
+        0-based, counter-clockwise from outside.
+    steps : int
+        Of `PointFit`.
+    count : int, optional
+        Points on the mesh, uniform by area; by default eight for each control point in the end.
+    seed : int
+    **options
+        Of `PointFit`, such as ``refine``.
+
+    Raises
+    ------
+    ValueError
+        If the mesh is malformed or has no area, or as `PointFit`.
+    CageError, SchemeError
+        As `PointFit`.
+    """
+    refine = options.get("refine", ())
+    if count is None:
+        refinements = refine if isinstance(refine, int) else len(refine)
+        count = POINTS_PER_CONTROL_POINT * cage.vertex_count * 4**refinements
+    points, normals = mesh_samples(np.asarray(positions, dtype=np.float64), np.asarray(triangles), count, seed)
+    return PointFit(cage, points, normals, seed=seed, **options).run(steps).cage
+
+
+def mesh_samples(positions: FloatArray, triangles: IntArray, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    """Points on triangles, uniform by area, and their normals."""
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"positions of the shape {positions.shape}; expected (n, 3)")
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or not np.issubdtype(triangles.dtype, np.integer):
+        found = f"triangles of the shape {triangles.shape} and type {triangles.dtype}"
+        raise ValueError(f"{found}; expected (m, 3) integers")
+    if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
+        row = int(np.flatnonzero(((triangles < 0) | (triangles >= len(positions))).any(axis=1))[0])
+        expected = f"expected vertices from 0 to {len(positions) - 1}"
+        raise ValueError(f"triangle {row} is {triangles[row].tolist()}; {expected}")
+    a, b, c = positions[triangles].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    doubled = np.linalg.norm(normals, axis=1)
+    if not doubled.sum() > 0:
+        raise ValueError("the mesh has no area; expected triangles")
+    chosen, weights = triangle_samples(positions, triangles, count, seed)
+    points: FloatArray = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
+    return points, normals[chosen] / doubled[chosen, None]
+
+
+def triangle_samples(
+    positions: FloatArray,  # (n, 3)
+    triangles: IntArray,  # (m, 3): 0-based; some of them have an area
+    count: int,
+    seed: int,
+) -> tuple[IntArray, FloatArray]:
+    """Locations uniform by area.
+
+    Returns 0-based triangles ``(count,)`` int64, and weights ``(count, 3)`` float64 of their three vertices; these are
+    not negative, and their sum is one.
+    """
+    rng = np.random.default_rng(seed)
+    a, b, c = positions[triangles].swapaxes(0, 1)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return rng.choice(len(areas), count, p=areas / areas.sum()), rng.dirichlet(np.ones(3), count)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy import sparse
 
 from ..cage import ControlCage
 from ..device_arrays import upload
@@ -16,9 +17,6 @@ from ..kernels.control_values import SparseMatrix
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-
-if TYPE_CHECKING:
-    from scipy import sparse
 
 # No quadratic form.
 FOLDS = "folds"
@@ -37,8 +35,6 @@ def _laplacian(surface: LimitSurface) -> sparse.csr_array:
 
 def _anchor(surface: LimitSurface) -> sparse.csr_array:
     """Mean squared distance of control points from their initial positions."""
-    from scipy import sparse
-
     return sparse.csr_array(sparse.eye_array(surface.cage.vertex_count) / surface.cage.vertex_count)
 
 

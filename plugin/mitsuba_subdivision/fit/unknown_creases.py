@@ -8,12 +8,12 @@ the matrix is linear in each sharpness (with Chaikin's method, in parts), so tha
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import sparse
 
 from ..cage import CageError, ControlCage
 from ..cage.tags import validated_edges
@@ -23,9 +23,7 @@ from ..mesh.cuts import Sharpness
 from ..refinement.adapted_scheme import adapted_scheme
 from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
-
-if TYPE_CHECKING:
-    from scipy import sparse
+from .large_steps import rows
 
 # More refinements than these would make a thousand faces and more of each.
 MOST_REFINEMENTS = 6
@@ -38,7 +36,6 @@ class UnknownCreases:
 
     Derivatives at integers are those of the interval above, at ``highest`` of the one below. Where creases of unequal
     sharpness meet, points may jump at integers: a vertex takes the mean sharpness of what a refinement makes smooth.
-
     Raises CageError, SchemeError of an edge that is not between two faces, of ``highest`` out of range, and those of
     `ControlCage.refinement`.
     """
@@ -77,8 +74,6 @@ class UnknownCreases:
 
     def matrix(self, sharpness: FloatArray) -> sparse.csr_array:
         """Control points of `refined` as weights of those of the cage, ``(n, n_v)``; rows sum to one."""
-        from scipy import sparse
-
         cut = self.with_sharpness(sharpness).cut_mesh
         topology, found = cut.topology, sparse.eye_array(self._cage.vertex_count, format="csr")[cut.vertex]
         for _ in range(self.highest):
@@ -115,19 +110,15 @@ class _RefinedPoints(dr.CustomOp):
 
     def eval(self, creases, sharpness, positions):
         values = np.clip(np.array(sharpness, dtype=np.float64), 0, creases.highest)
-        self.matrix, self.moves = creases.matrix(values), creases.derivatives(values, _rows(positions))
-        return upload(mi.Float, self.matrix @ _rows(positions))
+        self.matrix, self.moves = creases.matrix(values), creases.derivatives(values, rows(positions))
+        return upload(mi.Float, self.matrix @ rows(positions))
 
     def forward(self):
         along = np.array(self.grad_in("sharpness"), dtype=np.float64)
         moved = sum(rate * move for rate, move in zip(along, self.moves, strict=True))
-        self.set_grad_out(upload(mi.Float, self.matrix @ _rows(self.grad_in("positions")) + moved))
+        self.set_grad_out(upload(mi.Float, self.matrix @ rows(self.grad_in("positions")) + moved))
 
     def backward(self):
-        gradient = _rows(self.grad_out())
+        gradient = rows(self.grad_out())
         self.set_grad_in("sharpness", upload(mi.Float, [np.vdot(move, gradient) for move in self.moves]))
         self.set_grad_in("positions", upload(mi.Float, self.matrix.T @ gradient))
-
-
-def _rows(flat: dr.ArrayBase) -> FloatArray:
-    return np.array(flat, dtype=np.float64).reshape(-1, 3)

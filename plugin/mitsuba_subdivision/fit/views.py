@@ -71,11 +71,16 @@ class Pictures:
             raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
         self._shape = {**DEFAULT_SHAPE, **shape}
         self._scene = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
-        self._scene["integrator"] = _with_samples(self._scene["integrator"], spp, edge_spp)
-        self.sensors = [_loaded(view.sensor, spp) for view in views]
-        sizes = [_size(sensor) for sensor in self.sensors]
-        self._targets = [_target(views[index].picture, size, f"view {index}") for index, size in enumerate(sizes)]
-        self._masks = [_mask(views[index].mask, size, f"view {index}") for index, size in enumerate(sizes)]
+        integrator = self._scene["integrator"]
+        if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
+            # Counts for derivatives, unless it has its own.
+            self._scene["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
+        self.sensors = [with_sample_count(view.sensor, spp) for view in views]
+        self._targets, self._masks = [], []
+        for index, (view, sensor) in enumerate(zip(views, self.sensors, strict=True)):
+            width, height = map(int, sensor.film().crop_size())
+            self._targets.append(_target(view.picture, (height, width), f"view {index}"))
+            self._masks.append(_mask(view.mask, (height, width), f"view {index}"))
         if not callable(loss) and loss not in ("l1", "l2"):
             raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
         self._loss = loss
@@ -109,16 +114,7 @@ class Pictures:
         return dr.mean(size if mask is None else size * mask, axis=None)
 
 
-def _with_samples(
-    integrator: Mapping[str, Any] | mi.Integrator, spp: int, edge_spp: int
-) -> Mapping[str, Any] | mi.Integrator:
-    """An integrator's description with sample counts for derivatives, unless it has its own."""
-    if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
-        return {"sppc": spp, "sppp": edge_spp, **integrator}
-    return integrator
-
-
-def _loaded(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
+def with_sample_count(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
     """A sensor with a number of samples per pixel."""
     found = mi.load_dict(dict(sensor)) if isinstance(sensor, Mapping) else sensor
     found.sampler().set_sample_count(spp)
@@ -147,8 +143,3 @@ def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.Tenso
     if not np.isfinite(values).all() or (values < 0).any():
         raise ValueError(f"{where}: a mask with weights that are negative or not finite")
     return upload(mi.TensorXf, values[:, :, None])
-
-
-def _size(sensor: mi.Sensor) -> tuple[int, int]:
-    width, height = sensor.film().crop_size()
-    return int(height), int(width)

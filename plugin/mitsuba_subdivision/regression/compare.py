@@ -15,8 +15,6 @@ from .probe import compare_probes
 from .radiance_tiers import compare_flip, compare_paired, compare_tiles
 from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, pixel_of_largest, skipped_without
 
-EXIT_STATUS = {Status.PASS: 0, Status.WARN: 1, Status.FAIL: 2}
-
 
 @dataclass(frozen=True, eq=False)
 class WorstPixel:
@@ -62,7 +60,12 @@ class Comparison:
     @property
     def exit_status(self) -> int:
         """0 for pass, 1 for warn, 2 for fail."""
-        return EXIT_STATUS[self.status]
+        return {Status.PASS: 0, Status.WARN: 1, Status.FAIL: 2}[self.status]
+
+    @property
+    def maps(self) -> dict[str, NDArray[np.floating]]:
+        """Maps of all tiers, by their names."""
+        return {name: values for tier in self.tiers for name, values in tier.maps.items()}
 
     def tier(self, name: str) -> TierResult | None:
         """Result of the tier of a name, None if that did not run."""
@@ -168,8 +171,7 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 
 def _compare_probes(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
     if reference.probe is None or test.probe is None:
-        what = "geometry probe (channels P, Ns, uv, prim)"
-        return skipped_without("probe", reference.probe, test.probe, what)
+        return skipped_without("probe", reference.probe, test.probe, "geometry probe (channels P, Ns, uv, prim)")
     return compare_probes(reference.probe, test.probe, tolerances)
 
 
@@ -178,14 +180,11 @@ def _decide(
 ) -> None:
     """Let other tiers decide where one cannot, and where one proves that another's finding is chance.
 
-    Raises
-    ------
-    ImageError
-        If a tier that was chosen cannot run, and no other stands in for it.
+    Raises ImageError if a tier that was chosen cannot run, and no other stands in for it.
     """
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):
-        tile = results.setdefault("tile", results.get("tile") or compared_by["tile"]())
+        tile = results["tile"] = results.get("tile") or compared_by["tile"]()
         is_replaced = tile.status is not Status.SKIPPED
         if is_replaced:
             paired.lines.append("the tile tier decides instead")
@@ -231,10 +230,9 @@ def _worst(reference: Image, test: Image, results: list[TierResult]) -> WorstPix
     difference = np.abs(test.pixels - reference.pixels).max(axis=2)
     if not difference.max() > 0:
         return None
-    for result in results:
-        if "z" in result.maps:
-            return _worst_pixel(reference, test, pixel_of_largest(np.abs(result.maps["z"])), "z-score")
-    return _worst_pixel(reference, test, pixel_of_largest(difference), "difference")
+    z = next((np.abs(result.maps["z"]) for result in results if "z" in result.maps), None)
+    shown, shown_by = (difference, "difference") if z is None else (z, "z-score")
+    return _worst_pixel(reference, test, pixel_of_largest(shown), shown_by)
 
 
 def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:

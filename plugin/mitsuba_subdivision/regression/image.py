@@ -9,7 +9,6 @@ import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -79,13 +78,12 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
     ImageError
         If there is no estimate, or their sizes differ.
     """
-    total: Estimate | None = None
-    squares = np.zeros(())
-    for estimate in estimates:
-        squares_within = estimate.variance * max(estimate.batches - 1, 0)
-        if total is None:
-            total, squares = estimate, squares_within
-            continue
+    rest = iter(estimates)
+    total = next(rest, None)
+    if total is None:
+        raise ImageError("there is nothing to combine")
+    squares = total.variance * max(total.batches - 1, 0)
+    for estimate in rest:
         if estimate.mean.shape != total.mean.shape:
             sizes = " and ".join(f"{e.mean.shape[1]} x {e.mean.shape[0]}" for e in (total, estimate))
             raise ImageError(f"images of {sizes} pixels cannot be combined; expected one size")
@@ -95,10 +93,9 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
         # What is not finite is told of the image.
         with np.errstate(invalid="ignore", over="ignore"):
             step = estimate.mean - total.mean
+            squares_within = estimate.variance * max(estimate.batches - 1, 0)
             squares = squares + squares_within + step**2 * share * total.count[..., None]
             total = Estimate(total.mean + step * share, squares / (batches - 1), count, batches)
-    if total is None:
-        raise ImageError("there is nothing to combine")
     return total
 
 
@@ -238,7 +235,7 @@ def _require_metadata(metadata: dict[str, Any], source: str) -> None:
     for name, (is_right, expected) in _FORMS.items():
         if name in metadata and not is_right(metadata[name]):
             found = str(metadata[name])
-            shown = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}.."
+            shown = found[:_LONGEST] + ".." * (len(found) > _LONGEST)
             raise ImageError(f'metadata of image "{source}": {name} is {shown}; expected {expected}')
 
 
@@ -267,9 +264,8 @@ def _are_ranges(value: Any) -> bool:
     if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
         return False
     ends = [end for pair in value for end in pair]
-    if not ends or not all(type(end) is int and end >= 0 for end in ends):
-        return False
-    return all(a < b for a, b in value) and all(first[1] <= second[0] for first, second in pairwise(value))
+    are_integers = bool(ends) and all(type(end) is int and end >= 0 for end in ends)
+    return are_integers and ends == sorted(ends) and all(a < b for a, b in value)
 
 
 _FORMS = {

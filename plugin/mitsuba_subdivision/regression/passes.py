@@ -105,13 +105,13 @@ def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
     if not passes:
         raise RegressionError("no passes to merge; expected at least one")
     for image in passes:
-        _estimate_of_pass(image)
-    ordered = sorted(passes, key=lambda image: image.metadata["sampling"]["batches"])
-    first = ordered[0]
-    for other in ordered[1:]:
+        if image.estimate is None or "sampling" not in image.metadata:
+            raise RegressionError(f'"{image.name}" is no pass: it has no variance, or no record of its samples')
+    first, *others = ordered = sorted(passes, key=lambda image: image.metadata["sampling"]["batches"])
+    for other in others:
         _require_same_image(first, other)
     ranges = _joined(ordered)
-    estimate = combine(map(_estimate_of_pass, ordered)).stored()
+    estimate = combine(image.estimate for image in ordered if image.estimate is not None).stored()
     # Only the pass with the first batch can have these.
     paired = next((image for image in ordered if image.paired is not None), None)
     probe = next((image.probe for image in ordered if image.probe is not None), None)
@@ -144,12 +144,6 @@ def describe(loaded: LoadedScene) -> dict[str, Any]:
     }
 
 
-def _estimate_of_pass(image: Image) -> Estimate:
-    if image.estimate is None or "sampling" not in image.metadata:
-        raise RegressionError(f'"{image.name}" is no pass: it has no variance, or no record of its samples')
-    return image.estimate
-
-
 def _require_same_image(first: Image, other: Image) -> None:
     pairs = [(key, first.metadata.get(key), other.metadata.get(key)) for key in _SHARED]
     pairs += [(key, *(p.metadata["sampling"].get(key) for p in (first, other))) for key in ("seed", "batch", "total")]
@@ -167,10 +161,8 @@ def _require_same_image(first: Image, other: Image) -> None:
 def _joined(ordered: Sequence[Image]) -> list[list[int]]:
     """Ranges of batches, where neighbouring ranges are joined."""
     joined: list[list[int]] = []
-    ranges = sorted(
-        (start, stop, image.name) for image in ordered for start, stop in image.metadata["sampling"]["batches"]
-    )
-    for start, stop, name in ranges:
+    ranges = [(*pair, image.name) for image in ordered for pair in image.metadata["sampling"]["batches"]]
+    for start, stop, name in sorted(ranges):
         if joined and start < joined[-1][1]:
             raise RegressionError(f'"{name}" has batch {start}, which another pass has as well: it would count twice')
         if joined and start == joined[-1][1]:
@@ -188,15 +180,14 @@ def probe_scene(loaded: LoadedScene) -> Probe:
     """Position, normal, uv, shape, triangle and face at the first hits of the rays through the centres of pixels."""
     trace = _trace_arrays if dr.is_jit_v(mi.Float) else _trace_one_by_one
     width, height = loaded.size
-    position, normal, uv, triangle, shape = trace(loaded, width, height)
-    hit = shape != NOTHING
-    for values in (position, normal, uv):
-        values[~hit] = 0
-    triangle[~hit] = NOTHING
-    p, n, parameters = (values.reshape(height, width, -1).astype(np.float32) for values in (position, normal, uv))
-    element = _elements(loaded.scene, shape, triangle)
-    size = (height, width)
-    return Probe(p, n, parameters, shape.reshape(size), triangle.reshape(size), element.reshape(size))
+    *vectors, triangle, shape = trace(loaded, width, height)
+    missed = shape == NOTHING
+    for values in vectors:
+        values[missed] = 0
+    triangle[missed] = NOTHING
+    position, normal, uv = (values.reshape(height, width, -1) for values in vectors)
+    indices = shape, triangle, _elements(loaded.scene, shape, triangle)
+    return Probe(position, normal, uv, *(values.reshape(height, width) for values in indices))
 
 
 def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
@@ -314,11 +305,8 @@ def render_on_cluster(
     """
     with cluster(address) as client, timed("Rendering on the cluster"):
         count = count or min(sum(client.nthreads().values()), sampling.batches)
-        work = partial(_render_pass, load, sampling, count, with_probe)
+
+        def work(number: int) -> Image:
+            return render_pass(load(), sampling, number, count, with_probe=with_probe)
+
         return merge_passes([image for _, image in results(client, work, variant, range(1, count + 1))])
-
-
-def _render_pass(
-    load: Callable[[], LoadedScene], sampling: Sampling, count: int, with_probe: bool, number: int
-) -> Image:
-    return render_pass(load(), sampling, number, count, with_probe=with_probe)

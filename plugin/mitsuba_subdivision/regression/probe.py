@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, generate_binary_structure, morphological_gradient
 
 from . import ImageError
 from .tiers import Status, TierResult, Tolerances, pixel_of_largest
@@ -85,12 +86,17 @@ def compare_probes(reference: Probe, test: Probe, tolerances: Tolerances) -> Tie
     pixels = reference.shape.size
     both = reference.hit & test.hit
     other_shape = reference.shape != test.shape
-    inside = both & ~_near(_silhouette(reference.shape) | _silhouette(test.shape) | other_shape)
+    shapes = np.stack([reference.shape, test.shape])
+    # Pixels beside, above or below a pixel that hits another shape; then these and their eight neighbours.
+    cross = generate_binary_structure(2, 1)[None]
+    edges = (morphological_gradient(shapes, footprint=cross, mode="nearest") > 0).any(axis=0) | other_shape
+    inside = both & ~binary_dilation(edges, generate_binary_structure(2, 2))
     same_triangle = inside & (reference.triangle == test.triangle)
     other_element = inside & (reference.element != test.element)
 
     angle = np.where(both, normal_angle(reference.normal, test.normal), 0)
-    diagonal = _diagonal(reference)
+    points = reference.position[reference.hit].astype(np.float64)
+    diagonal = (float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0) or 1.0
     distance = np.linalg.norm(reference.position.astype(float) - test.position, axis=-1) / diagonal
     parameters = np.abs(reference.uv.astype(float) - test.uv).max(axis=-1)
     other_triangle = float((inside & ~same_triangle).sum() / pixels)
@@ -99,8 +105,8 @@ def compare_probes(reference: Probe, test: Probe, tolerances: Tolerances) -> Tie
         "mask_fraction": float(other_shape.sum() / pixels),
         "element_fraction": float(other_element.sum() / pixels),
         "angle_p999": _percentile(angle[inside]),
-        "angle_max": _largest(angle[inside]),
-        "position": _largest(distance[inside]),
+        "angle_max": float(angle[inside].max(initial=0)),
+        "position": float(distance[inside].max(initial=0)),
         "uv_p999": _percentile(parameters[same_triangle]),
         "triangle_fraction": other_triangle,
     }
@@ -137,28 +143,5 @@ def normal_angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-def _silhouette(shape: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Pixels beside, above or below a pixel that hits another shape."""
-    padded = np.pad(shape, 1, mode="edge")
-    neighbours = padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]
-    return np.any([shape != neighbour for neighbour in neighbours], axis=0)
-
-
-def _near(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels of a mask and their eight neighbours."""
-    padded = np.pad(mask, 1)
-    height, width = mask.shape
-    return np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
-
-
-def _diagonal(probe: Probe) -> float:
-    points = probe.position[probe.hit].astype(np.float64)
-    return float(np.linalg.norm(np.ptp(points, axis=0))) or 1.0 if len(points) else 1.0
-
-
 def _percentile(values: NDArray[np.floating]) -> float:
     return float(np.percentile(values, 99.9)) if values.size else 0.0
-
-
-def _largest(values: NDArray[np.floating]) -> float:
-    return float(values.max()) if values.size else 0.0

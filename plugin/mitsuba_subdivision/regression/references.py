@@ -28,55 +28,39 @@ REFERENCE_SPP = 16384
 def render_reference(
     source: SceneSource,
     path: str | Path,
-    parameters: Mapping[str, Any] | None = None,
-    sampling: Sampling | None = None,
+    parameters: Mapping[str, Any],
+    sampling: Sampling,
     tolerances: Tolerances | None = None,
 ) -> Image:
     """Render a reference in the current variant, with the box filter. `save_image` writes the file.
 
     The metadata keep the command that makes the reference, as run in the folder of its file ``path``.
     """
-    sampling = sampling or Sampling.of_spp(REFERENCE_SPP)
     image = render_pass(load_scene(source, parameters, BOX), sampling, with_probe=True)
-    scene = source if isinstance(source, (str, Path)) else None
-    return as_reference(image, scene, path, sampling, tolerances)
+    return as_reference(
+        image, source if isinstance(source, (str, Path)) else None, path, sampling, tolerances or Tolerances()
+    )
 
 
 def as_reference(
-    image: Image, scene: str | Path | None, path: str | Path, sampling: Sampling, tolerances: Tolerances | None = None
+    image: Image, scene: str | Path | None, path: str | Path, sampling: Sampling, tolerances: Tolerances
 ) -> Image:
     """Make a reference of an image: its metadata get tolerances, and the command that makes it.
 
     Raises ImageError if the image is not finite.
     """
     require_finite(image)
-    found = image.metadata
-    metadata = {**found, "tolerances": (tolerances or Tolerances()).as_dict()}
+    limits, found = tolerances.as_dict(), image.metadata
+    metadata = {**found, "tolerances": limits}
     if scene is not None:
         # Relative to the reference, so that the working folder makes no difference.
-        relative = Path(os.path.relpath(scene, Path(path).parent)).as_posix()
-        metadata["scene"] = relative
-        metadata["command"] = command(
-            relative, Path(path).name, found["parameters"], found["variant"], sampling, tolerances
-        )
+        metadata["scene"] = Path(os.path.relpath(scene, Path(path).parent)).as_posix()
+        words = [PROGRAM, "render", metadata["scene"], "-o", Path(path).name, "--reference"]
+        words += ["--spp", str(sampling.spp), "--batch", str(sampling.batch), "--seed", str(sampling.seed)]
+        words += ["--variant", found["variant"], *_assignments("-D", found["parameters"])]
+        words += _assignments("--tolerance", dict(limits.items() - Tolerances().as_dict().items()))
+        metadata["command"] = shlex.join(words)
     return replace(image, name=str(path), metadata=metadata)
-
-
-def command(
-    scene: str | Path,
-    output: str | Path,
-    parameters: Mapping[str, str],
-    variant: str,
-    sampling: Sampling,
-    tolerances: Tolerances | None = None,
-) -> str:
-    """Shell command that makes a reference."""
-    words = [PROGRAM, "render", str(scene), "-o", str(output), "--reference"]
-    words += ["--spp", str(sampling.spp), "--batch", str(sampling.batch), "--seed", str(sampling.seed)]
-    usual = Tolerances().as_dict()
-    changed = {name: v for name, v in (tolerances or Tolerances()).as_dict().items() if v != usual[name]}
-    words += ["--variant", variant, *_assignments("-D", parameters), *_assignments("--tolerance", changed)]
-    return shlex.join(words)
 
 
 class UnusableReference(RegressionError):
@@ -103,11 +87,10 @@ def sampling_of(reference: Image) -> Sampling:
             f'"{reference.name}" does not say how it was rendered; expected a reference, as '
             f'"{PROGRAM} render SCENE -o REFERENCE.exr --reference" writes'
         )
-    batches = sum(stop - start for start, stop in found["batches"])
-    return Sampling(batches, found["batch"], found["seed"])
+    return Sampling(sum(stop - start for start, stop in found["batches"]), found["batch"], found["seed"])
 
 
-def _assignments(option: str, values: Mapping[str, object]) -> Sequence[str]:
+def _assignments(option: str, values: Mapping[str, object]) -> list[str]:
     return [word for name, value in sorted(values.items()) for word in (option, f"{name}={value}")]
 
 
@@ -131,7 +114,6 @@ def render_like(
 
     The samples are independent of the reference's. The first attempt also has the geometry probe, and repeats the first
     batch of the reference sample by sample, for the paired tier.
-
     Each ``seed`` from 0 on has other samples, as has the second attempt with each.
 
     Raises UnusableReference if the reference does not say how it was rendered, or has another size.

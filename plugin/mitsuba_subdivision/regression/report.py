@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..srgb import encoded
-from ..whole_file import whole_file
+from ..whole_file import write_text
 from . import ImageError
 from .compare import Comparison
 from .image import write_channels
@@ -49,18 +50,16 @@ def write_report(folder: str | Path, comparison: Comparison, title: str | None =
     """Write the report of a comparison: ``index.html``, which needs no other file, ``comparison.json``, ``maps.exr``.
 
     The title is by default the reference's name. Returns the path of the page.
-
     Raises ImageError if matplotlib is not installed.
     """
     folder = Path(folder)
     title = title or comparison.reference.name
     picture = _panels(comparison)
     folder.mkdir(parents=True, exist_ok=True)
-    maps = {name: values for tier in comparison.tiers for name, values in tier.maps.items()}
-    if maps:
-        write_channels(folder / MAPS, maps)
-    _write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()}, indent=1) + "\n")
-    _write_text(folder / PAGE, _page(title, comparison, picture))
+    if comparison.maps:
+        write_channels(folder / MAPS, comparison.maps)
+    write_text(folder / NUMBERS, json.dumps({"title": title, **comparison.as_dict()}, indent=1) + "\n")
+    write_text(folder / PAGE, _page(title, comparison, picture))
     return folder / PAGE
 
 
@@ -75,10 +74,10 @@ def write_index(folder: str | Path) -> Path | None:
         rows.append((found["status"], f"<tr><td>{_badge(found['status'])}<td>{link}<td>{html.escape(tiers)}"))
     if not rows:
         return None
-    order = ["fail", "warn", "pass"]
-    lines = [line for _, line in sorted(rows, key=lambda row: order.index(row[0]))]
-    body = f"<h1>Render-difference tests</h1><table class=tiers>{''.join(lines)}</table>"
-    _write_text(folder / PAGE, _document("Render-difference tests", body))
+    rows.sort(key=lambda row: ["fail", "warn", "pass"].index(row[0]))
+    lines = "".join(line for _, line in rows)
+    body = f"<h1>Render-difference tests</h1><table class=tiers>{lines}</table>"
+    write_text(folder / PAGE, _document("Render-difference tests", body))
     return folder / PAGE
 
 
@@ -122,12 +121,10 @@ def _panels(comparison: Comparison) -> bytes:
 
 def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
     """The maps of all tiers, with that of FLIP for inspection where its tier did not run but can."""
-    maps = {name: values for tier in comparison.tiers for name, values in tier.maps.items()}
+    maps = comparison.maps
     if "flip" not in maps:
-        try:
+        with suppress(ImageError):
             maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
-        except ImageError:
-            return maps
     return maps
 
 
@@ -155,10 +152,9 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
         bar.locator = MaxNLocator(5)
     tile = comparison.tier("tile")
     for place in tile.numbers["failing"] if tile and name in ("z", "evidence") else ():
-        corner = place["x"] - 0.5, place["y"] - 0.5
+        box = (place["x"] - 0.5, place["y"] - 0.5), place["width"], place["height"]
         for colour, line in (("white", 2.0), ("black", 0.8)):
-            size = place["width"], place["height"]
-            panel.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=line))
+            panel.add_patch(Rectangle(*box, fill=False, edgecolor=colour, linewidth=line))
     if name == "flip" and not comparison.tier("flip"):
         caption += "; high where there is noise,\ndoes not count here"
     _finish(panel, comparison, title, caption)
@@ -170,8 +166,7 @@ def _finish(panel: Axes, comparison: Comparison, title: str, caption: str) -> No
 
     panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
     panel.set_xlabel(caption, fontsize=7.5, color="0.35")
-    panel.set_xticks([])
-    panel.set_yticks([])
+    panel.set(xticks=[], yticks=[])
     if comparison.worst:
         size = max(comparison.reference.size) / 14
         at = comparison.worst.x, comparison.worst.y
@@ -216,11 +211,6 @@ def _badge(status: str) -> str:
 
 def _document(title: str, body: str) -> str:
     return f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>{_STYLE}<body>{body}\n"
-
-
-def _write_text(path: Path, text: str) -> None:
-    with whole_file(path) as beside:
-        beside.write_text(text, encoding="utf-8")
 
 
 _STYLE = """<meta name=viewport content="width=device-width"><style>

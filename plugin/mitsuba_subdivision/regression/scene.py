@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Union
@@ -80,44 +81,44 @@ def load_scene(
 
 def _loaded_scene(source: SceneSource, parameters: Mapping[str, Any] | None, filter_name: str | None) -> LoadedScene:
     given = {name: str(value) for name, value in (parameters or {}).items()}
+    if given and isinstance(source, (Mapping, mi.Scene)):
+        what = "is a dictionary" if isinstance(source, Mapping) else "is loaded already"
+        raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene {what}")
     if isinstance(source, mi.Scene):
-        return _loaded(source, given, filter_name)
+        found = _filter_name(source)
+        if filter_name and found != filter_name:
+            raise RegressionError(
+                f'the loaded scene has the reconstruction filter "{found}"; expected "{filter_name}", which '
+                "a scene given as a file or a dictionary gets"
+            )
+        return LoadedScene(source, None, found)
     config = mi.parser.ParserConfig(str(mi.variant()))
     if isinstance(source, Mapping):
-        if given:
-            raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene is a dictionary")
         return _instantiate(config, [mi.parser.parse_dict(config, dict(source))], None, filter_name, given)
     path = Path(source)
     if not path.is_file():
         raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
-    resolver = _file_resolver()
-    before = [str(folder) for folder in resolver]
-    try:
+    with kept_search_folders() as resolver:
         # As in `mi.load_file`, names in the scene are looked up in the scene's folder first.
         resolver.prepend(str(path.resolve().parent))
         return _instantiate(config, [mi.parser.parse_file(config, str(path), **given)], path, filter_name, given)
-    finally:
-        resolver.clear()
-        for folder in before:
-            resolver.append(folder)
 
 
 def _file_resolver() -> Any:
     return mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
 
 
-def _loaded(scene: mi.Scene, parameters: dict[str, str], filter_name: str | None) -> LoadedScene:
-    if parameters:
-        raise RegressionError(
-            f"scene parameters {', '.join(parameters)} are for scene files; the scene is loaded already"
-        )
-    found = _filter_name(scene)
-    if filter_name and found != filter_name:
-        raise RegressionError(
-            f'the loaded scene has the reconstruction filter "{found}"; expected "{filter_name}", which '
-            "a scene given as a file or a dictionary gets"
-        )
-    return LoadedScene(scene, None, found)
+@contextmanager
+def kept_search_folders() -> Iterator[Any]:
+    """The folders that Mitsuba searches for files, which are restored afterwards."""
+    resolver = _file_resolver()
+    before = [str(folder) for folder in resolver]
+    try:
+        yield resolver
+    finally:
+        resolver.clear()
+        for folder in before:
+            resolver.append(folder)
 
 
 def _instantiate(
@@ -171,12 +172,8 @@ def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
 
 
 def _filter_name(scene: mi.Scene) -> str:
-    return type_name(scene.sensors()[0].film().rfilter())
-
-
-def type_name(plugin: mi.Object) -> str:
-    """Name of a filter's plugin, by the class that the filter prints: "BoxFilter[]" is "box"."""
-    return str(plugin).partition("[")[0].removesuffix("Filter").lower()
+    """Name of the filter's plugin, by the class that the filter prints: "BoxFilter[]" is "box"."""
+    return str(scene.sensors()[0].film().rfilter()).partition("[")[0].removesuffix("Filter").lower()
 
 
 def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
@@ -211,19 +208,19 @@ def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArr
 
 
 def render_parts(
-    scene: mi.Scene, parts: Sequence[int], seed: int = 0, on_part: Callable[[int], None] | None = None, **options: Any
+    scene: mi.Scene, parts: Sequence[int], seed: int = 0, what: str = "Rendering", **options: Any
 ) -> NDArray[np.float32]:
     """Mean of parts of an image, given by their samples per pixel, each weighted by these.
 
-    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples. ``on_part`` gets the
-    index of each part before it is rendered. The other options are those of `mi.render`.
+    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples. A line on the terminal
+    says ``what`` is done. The other options are those of `mi.render`.
     """
     total: NDArray[np.float64] | float = 0.0
-    for index, spp in enumerate(parts):
-        if on_part:
-            on_part(index)
-        pixels = render_pixels(scene, (seed * len(parts) + index) % SEEDS, spp, **options)
-        total = total + spp * pixels.astype(np.float64)
+    with timed(what) as at:
+        for index, spp in enumerate(parts):
+            at(f"part {index + 1} of {len(parts)}")
+            pixels = render_pixels(scene, (seed * len(parts) + index) % SEEDS, spp, **options)
+            total = total + spp * pixels.astype(np.float64)
     return np.asarray(total / sum(parts), dtype=np.float32)
 
 
@@ -235,11 +232,10 @@ def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.flo
     """
     is_independent = str(loaded.sensor.sampler()).startswith("IndependentSampler")
     parts = parts_of(spp, loaded.size) if is_independent else [spp]
-    sensor = {"sensor": loaded.sensor_index}
-    with timed("Rendering") as at:
-        if len(parts) == 1:
-            return render_pixels(loaded.scene, seed, spp, **sensor)
-        return render_parts(loaded.scene, parts, seed, lambda index: at(f"part {index + 1} of {len(parts)}"), **sensor)
+    if len(parts) > 1:
+        return render_parts(loaded.scene, parts, seed, sensor=loaded.sensor_index)
+    with timed("Rendering"):
+        return render_pixels(loaded.scene, seed, spp, sensor=loaded.sensor_index)
 
 
 def parts_of(spp: int, size: tuple[int, int]) -> list[int]:
@@ -297,5 +293,5 @@ def _first_of(information: str) -> str:
     """
     lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
     values = {name.strip(): value.strip() for name, value in lines}
-    numbers = [f"{name} {values[name]}" for name in _NUMBERS if name in values]
-    return ", ".join([*([values["model name"]] if "model name" in values else []), *numbers])
+    names = ["model name", *_NUMBERS]
+    return ", ".join(f"{name} {values[name]}".removeprefix("model name ") for name in names if name in values)

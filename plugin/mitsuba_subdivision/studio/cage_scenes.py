@@ -51,7 +51,6 @@ class CageScenes:
 
     Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
     stay. Each file is read once: its control points are kept in a temporary file.
-
     Raises CageError, OSError if there is no file of a frame.
     """
 
@@ -190,11 +189,12 @@ class CageScenes:
         surfaces = surfaces or {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
         if not look.cage:
             return surfaces
+        bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}}
         wire = {
             "type": "subdivision",
             **model.wire.cage.as_properties(mi),
             "tessellation_rate": WIRE_RATE,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}},
+            "bsdf": bsdf,
         }
         return {**surfaces, "cage": wire}
 

@@ -46,14 +46,13 @@ def framed(
     azimuth: float,
     elevation: float,
     size: tuple[int, int],  # (width, height)
-    margin: float = MARGIN,  # Part of the picture's width and height that stays empty on each side
 ) -> Camera:
-    """Place a camera so that points just fit into its image, centred.
+    """Place a camera so that points just fit into its image, centred, but for `MARGIN`.
 
     Points that are deeper than they are wide are smaller than that, as the camera keeps away from them.
     """
     axes = camera_axes(azimuth, elevation)
-    slopes = _slopes(size, margin)
+    slopes = _slopes(size)
     in_camera = points @ axes
     z = in_camera[:, 2]
     nearest, middle = [], []
@@ -63,8 +62,7 @@ def framed(
         middle.append((above - below) / 2)
     # A nearer camera would distort models that are long along the view, and could lie inside a thin tip.
     depth = min(*nearest, z.min() - NEAREST * (z.max() - z.min()))
-    centre = (z.min() + z.max()) / 2
-    return Camera(axes, axes @ np.array([*middle, depth]), float(centre - depth))
+    return Camera(axes, axes @ np.array([*middle, depth]), float((z.min() + z.max()) / 2 - depth))
 
 
 def outermost(
@@ -74,16 +72,16 @@ def outermost(
     size: tuple[int, int],  # (width, height)
 ) -> NDArray[np.float64]:
     """The few points that determine the camera of `framed`, and the bounds of all points."""
-    x, y = _slopes(size, MARGIN)
+    x, y = _slopes(size)
     # Away from each side of what the camera sees, then along its view and along the axes.
     towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
     directions = np.concatenate([towards @ camera_axes(*angles_of(view)).T, np.eye(3), -np.eye(3)])
     return points[np.unique((points @ studio_axes(up) @ directions.T).argmax(axis=0))]
 
 
-def _slopes(size: tuple[int, int], margin: float) -> NDArray[np.float64]:
-    """Half extents of the frustum per unit of depth, horizontally and vertically."""
-    return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * margin)
+def _slopes(size: tuple[int, int]) -> NDArray[np.float64]:
+    """Half extents of what points may fill per unit of depth, horizontally and vertically."""
+    return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * MARGIN)
 
 
 def camera_axes(azimuth: float, elevation: float) -> NDArray[np.float64]:
@@ -117,7 +115,6 @@ def studio_axes(up: str) -> NDArray[np.float64]:
     """Directions of the studio in the world: columns right, back and up ``(3, 3)``, of a viewer before the front.
 
     A model's front is that of modelling programs: -y where z is up, +z where y is up.
-
     Raises ValueError if the axis is neither y nor z.
     """
     if up not in UP_AXES:

@@ -63,9 +63,10 @@ class Model:
         self.path = Path(cage)
         rules: dict[str, Any] = {"scheme": scheme} if scheme else {}
         if contents is None:
-            self.surface = LimitSurface(ControlCage.from_file(cage, prim=prim, time=time, **rules))
+            read = ControlCage.from_file(cage, prim=prim, time=time, **rules)
         else:
-            self.surface = LimitSurface(ControlCage.from_arrays(**{**contents.as_arguments(), **rules}))
+            read = ControlCage.from_arrays(**{**contents.as_arguments(), **rules})
+        self.surface = LimitSurface(read)
 
     @cached_property
     def materials(self) -> dict[str, Material]:
@@ -120,9 +121,14 @@ class Model:
         in_memory: bool = False,  # Whether the shape gets the cage itself, rather than its file
     ) -> SceneNode:
         """The shape ``subdivision`` as an entry of a scene, without a material."""
-        cage = self._in_memory() if in_memory or self.path is None else self._in_file(self.path)
-        shape = {"type": "subdivision", **cage, **triangles}
-        return shape if shading == "vertex" else {**shape, "shading": shading}
+        given = {name: value for name, value in self._chosen.items() if value is not None}
+        if in_memory or self.path is None:
+            # What `prim` and `time` have chosen is in the cage itself.
+            cage = self.cage.as_properties(mi) | {name: given[name] for name in given if name == "scheme"}
+        else:
+            cage = {"filename": str(self.path.resolve()), **given}
+        shown = {} if shading == "vertex" else {"shading": shading}
+        return {"type": "subdivision", **cage, **triangles, **shown}
 
     def triangles_for(self, sensor: SceneNode) -> SceneNode:
         """Parameters of the coarsest exactly shaded tessellation whose facets this sensor of a scene does not see."""
@@ -130,13 +136,6 @@ class Model:
         segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
         highest = highest_rate(segments, np.array([corners]))
         return triangles_for(int(segments[0]), corners, min(MOST_SEGMENTS, highest), outline, highest)
-
-    def _in_memory(self) -> SceneNode:
-        """Properties of the shape that describe its cage."""
-        return self.cage.as_properties(mi) | ({"scheme": self._chosen["scheme"]} if self._chosen["scheme"] else {})
-
-    def _in_file(self, path: Path) -> SceneNode:
-        return {"filename": str(path.resolve())} | {k: v for k, v in self._chosen.items() if v is not None}
 
 
 def up_axis_of(path: Path) -> str:
@@ -161,25 +160,23 @@ class CageWire:
     @cached_property
     def cage(self) -> ControlCage:
         """The cage whose limit surface is the rods and balls."""
+        tube = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+        cube = named_cages.cube().face_vertices.reshape(6, 4)
         count = len(self._edges)
-        first, corner = 8 * np.arange(count)[:, None, None], np.arange(4)
-        beside = (corner + 1) % 4
-        tubes = first + np.stack([corner, beside, beside + 4, corner + 4], axis=1)
-        cube = named_cages.cube().face_vertices.reshape(1, 6, 4)
-        balls = 8 * (count + np.arange(len(self._vertices))[:, None, None]) + cube
-        faces = np.concatenate([tubes.reshape(-1, 4), balls.reshape(-1, 4)])
+        first = 8 * np.arange(count + len(self._vertices))[:, None, None]
+        faces = np.concatenate([(first[:count] + tube).reshape(-1, 4), (first[count:] + cube).reshape(-1, 4)])
         return ControlCage(self.positions(self._positions), faces, source=CageSource("cage wire"))
 
     def positions(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
-        start, end = control_points[self._edges[:, 0]], control_points[self._edges[:, 1]]
-        along = _unit(end - start)
+        ends = control_points[self._edges]
+        along = _unit(ends[:, 1] - ends[:, 0])
         # The axis that is furthest from the edge.
         axis = np.eye(3)[np.abs(along).argmin(axis=1)]
         side = _unit(np.cross(along, axis))
         across = np.stack([side, np.cross(along, side)], axis=1)
         ring = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) @ across * (self.radius / _TUBE_LIMIT)
-        tubes = np.stack([start, end], axis=1)[:, :, None] + ring[:, None]
+        tubes = ends[:, :, None] + ring[:, None]
         corners = named_cages.cube().positions * (BALL * self.radius / _CUBE_LIMIT / np.sqrt(3))
         balls = control_points[self._vertices, None] + corners
         return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])

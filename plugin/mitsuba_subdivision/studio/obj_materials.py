@@ -174,37 +174,33 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
     Phong's exponent ``Ns`` becomes a roughness by ``alpha^2 = 2 / (Ns + 2)``, with which a microfacet distribution has
     as wide a highlight; ``alpha`` is the square of the roughness.
     """
-    colour: SceneNode = {"type": "rgb", "value": _clipped(material.get("Kd", [0.8] * 3))}
+    diffuse, highlights = _numbers(material, "Kd", 0.8, 0.8, 0.8), _numbers(material, "Ks", 0.0, 0.0, 0.0)
+    colour: SceneNode = {"type": "rgb", "value": np.clip(diffuse, 0, 1).tolist()}
     texture = material.get(_TEXTURE)
     if isinstance(texture, Picture):
         if texture.path.is_file():
             colour = texture.texture()
         else:
             warn(f'material "{name}": there is no picture "{texture.path}"; its colour is Kd')
-    (exponent,), (illumination,) = _numbers(material, "Ns", [0.0]), _numbers(material, "illum", [2.0])
-    specular = sum(_clipped(material.get("Ks", [0.0] * 3))) / 3
+    (exponent,), (illumination,) = _numbers(material, "Ns", 0.0), _numbers(material, "illum", 2.0)
     glossy = {
         "type": "principled",
         "base_color": colour,
-        "roughness": _numbers(material, "Pr", [(2 / (max(exponent, 0) + 2)) ** 0.25])[0],
-        "metallic": _numbers(material, "Pm", [0.0])[0],
-        "specular": 0.0 if illumination in _MATTE else specular,
+        "roughness": _numbers(material, "Pr", (2 / (max(exponent, 0) + 2)) ** 0.25)[0],
+        "metallic": _numbers(material, "Pm", 0.0)[0],
+        "specular": 0.0 if illumination in _MATTE else sum(np.clip(highlights, 0, 1).tolist()) / 3,
     }
     bsdf: SceneNode = {"type": "twosided", "bsdf": glossy}
-    opacity = _numbers(material, "d", [1 - _numbers(material, "Tr", [0.0])[0]])[0]
+    opacity = _numbers(material, "d", 1 - _numbers(material, "Tr", 0.0)[0])[0]
     return bsdf if opacity >= 1 else {"type": "mask", "opacity": max(opacity, 0.0), "bsdf": bsdf}
 
 
 def material_emitter(material: Material) -> SceneNode | None:
     """The emitter of a material that shines; None if it does not."""
-    radiance = _numbers(material, "Ke", [0.0] * 3)
+    radiance = _numbers(material, "Ke", 0.0, 0.0, 0.0)
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}} if max(radiance) > 0 else None
 
 
-def _numbers(material: Material, key: str, default: list[float]) -> list[float]:
-    found = material.get(key, default)
-    return found if isinstance(found, list) else default
-
-
-def _clipped(values: list[float] | Picture) -> list[float]:
-    return [min(max(value, 0.0), 1.0) for value in values] if isinstance(values, list) else [0.8] * 3
+def _numbers(material: Material, key: str, *default: float) -> list[float]:
+    found = material.get(key)
+    return found if isinstance(found, list) else [*default]

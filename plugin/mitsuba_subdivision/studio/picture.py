@@ -38,7 +38,6 @@ def shading_for(
 
     If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
     would make an error of every scene in a scalar variant where warnings are errors.
-
     Raises ValueError if there is no such shading.
     """
     shading = parameters.get("shading", "auto")

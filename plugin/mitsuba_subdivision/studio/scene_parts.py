@@ -48,11 +48,9 @@ class SceneParts:
         if "positions" in node:
             found = self._with_cage(name, node)
         elif "mesh" in node:
-            beside = self._file(name, ".ply", node["mesh"].save)
-            found = _with_name(beside, {key: value for key, value in node.items() if key != "mesh"})
+            found = _with_name(self._file(name, ".ply", found.pop("mesh").save), found)
         elif "bitmap" in node:
-            kept = {key: value for key, value in node.items() if key != "bitmap"}
-            found = _with_name(self._picture(name, node["bitmap"]), kept)
+            found = _with_name(self._picture(name, found.pop("bitmap")), found)
         if "filename" in found:
             found["filename"] = _relative(Path(found["filename"]), self._path.parent)
         for key, value in found.items():
@@ -82,9 +80,11 @@ class SceneParts:
     def _with_cage(self, name: str, entry: SceneNode) -> SceneNode:
         contents = _contents(entry)
         suffix = _suffix_for(name, contents)
-        # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
-        chosen = {} if suffix == ".obj" else {rule: v for rule, v in contents.rules.items() if v != RULES[rule][0]}
-        contents = replace(contents, rules=contents.rules if suffix == ".obj" else {})
+        chosen = {}
+        if suffix != ".obj":
+            # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
+            chosen = {rule: value for rule, value in contents.rules.items() if value != RULES[rule][0]}
+            contents = replace(contents, rules={})
         beside = self._file(name, suffix, partial(write_file, contents))
         others = (*_ARRAYS, "cage_name", *RULES)
         kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}
@@ -99,7 +99,12 @@ class SceneParts:
             in_8_bits = pixels.dtype == np.uint8 and bitmap.srgb_gamma()
             if not in_8_bits:
                 bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
-            self._pictures[digest] = self._file(name, ".png" if in_8_bits else ".exr", partial(_write_bitmap, bitmap))
+
+            def write(path: Path) -> None:
+                with whole_file(path) as beside:
+                    bitmap.write(str(beside))
+
+            self._pictures[digest] = self._file(name, ".png" if in_8_bits else ".exr", write)
         return self._pictures[digest]
 
 
@@ -141,11 +146,6 @@ def _suffix_for(name: str, contents: CageContents) -> str:
 def _with_name(path: Path, kept: SceneNode) -> SceneNode:
     # The type comes first, as `mi.load_dict` expects.
     return {"type": kept.pop("type"), "filename": str(path), **kept}
-
-
-def _write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
-    with whole_file(path) as beside:
-        bitmap.write(str(beside))
 
 
 def _relative(path: Path, folder: Path) -> str:

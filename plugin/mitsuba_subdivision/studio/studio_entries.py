@@ -59,7 +59,6 @@ def studio(
 
     A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
     camera is below the model's middle there is no floor, and lights come from below.
-
     Returns dict: "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and "ground". "ground"
     is missing in views from below. Raises ValueError if no variant is set; if bounds are not finite, or the least not
     below the greatest; if view, axis, size or samples are invalid. Warns if the model is so small or large that
@@ -88,12 +87,10 @@ def studio(
     rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
     for name, (position, half_sides, radiance, weight) in LIGHTS.items():
         origin = axes @ middle + radius * rig @ np.array(position)
+        placed = mi.ScalarTransform4f().look_at(origin.tolist(), (axes @ middle).tolist(), axes[:, 2].tolist())
         scale = mi.ScalarTransform4f().scale([radius * half_sides[0], radius * half_sides[1], 1.0])
-        scene[name] = {
-            "type": "rectangle",
-            "to_world": _look_at(origin, axes @ middle, axes[:, 2]) @ scale,
-            "emitter": {"type": "area", "radiance": _rgb(radiance), "sampling_weight": weight},
-        }
+        emitter = {"type": "area", "radiance": _rgb(radiance), "sampling_weight": weight}
+        scene[name] = {"type": "rectangle", "to_world": placed @ scale, "emitter": emitter}
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}
     if not from_below:
         # The camera stands on the floor and sees neither its sides nor the top of the wall, however far away it is.
@@ -145,10 +142,6 @@ def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> mi.S
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = linear, origin
     return mi.ScalarTransform4f(matrix.tolist())
-
-
-def _look_at(origin: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> mi.ScalarTransform4f:
-    return mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=target.tolist(), up=up.tolist())
 
 
 def _rgb(value: tuple[float, ...]) -> SceneNode:

@@ -196,6 +196,6 @@ class Tessellation:
         OSError
             If the file cannot be written; an existing one is then left as it was.
         """
-        from ..files.triangle_writer import write_triangles
+        from ..files.formats import write_triangles
 
         write_triangles(path, self.positions, self.normals, self.triangles, self.texcoords, self.attributes)
