@@ -10,7 +10,7 @@ surface_models.py            models of surfaces, by the inputs that all share
 materialx_nodes.py, materialx_noise.py, baking.py   nodes of MaterialX, evaluated to numbers or pictures
 copies.py                    replaces many instances by meshes
 bsdfs.py, textures.py, texture_*.py, emitters.py, sensors.py, shapes.py   build scene entries from the data
-scene_entries.py, loaded_shapes.py   combine the entries, for one scene or for frames
+scene_entries.py             combines the entries, for one scene or for frames
 limit_surfaces.py, rates.py  limit surfaces and their tessellation rates
 studio_defaults.py           adds the studio's camera and lights if the stage has none
 stage_scenes.py, scene.py    all of it, at one time or in frames

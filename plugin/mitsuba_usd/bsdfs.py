@@ -9,9 +9,9 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
-from .materialx_nodes import LUMINANCE, constant, is_constant, node
+from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node
 from .stage_warnings import StageWarnings
-from .surface_models import COSINE_82, NEUTRAL, conductor, conductor_reflectance, schlick_reflectance, with_shape
+from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
 from .textures import Textures
 
 # USD's colour of meshes without one.
@@ -33,16 +33,13 @@ _DEEPEST = 24
 # Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take up to 8 % longer: chess
 # set, shader ball and McUsd of usd-wg/assets.
 _ROULETTE = 3
-# Difference of reflectances that nobody sees at an edge.
-_VISIBLE = 0.05
 
 
 class Bsdfs:
     """Builds BSDFs and emitters from materials."""
 
     def __init__(self, textures: Textures, notes: StageWarnings) -> None:
-        self._textures = textures
-        self._notes = notes
+        self._textures, self._notes = textures, notes
 
     def display(self, shape: ShapeContents) -> SceneNode:
         """BSDF of a shape without a material: its display colour and opacity."""
@@ -51,12 +48,8 @@ class Bsdfs:
         opacity = values.number(PrimvarContents("displayOpacity", [1.0]))
         return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
 
-    def surface(
-        self,
-        material: MaterialContents,
-        shape: ShapeContents,  # Whose attributes the material may read
-    ) -> SceneNode:
-        """BSDF of a material."""
+    def surface(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
+        """BSDF of a material, which may read attributes of the shape."""
         return _Surface(material, _Values(self._textures, self._notes, shape)).bsdf()
 
     def radiance(self, material: MaterialContents) -> SceneNode | None:
@@ -166,8 +159,7 @@ class _Surface:
 
     def _is(self, name: str, value: float) -> bool:
         """Whether an input has a value everywhere."""
-        given = self._inputs[name]
-        return is_constant(given) and bool(np.all(np.asarray(given) == value))
+        return is_all(self._inputs[name], value)
 
     def _leave(self, what: str) -> None:
         self._notes.add(what, self._material.name)
@@ -177,7 +169,7 @@ class _Surface:
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
             opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
-            weight = node("multiply", "float", in1=weight, in2=opaque)
+            weight = number("multiply", weight, opaque)
         if is_constant(weight) and _first(weight) <= 0:
             found = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
@@ -229,42 +221,31 @@ class _Surface:
             "eta": max(self._eta(), _LEAST_ETA),
             "metallic": values.number(inputs["metalness"]),
         }
-        if not (self._is("metalness", 0) or self._has_white_edges()):
+        if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
             # The ratio of its widths is 1 - 0.9 anisotropic.
             rest = node("invert", "float", in_=ratio, amount=1.0)
-            found["anisotropic"] = values.number(node("divide", "float", in1=rest, in2=0.9))
+            found["anisotropic"] = values.number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
             factor = self._reflectance("coat_ior") / _COAT
-            found["clearcoat"] = values.number(node("multiply", "float", in1=inputs["coat"], in2=factor))
+            found["clearcoat"] = values.number(number("multiply", inputs["coat"], factor))
             found["clearcoat_gloss"] = self._gloss()
         if not self._is("sheen", 0):
             color = np.broadcast_to(values.mean(inputs["sheen_color"]), (3,))
             brightness = float(color @ LUMINANCE)
-            found["sheen"] = values.number(node("multiply", "float", in1=inputs["sheen"], in2=brightness))
+            found["sheen"] = values.number(number("multiply", inputs["sheen"], brightness))
             if np.ptp(color) > 0:
                 self._leave("colours of sheen only set its brightness; it is white")
         return found
-
-    def _has_white_edges(self) -> bool:
-        """Whether a metal turns to white towards its edges as Schlick has it, and `principled`."""
-        base, edge = self._inputs["base_color"], self._inputs["edge_color"]
-        if self._is("edge_color", 1):
-            return True
-        if not (is_constant(base) and is_constant(edge)):
-            return False
-        color = constant(base, 3)
-        found = conductor_reflectance(*conductor(color, constant(edge, 3)), COSINE_82)
-        return bool(np.abs(found - schlick_reflectance(color, COSINE_82)).max() < _VISIBLE)
 
     def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
         roughness = self._inputs["coat_roughness"]
         if np.any(np.square(self._values.mean(roughness)) > _DULL):
             self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
-        width = node("multiply", "float", in1=roughness, in2=roughness)
+        width = number("multiply", roughness, roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
         return self._values.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
 
@@ -308,7 +289,7 @@ class _Surface:
             "spec_trans": transmission,
         }
         if transmission < 1:
-            found["diff_trans"] = values.number(node("multiply", "float", in1=inputs["translucency"], in2=2.0))
+            found["diff_trans"] = values.number(number("multiply", inputs["translucency"], 2.0))
         return found
 
     def _reflectance(self, name: str) -> float:
@@ -334,33 +315,30 @@ class _Surface:
         if self._is("anisotropy", 0):
             return None
         ratio = node("invert", "float", in_=self._inputs["anisotropy"], amount=1.0)
-        ratio = node("max", "float", in1=ratio, in2=0.02)
+        ratio = number("max", ratio, 0.02)
         quarters = _first(self._values.mean(self._inputs["rotation"])) * 4
         if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
             self._leave("rotations of anisotropy are rounded to quarter turns")
-        return node("divide", "float", in1=1.0, in2=ratio) if round(quarters) % 2 else ratio
+        return number("divide", 1.0, ratio) if round(quarters) % 2 else ratio
 
     def _widths(self) -> SceneNode | None:
         """Widths of a GGX lobe; None for a mirror."""
         roughness = self._inputs["roughness"]
-        width = node("multiply", "float", in1=roughness, in2=roughness)
+        width = number("multiply", roughness, roughness)
         if is_constant(width) and _first(width) < _MIRROR:
             return None
-        width = node("max", "float", in1=width, in2=_MIRROR)
+        width = number("max", width, _MIRROR)
         ratio = self._ratio()
         if ratio is None:
             return {"alpha": self._values.number(width)}
-        root = node("power", "float", in1=ratio, in2=0.5)
-        u = node("min", "float", in1=node("divide", "float", in1=width, in2=root), in2=1.0)
-        v = node("min", "float", in1=node("multiply", "float", in1=width, in2=root), in2=1.0)
+        root = number("power", ratio, 0.5)
+        u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
         return {"alpha_u": self._values.number(u), "alpha_v": self._values.number(v)}
 
 
 def _clamped(given: Input) -> Input:
     """A number from 0 to 1; plain pictures and attributes stay what they are."""
-    is_plain = (
-        isinstance(given, TextureContents) and np.all(np.equal(given.scale, 1)) and np.all(np.equal(given.bias, 0))
-    )
+    is_plain = isinstance(given, TextureContents) and given.scale == [1.0] * 4 and given.bias == [0.0] * 4
     if is_plain or isinstance(given, PrimvarContents):
         return given
     return node("clamp", "float", in_=given, low=0.0, high=1.0)

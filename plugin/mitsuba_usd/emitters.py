@@ -24,12 +24,8 @@ _LEAST_SOFTNESS = 1e-3
 _WITH_SHAPES = ("rect", "disk", "sphere", "cylinder")
 
 
-def emitter(
-    light: LightContents,
-    up: str,  # Up axis of the stage
-    textures: Textures,
-) -> SceneNode:
-    """An emitter, or a shape with one."""
+def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
+    """An emitter, or a shape with one; ``up`` is the up axis of the stage."""
     return _MAKERS[light.kind](light, up, textures)
 
 
@@ -40,36 +36,27 @@ def _distant(light: LightContents, *_others: object) -> SceneNode:
         # Radiance times the solid angle, projected onto a plane that faces the light.
         irradiance = irradiance * math.pi * math.sin(angle / 2) ** 2
     direction = -light.to_world[:3, 2]
-    return {
-        "type": "directional",
-        "direction": (direction / np.linalg.norm(direction)).tolist(),
-        "irradiance": rgb(irradiance),
-    }
+    direction /= np.linalg.norm(direction)
+    return {"type": "directional", "direction": direction.tolist(), "irradiance": rgb(irradiance)}
 
 
 def _rect(light: LightContents, _up: str, textures: Textures) -> SceneNode:
     width, height = light.size
-    area = width * height * _stretch(light.to_world, 0, 1)
-    radiance = _radiance(light, area)
-    emission: SceneNode = rgb(radiance)
-    bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
+    found = _area(light, width * height * _stretch(light.to_world, 0, 1))
+    bitmap = None if light.texture is None else textures.radiance(light.texture, found["radiance"]["value"])
     if bitmap is not None:
         # The image is upright for a viewer that looks at the light.
         upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
-        emission = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
+        found["radiance"] = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
     matrix = mi.ScalarTransform4f((light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])).tolist())
-    return {"type": "rectangle", "to_world": matrix, "emitter": {"type": "area", "radiance": emission}}
+    return {"type": "rectangle", "to_world": matrix, "emitter": found}
 
 
 def _disk(light: LightContents, _up: str, _textures: Textures) -> SceneNode:
     radius = light.size[0]
     matrix = light.to_world @ _TURNED @ np.diag([radius, radius, 1, 1])
     area = math.pi * radius**2 * _stretch(light.to_world, 0, 1)
-    return {
-        "type": "disk",
-        "to_world": mi.ScalarTransform4f(matrix.tolist()),
-        "emitter": {"type": "area", "radiance": rgb(_radiance(light, area))},
-    }
+    return {"type": "disk", "to_world": mi.ScalarTransform4f(matrix.tolist()), "emitter": _area(light, area)}
 
 
 def _sphere(light: LightContents, *_others: object) -> SceneNode:
@@ -78,7 +65,7 @@ def _sphere(light: LightContents, *_others: object) -> SceneNode:
         "type": "sphere",
         "center": light.to_world[:3, 3].tolist(),
         "radius": radius,
-        "emitter": {"type": "area", "radiance": rgb(_radiance(light, 4 * math.pi * radius**2))},
+        "emitter": _area(light, 4 * math.pi * radius**2),
     }
 
 
@@ -111,7 +98,7 @@ def _cylinder(light: LightContents, *_others: object) -> SceneNode:
         "p0": ends[0].tolist(),
         "p1": ends[1].tolist(),
         "radius": radius,
-        "emitter": {"type": "area", "radiance": rgb(_radiance(light, area))},
+        "emitter": _area(light, area),
     }
 
 
@@ -181,8 +168,10 @@ def _bounding_radius(light: LightContents) -> float:
     return float(np.linalg.norm(light.to_world[:3, :3], 2) * np.linalg.norm(light.size))
 
 
-def _radiance(light: LightContents, area: float) -> NDArray[np.float64]:
-    return np.array(light.emission) / (area if light.is_normalized and area > 0 else 1)
+def _area(light: LightContents, area: float) -> SceneNode:
+    """Emitter of a shape with an area."""
+    radiance = np.array(light.emission) / (area if light.is_normalized and area > 0 else 1)
+    return {"type": "area", "radiance": rgb(radiance)}
 
 
 def _scale(to_world: NDArray[np.float64]) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 import posixpath
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,13 +38,10 @@ MISSING = (
 )
 
 
-def with_documents(
-    stage: Usd.Stage,
-    name: str,  # Beginning of messages
-) -> Usd.Stage:
+def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
     """The stage, or if it refers to MaterialX documents, one of copies of its layers that has them.
 
-    Warns about each document that cannot be read.
+    Warns about each document that cannot be read; messages begin with the name.
     """
     from pxr import Sdf, Usd
 
@@ -177,11 +175,15 @@ class _Material:
             prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
         return out.GetAttr().GetPath()
 
-    def _add_nodes(self, graph: Any, path: Sdf.Path) -> None:
-        """Add all nodes of a graph, and its outputs."""
+    def _add_graph(
+        self, graph: Any, path: Sdf.Path, inputs: Iterable[MaterialX.Input], parent: Sdf.Path, container: Any
+    ) -> None:
+        """Add a graph with inputs, all its nodes, and its outputs."""
         from pxr import UsdShade
 
-        connectable = UsdShade.ConnectableAPI.Get(self._stage, path)
+        connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
+        for each in inputs:
+            self._add_input(connectable, each, parent, container)
         for node in graph.getNodes():
             self._add_node(node, path, graph)
         for output in graph.getOutputs():
@@ -200,12 +202,9 @@ class _Material:
         name = "" if definition is None else definition.getName()
         implementation = None if definition is None else definition.getImplementation()
         if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
-            connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
             own = {each.getName() for each in node.getInputs()}
             others = [each for each in definition.getActiveInputs() if each.getName() not in own]
-            for each in (*others, *node.getInputs()):
-                self._add_input(connectable, each, parent, container)
-            self._add_nodes(implementation, path)
+            self._add_graph(implementation, path, (*others, *node.getInputs()), parent, container)
             return path
         shader = UsdShade.Shader.Define(self._stage, path)
         shader.CreateIdAttr(name or node.getCategory())
@@ -224,8 +223,6 @@ class _Material:
 
     def _connect(self, attribute: Usd.Attribute, port: Any, parent: Sdf.Path, container: Any) -> bool:
         """Connect an attribute to what a port of MaterialX reads, if it reads anything."""
-        from pxr import UsdShade
-
         name, output = port.getNodeName(), _prim_name(port.getOutputString() or "out")
         if port.hasInterfaceName():
             attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
@@ -236,10 +233,7 @@ class _Material:
                 return False
             path = self._path.AppendChild(_prim_name(graph.getName()))
             if not self._stage.GetPrimAtPath(path):
-                connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
-                for each in graph.getInputs():
-                    self._add_input(connectable, each, self._path, self._source)
-                self._add_nodes(graph, path)
+                self._add_graph(graph, path, graph.getInputs(), self._path, self._source)
             if not port.getOutputString() and graph.getOutputs():
                 output = _prim_name(graph.getOutputs()[0].getName())
             attribute.AddConnection(path.AppendProperty(f"outputs:{output}"))

@@ -178,18 +178,6 @@ def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[_Arguments]
     return lambda n: _mixed(n.bg, blend(n.fg, n.bg), n.mix)
 
 
-def _dodged(fg: Values, bg: Values) -> Values:
-    return np.where(np.abs(1 - fg) < 1e-8, 0.0, bg / (1 - fg))
-
-
-def _burned(fg: Values, bg: Values) -> Values:
-    return np.where(np.abs(fg) < 1e-8, 0.0, 1 - (1 - bg) / fg)
-
-
-def _remapped(n: _Arguments) -> Values:
-    return n.outlow + (n.value_in - n.inlow) * (n.outhigh - n.outlow) / (n.inhigh - n.inlow)
-
-
 def _extracted(n: _Arguments) -> Values:
     index = int(np.ravel(n.index)[0])
     return n.value_in[..., index : index + 1] if n.value_in.shape[-1] > 1 else n.value_in
@@ -249,7 +237,7 @@ OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
     "crossproduct": lambda n: np.cross(n.in1, n.in2),
     "rotate2d": _rotated,
     "rotate3d": _rotated_in_space,
-    "remap": _remapped,
+    "remap": lambda n: n.outlow + (n.value_in - n.inlow) * (n.outhigh - n.outlow) / (n.inhigh - n.inlow),
     "smoothstep": _smooth_step,
     "luminance": _luminance,
     "rgbtohsv": lambda n: _hsv(n.value_in),
@@ -260,8 +248,8 @@ OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
     "minus": _blended(lambda fg, bg: bg - fg),
     "difference": _blended(lambda fg, bg: np.abs(bg - fg)),
     "screen": _blended(lambda fg, bg: 1 - (1 - fg) * (1 - bg)),
-    "dodge": _blended(_dodged),
-    "burn": _blended(_burned),
+    "dodge": _blended(lambda fg, bg: np.where(np.abs(1 - fg) < 1e-8, 0.0, bg / (1 - fg))),
+    "burn": _blended(lambda fg, bg: np.where(np.abs(fg) < 1e-8, 0.0, 1 - (1 - bg) / fg)),
     "over": _blended(lambda fg, bg: fg + bg * (1 - fg[..., 3:])),
     "in": _blended(lambda fg, bg: fg * bg[..., 3:]),
     "mask": _blended(lambda fg, bg: bg * fg[..., 3:]),
@@ -291,13 +279,8 @@ OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
 SAMPLED = ("texcoord", "image", "heighttonormal")
 
 
-def node(
-    # As of `NodeContents`. `kind` is its type.
-    category: str,
-    kind: str,
-    **inputs: Input,  # `in_` for `in`
-) -> Input:
-    """An expression: a node, or what it comes to.
+def node(category: str, kind: str, **inputs: Input) -> Input:
+    """An expression: a node of a type, or what it comes to; ``in_`` is its input ``in``.
 
     What has only constant inputs is computed. A picture that is multiplied by constants and moved by them stays a
     picture; what changes nothing is left out.
@@ -333,13 +316,18 @@ def _plain(values: Values) -> float | list[float]:
     return float(numbers[0]) if numbers.size == 1 else numbers.tolist()
 
 
-def _is_all(given: Input, value: float) -> bool:
+def is_all(given: Input, value: float) -> bool:
     """Whether an input is a number, or all channels of a colour are."""
     return is_constant(given) and not isinstance(given, str) and bool(np.all(np.asarray(given) == value))
 
 
-def affine(texture: TextureContents, factor: Any, offset: Any) -> TextureContents | None:
-    """A picture times a factor and plus an offset, numbers or one for each channel; None if it has other channels."""
+def affine(texture: Input, factor: Any, offset: Any) -> TextureContents | None:
+    """A picture times a factor and plus an offset, numbers or one for each channel.
+
+    None if it has other channels, or is no picture.
+    """
+    if not isinstance(texture, TextureContents):
+        return None
     scales, offsets = np.ones(4), np.zeros(4)
     try:
         scales[texture.channels], offsets[texture.channels] = factor, offset
@@ -354,44 +342,36 @@ def affine(texture: TextureContents, factor: Any, offset: Any) -> TextureContent
     )
 
 
-def _scaled(given: Input, factor: Any, offset: Any) -> TextureContents | None:
-    return affine(given, factor, offset) if isinstance(given, TextureContents) else None
-
-
 def _simpler_product(kind: str, given: dict[str, Input]) -> Input | None:
     for one, other in (("in1", "in2"), ("in2", "in1")):
-        if _is_all(given[one], 1):
+        if is_all(given[one], 1):
             return _as_wide(given[other], kind)
-        if _is_all(given[one], 0):
+        if is_all(given[one], 0):
             return _plain(np.zeros(CHANNELS[kind]))
         if is_constant(given[one]):
-            return _scaled(given[other], given[one], 0.0)
+            return affine(given[other], given[one], 0.0)
     return None
 
 
 def _simpler_quotient(_kind: str, given: dict[str, Input]) -> Input | None:
     if not is_constant(given["in2"]) or np.any(np.asarray(given["in2"]) == 0):
         return None
-    return _scaled(given["in1"], 1 / np.asarray(given["in2"]), 0.0)
+    return affine(given["in1"], 1 / np.asarray(given["in2"]), 0.0)
 
 
 def _simpler_sum(kind: str, given: dict[str, Input]) -> Input | None:
     for one, other in (("in1", "in2"), ("in2", "in1")):
-        if _is_all(given[one], 0):
+        if is_all(given[one], 0):
             return _as_wide(given[other], kind)
         if is_constant(given[one]):
-            return _scaled(given[other], 1.0, given[one])
+            return affine(given[other], 1.0, given[one])
     return None
 
 
 def _simpler_difference(_kind: str, given: dict[str, Input]) -> Input | None:
     if is_constant(given["in2"]):
-        return _scaled(given["in1"], 1.0, -np.asarray(given["in2"]))
-    return _scaled(given["in2"], -1.0, given["in1"]) if is_constant(given["in1"]) else None
-
-
-def _simpler_inverse(_kind: str, given: dict[str, Input]) -> Input | None:
-    return _scaled(given["in"], -1.0, given["amount"]) if is_constant(given["amount"]) else None
+        return affine(given["in1"], 1.0, -np.asarray(given["in2"]))
+    return affine(given["in2"], -1.0, given["in1"]) if is_constant(given["in1"]) else None
 
 
 def _simpler_remap(_kind: str, given: dict[str, Input]) -> Input | None:
@@ -401,12 +381,12 @@ def _simpler_remap(_kind: str, given: dict[str, Input]) -> Input | None:
     if np.any(low == high):
         return None
     factor = (to_high - to_low) / (high - low)
-    return _scaled(given["in"], factor, to_low - low * factor)
+    return affine(given["in"], factor, to_low - low * factor)
 
 
 def _simpler_mix(kind: str, given: dict[str, Input]) -> Input | None:
     for value, name in ((0, "bg"), (1, "fg")):
-        if _is_all(given["mix"], value):
+        if is_all(given["mix"], value):
             return _as_wide(given[name], kind)
     return _as_wide(given["bg"], kind) if same(given["bg"], given["fg"]) else None
 
@@ -464,10 +444,10 @@ _SIMPLER: dict[str, Callable[[str, dict[str, Input]], Input | None]] = {
     "divide": _simpler_quotient,
     "add": _simpler_sum,
     "subtract": _simpler_difference,
-    "invert": _simpler_inverse,
+    "invert": lambda _, given: affine(given["in"], -1.0, given["amount"]) if is_constant(given["amount"]) else None,
     "remap": _simpler_remap,
     "mix": _simpler_mix,
-    "power": lambda kind, given: _as_wide(given["in1"], kind) if _is_all(given["in2"], 1) else None,
+    "power": lambda kind, given: _as_wide(given["in1"], kind) if is_all(given["in2"], 1) else None,
     "ifgreater": _simpler_choice(lambda a, b: a > b),
     "ifgreatereq": _simpler_choice(lambda a, b: a >= b),
     "ifequal": _simpler_choice(lambda a, b: a == b),

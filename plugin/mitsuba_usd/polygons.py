@@ -21,13 +21,10 @@ AROUND, ALONG = 64, 24
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 
 
-def read_normals(
-    reader: MeshReader,
-    cage: CageContents,  # Contents of the mesh, in its own space
-) -> NDArray[np.float64] | None:
+def read_normals(reader: MeshReader, cage: CageContents) -> NDArray[np.float64] | None:
     """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``, after skinning; None without any.
 
-    Normals that do not fit the mesh are left out, with a message to the reader.
+    They are in the mesh's own space, as the cage. Those that do not fit the mesh are left out, with a message.
     """
     from pxr import UsdGeom
 
@@ -74,8 +71,7 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
     """A Cube, Plane, Sphere, Cylinder, Cone or Capsule as polygons, maybe with normals at face corners."""
 
     def number(name: str, usual: float) -> float:
-        attribute = prim.GetAttribute(name)
-        value = value_at(attribute, time) if attribute else None
+        value = value_at(prim.GetAttribute(name), time)
         size = usual if value is None else float(value)
         if not 0 <= size < np.inf:
             raise ValueError(f"{name} is {size}; expected a finite number, 0 or more")
@@ -131,13 +127,8 @@ def _capsule(number: Number) -> Polygons:
 
 
 GPRIMS: dict[str, Callable[[Number], Polygons]] = {
-    "Cube": _cube,
-    "Plane": _plane,
-    "Sphere": _sphere,
-    "Cylinder": _cylinder,
-    "Cone": _cone,
-    "Capsule": _capsule,
-}
+    "Cube": _cube, "Plane": _plane, "Sphere": _sphere, "Cylinder": _cylinder, "Cone": _cone, "Capsule": _capsule,
+}  # fmt: skip
 
 
 def _arc(radius: float, start: float, end: float, height: float) -> tuple[NDArray, NDArray]:

@@ -16,8 +16,7 @@ from .bsdfs import Bsdfs, interior, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .emitters import emitter, one_environment
 from .limit_surfaces import Surfaces
-from .loaded_shapes import LoadedShapes
-from .shapes import as_polygons, polygon_mesh, subdivision
+from .shapes import LoadedShapes, as_polygons, polygon_mesh, subdivision
 from .stage_warnings import StageWarnings
 from .studio_defaults import RESERVED
 from .textures import Textures
@@ -43,15 +42,11 @@ class SceneEntries:
         # Whether shapes of lights let light through, which takes the integrator `volpath`
         has_clear_lamps: bool = False,
     ) -> None:
-        self._contents = contents
-        self._notes = notes
+        self._contents, self._notes = contents, notes
         self._textures = Textures(notes, needed, texture_size)
         self._bsdfs = Bsdfs(self._textures, notes)
-        self._parameters = parameters
-        self._surfaces = surfaces
-        self._triangles = triangles or {}
-        self._loaded = loaded
-        self._has_clear_lamps = has_clear_lamps
+        self._parameters, self._surfaces, self._triangles = parameters, surfaces, triangles or {}
+        self._loaded, self._has_clear_lamps = loaded, has_clear_lamps
         # Entries of BSDFs that are the same for all shapes, by material.
         self._shared: dict[int, str] = {}
         self.scene: SceneNode = {"type": "scene"}

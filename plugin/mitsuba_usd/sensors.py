@@ -17,13 +17,8 @@ _LEAST_NEAR = 1e-6
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
 
 
-def sensor(
-    camera: CameraContents,
-    size: tuple[int, int],  # (width, height): of the film, in pixels
-    spp: int,
-    notes: StageWarnings,
-) -> SceneNode:
-    """A sensor whose film is the camera's aperture, fitted to the size."""
+def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: StageWarnings) -> SceneNode:
+    """A sensor whose film is the camera's aperture, fitted to the size (width, height) in pixels."""
     width, height = size
     wide, high = film_window(camera, width / height)
     matrix = camera.to_world @ np.diag([-1.0, 1, -1, 1])

@@ -64,8 +64,7 @@ def read_settings(stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings) ->
     path = prim.GetPath()
 
     def value(name: str) -> Any:
-        attribute = prim.GetAttribute(name)
-        return value_at(attribute, time) if attribute else None
+        return value_at(prim.GetAttribute(name), time)
 
     for name, neutral in _NEUTRAL_SETTINGS.items():
         authored = prim.GetAttribute(name).HasAuthoredValue()

@@ -14,23 +14,15 @@ from .stage_warnings import StageWarnings
 if TYPE_CHECKING:
     from pxr import Usd
 
-KINDS = {
-    "DistantLight": "distant",
-    "RectLight": "rect",
-    "DiskLight": "disk",
-    "SphereLight": "sphere",
-    "CylinderLight": "cylinder",
-    "DomeLight": "dome",
-    "DomeLight_1": "dome",
-}
-# Attributes for the sizes of each kind. The schemas of lights say what they are without a value.
-_SIZES = {
-    "distant": ["inputs:angle"],
-    "rect": ["inputs:width", "inputs:height"],
-    "disk": ["inputs:radius"],
-    "sphere": ["inputs:radius"],
-    "cylinder": ["inputs:length", "inputs:radius"],
-    "dome": [],
+# Kind of each type, and attributes for its sizes. The schemas of lights say what they are without a value.
+_KINDS: dict[str, tuple[str, ...]] = {
+    "DistantLight": ("distant", "inputs:angle"),
+    "RectLight": ("rect", "inputs:width", "inputs:height"),
+    "DiskLight": ("disk", "inputs:radius"),
+    "SphereLight": ("sphere", "inputs:radius"),
+    "CylinderLight": ("cylinder", "inputs:length", "inputs:radius"),
+    "DomeLight": ("dome",),
+    "DomeLight_1": ("dome",),
 }
 # Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
 _POINTLIKE = 1.0
@@ -47,19 +39,16 @@ _NEUTRAL = {
 
 
 def read_light(
-    prim: Usd.Prim,
-    to_world: NDArray[np.float64],  # (4, 4) float64: for column vectors
-    time: Usd.TimeCode,
-    notes: StageWarnings,
+    prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> LightContents | None:
-    """Read a light; None if its kind is not supported."""
+    """Read a light with a transform ``(4, 4)`` for column vectors; None if its kind is not supported."""
     path, given = prim.GetPath(), str(prim.GetTypeName())
-    kind = KINDS.get(given)
-    if kind is None:
-        notes.add(f"lights of type {given} are ignored; expected one of {', '.join(KINDS)}", path)
+    if given not in _KINDS:
+        notes.add(f"lights of type {given} are ignored; expected one of {', '.join(_KINDS)}", path)
         return None
     _note_ignored(prim, time, notes)
-    size = [float(value_at(prim.GetAttribute(name), time)) for name in _SIZES[kind]]
+    kind, *sizes = _KINDS[given]
+    size = [float(value_at(prim.GetAttribute(name), time)) for name in sizes]
     if kind == "distant" and size[0] > _POINTLIKE:
         notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
     is_point = bool(kind == "sphere" and _value(prim, "treatAsPoint", time, False))
@@ -95,8 +84,7 @@ def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
 
 
 def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
-    attribute = prim.GetAttribute(name)
-    value = value_at(attribute, time) if attribute else None
+    value = value_at(prim.GetAttribute(name), time)
     return usual if value is None else value
 
 

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_layers import MISSING, has_materialx
-from .stage_networks import NetworkReader, note_unknown_inputs, source_of
+from .stage_networks import NetworkReader, note_unknown_inputs, path_of, source_of
 from .stage_warnings import StageWarnings
 from .surface_models import MODELS, PREVIEW, left_out
-from .texture_image import UDIM
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdShade
@@ -38,8 +37,7 @@ class MaterialReader:
     """Reads materials, each once."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
-        self._time = time
-        self._notes = notes
+        self._time, self._notes = time, notes
         self._networks = NetworkReader(time, notes)
         self._numbers: dict[str, int | None] = {}
         self.materials: list[MaterialContents] = []  # Of those that are equal, the first
@@ -59,7 +57,12 @@ class MaterialReader:
         """Number of a material; None if it is not supported."""
         path = str(material.GetPath())
         if path not in self._numbers:
-            contents = self._read(material)
+            try:
+                contents = self._contents(material)
+            except (AttributeError, TypeError, ValueError, IndexError, RecursionError):
+                what = "materials whose inputs have other types than their model's are ignored"
+                self._notes.add(f"{what}, and display colours are used", path)
+                contents = None
             self._numbers[path] = None if contents is None else self._numbered(contents)
         return self._numbers[path]
 
@@ -70,16 +73,6 @@ class MaterialReader:
                 return number
         self.materials.append(contents)
         return len(self.materials) - 1
-
-    def _read(self, material: UsdShade.Material) -> MaterialContents | None:
-        try:
-            return self._contents(material)
-        except (AttributeError, TypeError, ValueError, IndexError, RecursionError):
-            what = (
-                "materials whose inputs have other types than their model's are ignored, and display colours are used"
-            )
-            self._notes.add(what, material.GetPath())
-            return None
 
     def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()
@@ -172,10 +165,11 @@ class MaterialReader:
         if output not in _OUTPUTS:
             self._notes.add(f'the output "{output}" of textures is not there; rgb is used', path)
             output = "rgb"
-        file = self._file(shader)
-        if not file:
+        asset = self._value(shader, "file", None)
+        if asset is None or not asset.path:
             self._notes.add("textures without a file are ignored", path)
             return None
+        file = path_of(asset, shader.GetInput("file").GetValueProducingAttributes()[0], self._time)
         wraps = [self._word(shader, f"wrap{axis}", _WRAPS, "useMetadata") for axis in "ST"]
         if _WRAPS[wraps[0]] != _WRAPS[wraps[1]]:
             self._notes.add("wrapT of textures is ignored; wrapS applies to both coordinates", path)
@@ -193,20 +187,6 @@ class MaterialReader:
             texcoords,
             self._four(shader, "fallback", (0, 0, 0, 1)),
         )
-
-    def _file(self, shader: UsdShade.Shader) -> str:
-        """Path of a texture's file; "" if it has none."""
-        from pxr import UsdShade
-
-        asset = self._value(shader, "file", None)
-        if asset is None or not asset.path:
-            return ""
-        if asset.resolvedPath or UDIM not in asset.path:
-            return str(asset.resolvedPath or asset.path)
-        # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
-        attribute = shader.GetInput("file").GetValueProducingAttributes()[0]
-        layer = attribute.GetPropertyStack(self._time)[0].layer
-        return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
 
     def _placement(self, shader: UsdShade.Shader, name: str) -> tuple[NDArray[np.float64], str]:
         """Transform ``(3, 3)`` of texture coordinates, and the name of their primvar."""

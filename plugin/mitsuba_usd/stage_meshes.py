@@ -29,26 +29,19 @@ _NO_FACES: IntArray = np.zeros(0, np.int64)
 
 
 class ShapeReader:
-    """Reads meshes, and the shapes that USD has without meshes."""
+    """Reads meshes, and the shapes that USD has without meshes; messages begin with the name."""
 
-    def __init__(
-        self,
-        name: str,  # Beginning of messages
-        time: Usd.TimeCode,
-        materials: MaterialReader,
-        notes: StageWarnings,
-    ) -> None:
+    def __init__(self, name: str, time: Usd.TimeCode, materials: MaterialReader, notes: StageWarnings) -> None:
         self._name, self._time, self._materials, self._notes = name, time, materials, notes
         self._skinning = Skinning(time, notes.add)
 
-    def read(
-        self,
-        prim: Usd.Prim,
-        to_world: NDArray[np.float64],  # (4, 4) float64: from the prim's space, for column vectors
-    ) -> list[ShapeContents]:
-        """Shapes of a prim: one for each material. Raises CageError, TypeError, ValueError if it cannot be used."""
+    def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
+        """Shapes of a prim with a transform ``(4, 4)`` for column vectors: one for each material.
+
+        Raises CageError, TypeError, ValueError if it cannot be used.
+        """
         location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
-        if not is_invertible(to_world):
+        if not are_invertible(to_world):
             raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
         with np.errstate(over="ignore", invalid="ignore"):
             if str(prim.GetTypeName()) not in GPRIMS:
@@ -182,11 +175,6 @@ def _faces_of(reader: MeshReader, subset: UsdGeom.Subset, face_count: int) -> In
     faces = reader.array(subset.GetIndicesAttr(), np.int64)
     require_range(faces, face_count, f"{reader.location}: subset {subset.GetPrim().GetName()} has")
     return faces
-
-
-def is_invertible(matrix: NDArray[np.float64]) -> bool:
-    """Whether a transform ``(4, 4)`` is finite and has an inverse."""
-    return bool(are_invertible(matrix))
 
 
 def are_invertible(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:

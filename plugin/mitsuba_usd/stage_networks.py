@@ -58,12 +58,22 @@ def source_of(given: UsdShade.Input, notes: StageWarnings) -> Usd.Attribute | No
     return found[0] if found else None
 
 
+def path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
+    """Path of the file that is the value of an attribute; "" for none."""
+    from pxr import UsdShade
+
+    if asset.resolvedPath or UDIM not in asset.path:
+        return str(asset.resolvedPath or asset.path)
+    # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
+    layer = attribute.GetPropertyStack(time)[0].layer
+    return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
+
+
 class NetworkReader:
     """Reads shaders whose identifiers are definitions of MaterialX."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
-        self._time = time
-        self._notes = notes
+        self._time, self._notes = time, notes
         self._known: dict[tuple[str, str], Input | None] = {}
         self._sizes: dict[int, int] = {}
 
@@ -111,10 +121,7 @@ class NetworkReader:
         """A file as a picture of four channels that is everywhere."""
         from pxr import UsdShade
 
-        path = str(asset.resolvedPath or asset.path)
-        if not asset.resolvedPath and UDIM in asset.path:
-            layer = attribute.GetPropertyStack(self._time)[0].layer
-            path = UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
+        path = path_of(asset, attribute, self._time)
         given = UsdShade.Shader(attribute.GetPrim()).GetInput(_COLOR_SPACE)
         named = value_at(given.GetAttr(), self._time) if given else None
         space = "sRGB" if self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()) else "raw"
@@ -283,7 +290,7 @@ class NetworkReader:
         if is_constant(scale):
             x, y = constant(scale, 2).tolist()
             factor, offset = [2 * x, 2 * y, 2.0], [-x, -y, -1.0]
-            turned = affine(picture, factor, offset) if isinstance(picture, TextureContents) else None
+            turned = affine(picture, factor, offset)
             if turned is not None:
                 return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0])
             scaled = node("multiply", "vector3", in1=picture, in2=factor)

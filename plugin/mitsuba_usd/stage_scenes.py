@@ -34,11 +34,11 @@ from numpy.typing import NDArray
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .limit_surfaces import Surfaces
-from .loaded_shapes import LoadedShapes
 from .materialx_layers import library
 from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
 from .scene_entries import SceneEntries
 from .sensors import NO_BLUR, sensor
+from .shapes import LoadedShapes
 from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage
 from .stage_warnings import StageWarnings
 from .studio_defaults import angles_for, size_for, with_studio_defaults
@@ -309,7 +309,7 @@ class StageReader:
     def __init__(
         self,
         path: str | Path,
-        camera: str | None = None,  # Its path; by default, that of the stage's render settings, or its first one
+        camera: str | None = None,  # As of `read_stage`
         warned: set[str] | None = None,  # Warnings about other files, without their names; those about this are added
     ) -> None:
         with Path(path).open("rb"):

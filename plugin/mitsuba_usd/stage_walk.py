@@ -35,7 +35,7 @@ from .polygons import GPRIMS
 from .stage_camera import FrameSettings, read_camera, read_settings
 from .stage_lights import read_light
 from .stage_materials import MaterialReader
-from .stage_meshes import COLORS, ShapeReader, are_invertible, is_invertible
+from .stage_meshes import COLORS, ShapeReader, are_invertible
 from .stage_warnings import StageWarnings
 
 if TYPE_CHECKING:
@@ -84,13 +84,11 @@ class _Subtree:
         return bool(self.shapes) and not self.lights and not any(is_hindered)
 
 
-def read_stage(
-    path: str | Path,
-    # Time code; by default, each value is the one that does not depend on time, or else its first sample
-    time: float | None = None,
-    camera: str | None = None,  # Its path; by default, that of the stage's render settings, or its first one
-) -> SceneContents:
+def read_stage(path: str | Path, time: float | None = None, camera: str | None = None) -> SceneContents:
     """Read a stage, in this process. Warns about everything that is ignored, once for each kind.
+
+    Without a time code, each value is the one that does not depend on time, or else its first sample. Without the path
+    of a camera, it is that of the stage's render settings, or its first one.
 
     Raises CageError if the package usd-core is missing; if the file is malformed; if there is no such camera.
     """
@@ -151,10 +149,8 @@ class _StageWalk:
     ) -> None:
         from pxr import Usd
 
-        self._stage = stage
-        self._name = name
+        self._stage, self._name, self._notes = stage, name, notes
         self._code = Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
-        self._notes = notes
         self._at, self._count = at, 0
         self._transforms: dict[str, Gf.Matrix4d] = {}
         self._materials = MaterialReader(self._code, notes)
@@ -204,7 +200,7 @@ class _StageWalk:
         """Visible contents of a prim and its descendants."""
         found, to_world = _Subtree(), self._to_world(root)
         # Of a singular transform, none of it is visible.
-        to_root = np.asarray(np.linalg.inv(to_world) if is_invertible(to_world) else np.eye(4))
+        to_root = np.asarray(np.linalg.inv(to_world) if are_invertible(to_world) else np.eye(4))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
             name = str(prim.GetPath()).removeprefix(above)
@@ -218,8 +214,7 @@ class _StageWalk:
         """Add what a prim shows."""
         from pxr import UsdGeom, UsdLux
 
-        draw_mode = prim.GetAttribute("model:drawMode")
-        if draw_mode and value_at(draw_mode, self._code) not in _FULL_MODES:
+        if value_at(prim.GetAttribute("model:drawMode"), self._code) not in _FULL_MODES:
             self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
         if prim != root and prim.IsInstance():
             self._add_instance(prim, name, to_root, found)
@@ -281,7 +276,7 @@ class _StageWalk:
     def _add_instance(self, prim: Usd.Prim, name: str, to_root: NDArray[np.float64], found: _Subtree) -> None:
         """Add an instance; instances that differ in appearance belong to different prototypes."""
         matrix = to_root @ self._to_world(prim)
-        if is_invertible(matrix):
+        if are_invertible(matrix):
             found.instances.append(InstanceContents(name, self._prototype(self._appearance(prim), prim), matrix))
         else:
             self._notes.add(_SINGULAR, prim.GetPath())

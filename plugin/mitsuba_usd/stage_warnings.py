@@ -20,12 +20,8 @@ class StageWarnings:
         # The first message of kinds of which each message names its prim.
         self._first: dict[str, str] = {}
 
-    def add(
-        self,
-        what: str,  # The problem and its consequence, the same text for all of its kind
-        prim: object,
-    ) -> None:
-        """Record a problem of a prim."""
+    def add(self, what: str, prim: object) -> None:
+        """Record a problem of a prim and its consequence, the same text for all of its kind."""
         prims = self._prims.setdefault(what, [])
         if str(prim) not in prims:
             prims.append(str(prim))
@@ -43,9 +39,9 @@ class StageWarnings:
     ) -> None:
         """Warn of each kind once."""
         for kind, prims in self._prims.items():
-            if warned is not None and kind in warned:
-                continue
             if warned is not None:
+                if kind in warned:
+                    continue
                 warned.add(kind)
             if kind not in self._first:
                 warn(f"{name}: {kind} ({_listed(prims)})")

@@ -10,7 +10,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .bsdfs import integrator, rgb
-from .contents import CameraContents, SceneContents
+from .contents import SceneContents
 from .emitters import are_lamps_in_the_way
 from .sensors import sensor
 from .stage_warnings import StageWarnings
@@ -38,7 +38,12 @@ def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
 
 def angles_for(contents: SceneContents, look: Look) -> View:
     """View direction of a stage's camera, for the studio, whose lights turn with the camera."""
-    return look.view if contents.camera is None else _angles(contents.camera, contents.up)
+    if contents.camera is None:
+        return look.view
+    back = contents.camera.to_world[:3, 2]
+    right, behind, above = back if contents.up == "z" else (back[0], -back[2], back[1])
+    azimuth = math.degrees(math.atan2(right, -behind))
+    return azimuth, math.degrees(math.asin(np.clip(above, -1, 1)))
 
 
 def with_studio_defaults(
@@ -47,7 +52,7 @@ def with_studio_defaults(
     is_lit: bool,  # Whether the stage has lights
     look: Look,
     notes: StageWarnings,
-    name: str | None = None,  # Of the stage, with which messages begin
+    name: str,  # Of the stage, with which messages begin
 ) -> SceneNode:
     """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene."""
     camera, size = contents.camera, size_for(contents, look)
@@ -78,11 +83,3 @@ def _distant_light(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
     area = 4 * np.linalg.norm(np.cross(matrix[:3, 0], matrix[:3, 1]))
     irradiance = np.array(light["emitter"]["radiance"]["value"]) * area / distance**2
     return {"type": "directional", "direction": (towards / distance).tolist(), "irradiance": rgb(irradiance)}
-
-
-def _angles(camera: CameraContents, up: str) -> tuple[float, float]:
-    """Azimuth and elevation of a camera."""
-    back = camera.to_world[:3, 2]
-    right, behind, above = back if up == "z" else (back[0], -back[2], back[1])
-    azimuth = math.degrees(math.atan2(right, -behind))
-    return azimuth, math.degrees(math.asin(np.clip(above, -1, 1)))

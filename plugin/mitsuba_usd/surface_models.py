@@ -14,12 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents
-from .materialx_nodes import constant, is_constant, node
+from .materialx_nodes import constant, is_all, is_constant, node
 
 Given = Callable[[str], Input]
 WHITE, BLACK = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
 # Of OpenPBR's 82 degrees, where colours of metals differ most.
 COSINE_82 = 1 / 7
+# Difference of reflectances that nobody sees at an edge.
+_VISIBLE = 0.05
 
 # What a surface has, and the value of what it does not say. Widths of GGX lobes are the square of roughness.
 NEUTRAL: dict[str, Input] = {
@@ -49,10 +51,10 @@ NEUTRAL: dict[str, Input] = {
 
 
 class Model(NamedTuple):
-    """The map from a model's inputs to those of `NEUTRAL`, and the neutral values of inputs without a counterpart."""
+    """The map from a model's inputs to those of `NEUTRAL`, and the names of inputs without a counterpart."""
 
     inputs: Callable[[Given], dict[str, Input]]
-    left: Mapping[str, Input]
+    left: tuple[str, ...]
 
 
 def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialContents:
@@ -70,7 +72,8 @@ def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialConte
 
 def left_out(model: str, given: Mapping[str, Input]) -> list[str]:
     """Inputs of a material that have no place in `NEUTRAL` and are not neutral."""
-    return [name for name, neutral in MODELS[model].left.items() if name in given and given[name] != neutral]
+    neutral = {"transmission_scatter": BLACK}
+    return [name for name in MODELS[model].left if name in given and given[name] != neutral.get(name, 0.0)]
 
 
 def standard_surface(i: Given) -> dict[str, Input]:
@@ -266,12 +269,11 @@ def reflectance(ior: Input) -> Input:
     return number("multiply", root, root)
 
 
-def conductor(
-    # (..., 3) float: what it reflects head-on, and how it turns to white towards grazing angles
-    reflectivity: ArrayLike,
-    edge: ArrayLike,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Index of refraction and absorption of a metal: [Gulbrandsen 2014], equations 11 to 15."""
+def conductor(reflectivity: ArrayLike, edge: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Index of refraction and absorption of a metal: [Gulbrandsen 2014], equations 11 to 15.
+
+    From colours (..., 3): what it reflects head-on, and how it turns to white towards grazing angles.
+    """
     r, g = np.clip(reflectivity, 0, 0.99), np.clip(edge, 0, 1)
     root = np.sqrt(r)
     n = g * (1 - r) / (1 + r) + (1 - g) * (1 + root) / (1 - root)
@@ -309,6 +311,15 @@ def edge_color(reflectivity: Input, at_82_degrees: Input) -> Input:
     return edges[np.abs(found - target).argmin(axis=0), 0].tolist()
 
 
+def has_white_edges(base: Input, edge: Input) -> bool:
+    """Whether a metal turns to white towards its edges as Schlick has it, and `principled`, as far as one sees."""
+    if not (is_constant(base) and is_constant(edge)):
+        return is_all(edge, 1)
+    color = constant(base, 3)
+    found = conductor_reflectance(*conductor(color, constant(edge, 3)), COSINE_82)
+    return is_all(edge, 1) or bool(np.abs(found - schlick_reflectance(color, COSINE_82)).max() < _VISIBLE)
+
+
 def _below_coat(coat: Input, ior: Input) -> Input:
     """What of the light gets through a coat, head-on."""
     return complement(number("multiply", coat, reflectance(ior)))
@@ -319,32 +330,18 @@ def _colors_of_depth(color: Input, depth: Input) -> dict[str, Input]:
     return {"transmission_color": color} if depth == 0 else {"depth_color": color, "depth": depth}
 
 
-_BLACK_SCATTER: dict[str, Input] = {"transmission_scatter": BLACK, "transmission_scatter_anisotropy": 0.0}
 MODELS: dict[str, Model] = {
-    "standard_surface": Model(
-        standard_surface,
-        {
-            "diffuse_roughness": 0.0,
-            **_BLACK_SCATTER,
-            "transmission_dispersion": 0.0,
-            "transmission_extra_roughness": 0.0,
-            "coat_anisotropy": 0.0,
-            "thin_film_thickness": 0.0,
-        },
-    ),
-    "open_pbr_surface": Model(
-        open_pbr_surface,
-        {
-            "base_diffuse_roughness": 0.0,
-            **_BLACK_SCATTER,
-            "transmission_dispersion_scale": 0.0,
-            "coat_roughness_anisotropy": 0.0,
-            "thin_film_weight": 0.0,
-        },
-    ),
-    "UsdPreviewSurface": Model(preview_surface, {"displacement": 0.0}),
-    "gltf_pbr": Model(gltf_pbr, {"iridescence": 0.0, "dispersion": 0.0}),
-}
+    "standard_surface": Model(standard_surface, (
+        "diffuse_roughness", "transmission_scatter", "transmission_scatter_anisotropy", "transmission_dispersion",
+        "transmission_extra_roughness", "coat_anisotropy", "thin_film_thickness",
+    )),
+    "open_pbr_surface": Model(open_pbr_surface, (
+        "base_diffuse_roughness", "transmission_scatter", "transmission_scatter_anisotropy",
+        "transmission_dispersion_scale", "coat_roughness_anisotropy", "thin_film_weight",
+    )),
+    "UsdPreviewSurface": Model(preview_surface, ("displacement",)),
+    "gltf_pbr": Model(gltf_pbr, ("iridescence", "dispersion")),
+}  # fmt: skip
 # What inputs of UsdPreviewSurface are where they are not authored.
 PREVIEW: dict[str, Input] = {
     "diffuseColor": [0.18, 0.18, 0.18],

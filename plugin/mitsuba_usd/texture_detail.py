@@ -22,11 +22,8 @@ MOST_EDGES = 0.95
 MOST_SAMPLES = 20_000
 
 
-def texels_for_pictures(
-    contents: SceneContents,
-    sensors: Sequence[SceneNode],  # Entries of a scene
-) -> dict[str, float]:
-    """Pixels along the sides of textures that pictures show at most, by file; of tiles, along those of each.
+def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
+    """Pixels along the sides of textures that pictures by sensors show at most, by file; of tiles, along those of each.
 
     Files of which the detail is unknown are missing, or have no bound.
     """

@@ -133,12 +133,10 @@ class Textures:
         if key not in self._bitmaps:
             self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
             self._bitmaps[key].set_srgb_gamma(is_decoded)
-        return self._node(self._bitmaps[key], to_uv, texture.wrap, is_raw)
+        return self._bitmap(self._bitmaps[key], to_uv, texture.wrap, is_raw)
 
-    def _bitmap(self, values: NDArray, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
-        return self._node(_linear_bitmap(values), to_uv, wrap, is_raw)
-
-    def _node(self, bitmap: mi.Bitmap, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
+    def _bitmap(self, values: NDArray | mi.Bitmap, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
+        bitmap = values if isinstance(values, mi.Bitmap) else _linear_bitmap(values)
         transform = mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist())
         return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": wrap, "to_uv": transform}
 

@@ -3,6 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision import upload
 
 # Sums of some tens of terms of order one, in single precision.
 SINGLE = 2e-6
@@ -23,9 +24,22 @@ def rows(value):
     return np.array(value, dtype=np.float64).T
 
 
-def hit(shape, x=0.1, y=0.2):
+def scene_with(**objects):
+    return mi.load_dict({"type": "scene", **objects})
+
+
+def rays(o, d):
+    return mi.Ray3f(upload(mi.Point3f, o), upload(mi.Vector3f, d))
+
+
+def down(x=0.1, y=0.2, z=5):
+    """A ray from above."""
+    return mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(0, 0, -1))
+
+
+def hit(shape, *place):
     """Of a ray from above."""
-    return mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(mi.Ray3f([x, y, 5], [0, 0, -1]))
+    return scene_with(shape=shape).ray_intersect(down(*place))
 
 
 def film(width, height=None):

@@ -1,7 +1,6 @@
 """Texture coordinates and attributes of the shape: parameters, buffers, derivatives and renders."""
 
 import gc
-import re
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +14,7 @@ from reference.refined_cages import tagged
 from shapes.cages import ISLANDS, cube, described, load, textured
 from shapes.scenes import SINGLE, WIDTHS, buffer, film, hit, perspective, vertices
 from shapes.updates import differentiated, update
-from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, mirrors, scalar, shadings
+from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, mirrors, shadings
 
 
 def textured_cube(rng, **options):
@@ -135,42 +134,6 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of(name, width, messag
     cage = cube(attributes={"colour": cube().positions, name: np.ones((8, width))})
     with pytest.warns(CageWarning, match=message):
         assert mesh_attributes(cage) == {"colour": 3}
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"texcoords": np.zeros((8, 3))}, 'parameter "texcoords" has shape (8, 3); expected (n, 2)'),
-        ({"texcoords": np.zeros((7, 2))}, 'attribute "texcoords" has 7 values; expected 8, one per vertex'),
-        ({"texcoord_indices": np.zeros(24)}, 'parameter "texcoord_indices" needs "texcoords"'),
-        (
-            {"texcoords": np.zeros((4, 2)), "texcoord_indices": np.full(24, 4)},
-            'face 0: corner 0 has index 4 into attribute "texcoords"; expected 0 to 3',
-        ),
-        ({"texcoords": np.zeros((8, 2)), "varying_texcoords": np.zeros((8, 2))}, '"texcoords" a second time'),
-        ({"vertex_c": np.zeros((8, 3)), "varying_c": np.zeros((8, 3))}, '"c" a second time; expected one'),
-        ({"vertex_normals": np.zeros((8, 3))}, 'parameter "vertex_normals" names an attribute "normals"'),
-        ({"vertex_c": np.zeros(8)}, 'parameter "vertex_c" has shape (8,); expected (n, k)'),
-        ({"vertex_c": "red"}, "parameter \"vertex_c\" is 'red'; expected a tensor"),
-        ({"texcord": np.zeros((8, 2))}, 'unknown parameter "texcord", did you mean "texcoords"?'),
-        (
-            {"filename": "cage.obj", "texcoords": np.zeros((8, 2))},
-            'parameters "filename" and "texcoords" contradict each other',
-        ),
-    ],
-)
-@every_variant
-def test_errors_say_what_was_expected(parameters, message):
-    cage = {"type": "subdivision"} if "filename" in parameters else described(cube())
-    given = {name: upload(mi.TensorXf, v) if isinstance(v, np.ndarray) else v for name, v in parameters.items()}
-    with pytest.raises(RuntimeError, match=re.escape(message)):
-        mi.load_dict({**cage, **given})
-
-
-@scalar
-def test_seams_are_an_error_for_doo_sabin(np_rng):
-    with pytest.raises(RuntimeError, match="the scheme doo_sabin has no rules for seams"):
-        make(textured_cube(np_rng), scheme="doo_sabin")
 
 
 @every_variant

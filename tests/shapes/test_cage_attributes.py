@@ -1,9 +1,5 @@
 """Texture coordinates and attributes at the cage as parameters: what follows them, and gradients by them."""
 
-import gc
-import re
-import weakref
-
 import drjit as dr
 import mitsuba as mi
 import mitsuba_subdivision as msub
@@ -15,7 +11,7 @@ from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
 from reference.refined_cages import refine_first, tagged
 from shapes.cages import MIXED_FACES, cube, load
 from shapes.scenes import SINGLE, buffer, perspective
-from shapes.updates import MODES, derivative, differentiated, update
+from shapes.updates import MODES, assign_cage, derivative, differentiated, update
 from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, shadings
 
 # Where a ray meets the surface in single precision, times the slope of attributes there.
@@ -80,14 +76,6 @@ def make(cage, **parameters):
     return load(cage, **({} if "tessellation" in parameters else {"tessellation_rate": 4}), **parameters)
 
 
-def values_of(cage):
-    return {"texcoords": cage.texcoords.values, **{name: each.values for name, each in cage.attributes.items()}}
-
-
-def assign(parameters, cage):
-    update(parameters, {f"cage_{n}": upload(type(parameters[f"cage_{n}"]), v) for n, v in values_of(cage).items()})
-
-
 def assert_alike(shape, expected):
     for name in (f"vertex_{name}" for name in NAMES):
         np.testing.assert_allclose(buffer(shape, name), buffer(expected, name), rtol=0, atol=SINGLE, err_msg=name)
@@ -141,20 +129,15 @@ def test_a_frozen_function_sees_new_values(shading, interpolation, by):
     [*((name, "vertex") for name in CAGES), *(pytest.param(name, "exact", marks=exact) for name in ("cube", "mixed"))],
     indirect=["cage"],
 )
-def test_an_update_equals_a_new_shape(cage, shading):
+def test_values_are_shown_as_they_were_given_and_an_update_of_them_equals_a_new_shape(cage, shading):
     made, parameters = cage
     shape = make(made(), shading=shading, **parameters)
-    assign(mi.traverse(shape), made(1))
+    shown = mi.traverse(shape)
+    for name, values in {"texcoords": made().texcoords, **made().attributes}.items():
+        np.testing.assert_array_equal(np.array(shown[f"cage_{name}"]), values.values.ravel().astype(np.float32))
+    assign_cage(shape, made(1))
     assert (len(buffer(shape, "vertex_texcoords")) > 0) == (shading == "vertex")
     assert_alike(shape, make(made(1), shading=shading, **parameters))
-
-
-@every_variant
-def test_traverse_shows_the_values_as_they_were_given(cage):
-    made, parameters = cage
-    found = mi.traverse(make(made(), **parameters))
-    for name, values in values_of(made()).items():
-        np.testing.assert_array_equal(np.array(found[f"cage_{name}"]), values.ravel().astype(np.float32))
 
 
 def hits(shape):
@@ -178,7 +161,7 @@ def hits(shape):
     return np.array([np.array(each).ravel() for each in found])
 
 
-# Vertices of the other cages follow in test_an_update_equals_a_new_shape; hits compile kernels for seconds.
+# Vertices of the other cages follow in the test above by updates; hits compile kernels for seconds.
 @exact
 @every_array_variant
 @pytest.mark.parametrize("cage", ["refined", "loop", "adaptive mixed"], indirect=True)
@@ -186,7 +169,7 @@ def test_hits_follow(cage):
     made, parameters = cage
     shape = make(made(), shading="exact", **parameters)
     before = hits(shape)
-    assign(mi.traverse(shape), made(1))
+    assign_cage(shape, made(1))
     expected = hits(make(made(1), shading="exact", **parameters))
     scale = np.maximum(1, np.abs(expected))
     assert (np.abs(hits(shape) - expected) / scale).max() < HIT
@@ -198,11 +181,11 @@ def test_hits_follow(cage):
 def test_values_stay_when_triangles_are_chosen_anew(shading):
     shape = make(creased(), shading=shading, **ADAPTIVE)
     parameters, count = mi.traverse(shape), shape.vertex_count()
-    assign(parameters, creased(1))
+    assign_cage(shape, creased(1))
     update(parameters, chord_error=FINER["chord_error"])
     assert shape.vertex_count() > count
     assert_alike(shape, make(creased(1), shading=shading, **FINER))
-    assign(parameters, creased(2))
+    assign_cage(shape, creased(2))
     shape.retessellate()
     assert_alike(shape, make(creased(2), shading=shading, **FINER))
 
@@ -237,25 +220,6 @@ def test_attributes_that_a_mesh_has_no_place_for_are_no_parameters():
         shape = make(cube(attributes={"pair": np.ones((8, 2)), "colour": np.ones((8, 3))}))
     found = {key for key in mi.traverse(shape).keys() if key.startswith("cage_")}  # noqa: SIM118 - it iterates over pairs
     assert found == {"cage_colour"}
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (np.ones(23), "23 numbers; expected 24, 3 for each of 8 values at the cage"),
-        (
-            np.where(np.arange(24) > 21, np.inf, 1),
-            "number 22 is not finite; expected finite numbers (2 such in all)",
-        ),
-    ],
-)
-@every_variant
-def test_errors_say_what_was_expected(values, message):
-    parameters = mi.traverse(make(creased()))
-    if not dr.is_jit_v(mi.Float) and len(values) != len(parameters["cage_colour"]):
-        pytest.skip("Mitsuba compares the values before it assigns them")
-    with pytest.raises(ValueError, match=re.escape(f'parameter "cage_colour": {message}')):
-        update(parameters, cage_colour=upload(type(parameters["cage_colour"]), values))
 
 
 # Gradients
@@ -373,23 +337,6 @@ def test_each_view_has_its_gradients_after_one_update(name, shading):
 
 
 @every_ad_variant
-def test_gradients_that_end_at_the_values_are_told_of():
-    scene = picture_of(creased(), "colour")
-    parameters, key, factor = mi.traverse(scene), "shape.cage_colour", dr.opaque(mi.Float, 1)
-    dr.enable_grad(factor)
-    update(parameters, {key: parameters[key] * factor})
-
-    def differentiate():
-        dr.backward(loss_of(mi.render(scene, parameters, spp=4)))
-        return dr.grad(factor)[0]
-
-    first = differentiate()
-    assert first > 0
-    with pytest.warns(CageWarning, match=r"control cage: gradients came to cage_colour a second time since the last"):
-        assert differentiate() == first
-
-
-@every_ad_variant
 def test_control_points_and_colours_have_gradients_together():
     scene = picture_of(creased(), "colour")
     parameters, keys = mi.traverse(scene), ["shape.control_points", "shape.cage_colour"]
@@ -408,21 +355,6 @@ def test_control_points_and_colours_have_gradients_together():
     for alone, together in zip(found[0] + found[1], found[2], strict=True):
         assert np.abs(alone).max() > 0
         np.testing.assert_allclose(together, alone, rtol=0, atol=10 * SUM * np.abs(alone).max())
-
-
-@every_ad_variant
-@shadings
-def test_derivatives_do_not_keep_shapes_alive(shading):
-    shape = make(creased(), shading=shading)
-    parameters = mi.traverse(shape)
-    dr.enable_grad(parameters["cage_colour"])
-    parameters.set_dirty("cage_colour")
-    parameters.update()
-    dr.backward(dr.sum(parameters["vertex_colour"]))
-    alive = weakref.ref(shape)
-    del shape, parameters
-    gc.collect()
-    assert alive() is None
 
 
 # Differences of values at hits over this step, in single precision, beside the largest: rounding over the step, and

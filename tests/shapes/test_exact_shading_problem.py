@@ -55,10 +55,3 @@ def test_a_trial_that_fails_is_a_reason(monkeypatch):
     interaction_hook._trial_problem.cache_clear()
     assert problem() == "exact shading needs the virtual functions of Mitsuba 3.9"
     interaction_hook._trial_problem.cache_clear()
-
-
-@scalar
-@pytest.mark.parametrize("name", ["automatic", "flat"])
-def test_other_names_are_refused(name):
-    with pytest.raises(Exception, match=f'parameter "shading" is "{name}"; expected one of vertex, exact, auto'):
-        load(cube(), shading=name)

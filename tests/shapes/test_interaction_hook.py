@@ -13,13 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision import upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.shapes import exact_shading
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook import hook_trial, interaction_hook, machine_code
 from reference.refined_cages import sheet
 from shapes.cages import described, load
-from shapes.scenes import perspective, rows
+from shapes.scenes import down, perspective, rows, scene_with
 from shapes.updates import update
 from shapes.variants import every_array_variant, llvm
 
@@ -27,6 +27,9 @@ pytestmark = pytest.mark.threads
 
 if interaction_hook.hook_problem():
     pytest.skip(str(interaction_hook.hook_problem()), allow_module_level=True)
+
+
+TOP = (0.13, 0.21, 4)
 
 
 def cube(**parameters):
@@ -37,17 +40,13 @@ def make(**parameters):
     return mi.load_dict(cube(**parameters))
 
 
-def top(z=4):
-    """A ray that meets the cube's top away from the triangles' corners."""
-    return mi.Ray3f([0.13, 0.21, z], [0, 0, -1])
-
-
 def interaction(shape):
-    return mi.load_dict({"type": "scene", "shape": shape}).ray_intersect(top())
+    """Of a ray that meets the cube's top away from the triangles' corners."""
+    return scene_with(shape=shape).ray_intersect(down(*TOP))
 
 
-def vector(value):
-    return rows(value).ravel()
+def normal(scene, ray):
+    return rows(scene.ray_intersect(ray).sh_frame.n).ravel()
 
 
 class AnswerError(Exception):
@@ -67,13 +66,13 @@ def complete_by(monkeypatch, function):
     monkeypatch.setattr(exact_shading.ExactShading, "complete", function)
 
 
-def scene_of(shape, integrator="path", size=16):
-    seen = {"integrator": {"type": integrator}, "sky": {"type": "constant"}, "a": perspective(size, [1, 2, 3])}
-    return mi.load_dict({"type": "scene", **seen, "shape": shape})
+def scene_of(shape, integrator="path"):
+    sensor = perspective(16, [1, 2, 3])
+    return scene_with(integrator={"type": integrator}, sky={"type": "constant"}, sensor=sensor, shape=shape)
 
 
 def heat():
-    return upload(mi.TensorXf, np.arange(8.0, dtype=np.float32)[:, None])
+    return upload(mi.TensorXf, np.arange(8.0)[:, None])
 
 
 BEGIN = """
@@ -104,21 +103,26 @@ def printed(code):
 
 @every_array_variant
 def test_an_error_is_raised_by_what_caused_it_and_by_nothing_else(monkeypatch, capfd):
-    shape = make()
-    scene = scene_of(shape)
-    expected = vector(interaction(shape).n)
-    picture = np.array(mi.render(scene, spp=1, seed=3))
-    assert np.isfinite(picture).all()
-    with monkeypatch.context() as during:
-        complete_by(during, fail)
-        for _ in range(2):
-            with raises_answer():
-                interaction(shape)
-            with raises_answer():
-                mi.render(scene, spp=1)
+    shape = make(vertex_heat=heat())
+    scene, si = scene_of(shape), interaction(shape)
+    instances = scene_with(group=members(0, 1), instance=instance("group", 1))
+    exact = exact_shading.ExactShading
+    for owner, name, ask in (
+        (exact, "complete", lambda: interaction(shape).n),
+        (exact, "complete", lambda: mi.render(scene, spp=1, seed=3)),
+        (exact, "attribute", lambda: shape.eval_attribute("vertex_heat", si)),
+        (exact, "attribute", lambda: shape.eval_attribute_1("vertex_heat", si)),
+        (interaction_hook, "tag_of", lambda: instances.ray_intersect(down(2.13, 0.21, 9)).n),
+    ):
+        expected = np.array(ask())
+        assert np.isfinite(expected).all()
+        with monkeypatch.context() as during:
+            during.setattr(owner, name, fail)
+            for _ in range(2):
+                with raises_answer():
+                    ask()
+        np.testing.assert_array_equal(np.array(ask()), expected)
     assert sys.gettrace() is None
-    np.testing.assert_array_equal(vector(interaction(shape).n), expected)
-    np.testing.assert_array_equal(np.array(mi.render(scene, spp=1, seed=3)), picture)
     assert capfd.readouterr().err == ""
 
 
@@ -134,10 +138,7 @@ def test_errors_pass_through_loops_and_derivatives(monkeypatch):
         dr.backward(dr.mean(picture))
     with raises_answer():
         mi.render(scene, parameters, spp=1)
-
-
-@llvm
-def test_errors_inside_a_loop_of_the_answer_are_themselves(monkeypatch):
+    # Inside a loop of the answer, too.
     complete_by(monkeypatch, lambda _, si, *__: dr.while_loop((mi.UInt32(si.prim_index),), lambda i: i < 3, fail))
     with raises_answer():
         interaction(make())
@@ -211,18 +212,18 @@ print(len({ask() for _ in range(3)}))
 @llvm
 def test_mitsubas_own_errors_are_those_of_vertex_shading():
     """An exception of C++ passes by Python: flags, sizes and indices that do not fit are errors, and no crash."""
-    rays = mi.Ray3f(mi.Point3f([0.13, 0, 0.1], 0.21, 4), mi.Vector3f(0, 0, -1))
+    rays, top = down([0.13, 0, 0.1], 0.21, 4), down(*TOP)
     flags = mi.RayFlags.DetachShape | mi.RayFlags.FollowShape
 
     def errors(shading):
         shape = make(shading=shading)
-        scene = mi.load_dict({"type": "scene", "shape": shape})
-        found, outside = (scene.ray_intersect_preliminary(each) for each in (rays, top()))
+        scene = scene_with(shape=shape)
+        found, outside = (scene.ray_intersect_preliminary(each) for each in (rays, top))
         outside.prim_index = mi.UInt32(100000)
         for ask in (
             lambda: shape.compute_surface_interaction(rays, found, flags),
             lambda: shape.compute_surface_interaction(rays, found, active=mi.Mask([True, False])),
-            lambda: shape.compute_surface_interaction(top(), outside),
+            lambda: shape.compute_surface_interaction(top, outside),
             lambda: shape.eval_attribute_1("face_element", scene.ray_intersect(rays), mi.Mask([True, False])),
         ):
             with pytest.raises(RuntimeError) as caught:
@@ -230,19 +231,6 @@ def test_mitsubas_own_errors_are_those_of_vertex_shading():
             yield re.sub("r[0-9]+", "", str(caught.value))
 
     assert list(errors("exact")) == list(errors("vertex"))
-
-
-@llvm
-def test_errors_about_attributes_are_raised(monkeypatch):
-    shape = make(vertex_heat=heat())
-    si = interaction(shape)
-    exact = shape.eval_attribute_1("vertex_heat", si)[0]
-    with monkeypatch.context() as during:
-        during.setattr(exact_shading.ExactShading, "attribute", fail)
-        for evaluate in (shape.eval_attribute, shape.eval_attribute_1):
-            with raises_answer():
-                evaluate("vertex_heat", si)
-    assert shape.eval_attribute_1("vertex_heat", si)[0] == exact
 
 
 # Interruptions
@@ -253,9 +241,9 @@ def chain(error):
     return [] if error is None else [type(error).__name__, *chain(error.__cause__)]
 scenes = {}
 for shading in ("vertex", "exact"):
-    film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH}
+    film = {"type": "hdrfilm", "width": 8, "height": 8}
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
-    shapes = {f"shape{i}": shape(shading) for i in range(COUNT)}
+    shapes = {f"shape{i}": shape(shading) for i in range(40)}
     scenes[shading] = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
         "sensor": {"type": "perspective", "to_world": to_world, "film": film}, **shapes})
     mi.render(scenes[shading], spp=1)
@@ -269,7 +257,7 @@ for shading, scene in scenes.items():
         threading.Timer(0.1 + 0.05 * turn, interrupt).start()
         try:
             while True:
-                mi.render(scene, spp=SAMPLES)
+                mi.render(scene, spp=1)
         except BaseException as error:
             took, kinds = time.monotonic() - sent, chain(error)
         assert kinds[-1] == "KeyboardInterrupt" and took < 1, (shading, turn, kinds, took)
@@ -282,7 +270,7 @@ for shading, scene in scenes.items():
 # Many renders, which take most of their time in answers.
 @llvm
 def test_an_interruption_is_raised_when_mitsuba_has_returned():
-    turns = printed(f"WIDTH, COUNT, SAMPLES = 8, 40, 1\n{INTERRUPTED}").splitlines()
+    turns = printed(INTERRUPTED).splitlines()
     assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
 
 
@@ -349,29 +337,15 @@ def members(number, count):
 
 
 @llvm
-def test_shapes_outside_groups_are_not_asked_inside_instances(asked):
-    def answers(shapes, instances):
-        scene = {"type": "scene", "group": {"type": "shapegroup", "a": cube()}}
-        scene |= {f"shape{i}": cube() for i in range(shapes)}
-        scene |= {f"instance{i}": instance("group", i + 1) for i in range(instances)}
-        asked.clear()
-        found = mi.load_dict(scene).ray_intersect(mi.Ray3f(mi.Point3f([0.13, 2.13], 0.21, 4), [0, 0, -1]))
-        assert np.linalg.norm(np.array(found.n), axis=0) == pytest.approx(1, abs=1e-6)
-        return len(asked)
-
-    assert answers(4, 3) - answers(4, 1) == answers(1, 3) - answers(1, 1) == 2
-    assert answers(4, 1) - answers(1, 1) == 3
-
-
-@llvm
-def test_shapes_of_other_groups_do_not_answer(asked):
-    """Each shape answers twice, for itself and its group, and once in each instance of its own group."""
-    for groups, count, instances in ((1, 1, 1), (1, 2, 3), (2, 1, 1), (2, 2, 3), (3, 2, 2)):
-        scene = {"type": "scene", **{f"group{g}": members(g, count) for g in range(groups)}}
+def test_instances_ask_the_shapes_of_their_own_group_only(asked):
+    """Those in groups answer twice, for themselves and their group, and once in each instance; others once."""
+    counts = [(1, 1, 1, 4), (1, 1, 3, 4), (1, 2, 3, 1), (2, 1, 1, 0), (2, 2, 3, 0), (3, 2, 2, 1)]
+    for groups, count, instances, outside in counts:
+        scene = {f"group{g}": members(g, count) for g in range(groups)} | {f"o{i}": cube() for i in range(outside)}
         scene |= {f"of{g}_{i}": instance(f"group{g}", g + i) for g in range(groups) for i in range(instances)}
         asked.clear()
-        mi.load_dict(scene).ray_intersect(top(9))
-        assert len(asked) == groups * count * (2 + instances)
+        scene_with(**scene).ray_intersect(down(*TOP))
+        assert len(asked) == groups * count * (2 + instances) + outside
 
 
 @llvm
@@ -383,8 +357,8 @@ def test_groups_side_by_side_are_as_each_alone():
     key = "group1.m1_0.control_points"
 
     def scene_of(*groups):
-        shown = {f"group{g}": members(g, 1) for g in groups} | {f"of{g}": instance(f"group{g}", 3 * g) for g in groups}
-        return mi.load_dict({"type": "scene", **shown})
+        instances = {f"of{g}": instance(f"group{g}", 3 * g) for g in groups}
+        return scene_with(**{f"group{g}": members(g, 1) for g in groups}, **instances)
 
     def found(scene):
         parameters = mi.traverse(scene)
@@ -407,70 +381,45 @@ def test_groups_side_by_side_are_as_each_alone():
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-3)
 
 
-@llvm
-def test_errors_in_groups_are_raised(monkeypatch):
-    scene = mi.load_dict({"type": "scene", "group": members(0, 1), "instance": instance("group", 1)})
-    ray = mi.Ray3f([2.13, 0.21, 9], [0, 0, -1])
-    expected = vector(scene.ray_intersect(ray).n)
-    with monkeypatch.context() as during, raises_answer():
-        during.setattr(interaction_hook, "tag_of", fail)
-        scene.ray_intersect(ray)
-    np.testing.assert_array_equal(vector(scene.ray_intersect(ray).n), expected)
-
-
 # Lifetimes, variants and threads
 
 
 @llvm
 def test_shapes_that_are_made_in_parallel_share_a_hook():
     """Mitsuba makes the shapes of a scene in parallel; the table of one hook must not be given up for another's."""
-    code = (
-        "import mitsuba_subdivision, mitsuba as mi, numpy as np\n"
-        "from mitsuba_subdivision.cage import named_cages\n"
-        "mi.set_variant('llvm_ad_rgb')\n"
-        "shape = {'type': 'subdivision', **named_cages.cube().as_properties(mi), 'shading': 'exact'}\n"
-        "scene = mi.load_dict({'type': 'scene', **{f's{i}': dict(shape) for i in range(12)}})\n"
-        "assert scene.ray_intersect(mi.Ray3f([0, 0, 4], [0, 0, -1])).is_valid()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    printed("""
+scene = mi.load_dict({'type': 'scene', **{f's{i}': shape('exact') for i in range(12)}})
+assert scene.ray_intersect(mi.Ray3f([0, 0, 4], [0, 0, -1])).is_valid()
+""")
 
 
 @every_array_variant
 def test_shapes_come_and_go():
     # Addresses are used again, so that answers kept for too long would be those of another cage.
-    expected = vector(interaction(make()).sh_frame.n)
+    expected = rows(interaction(make()).sh_frame.n)
     for turn in range(120):
         shape = make(flip_normals=turn % 2 == 1)
         if turn % 40 < 2:
             sign = -1 if turn % 2 else 1
-            np.testing.assert_allclose(vector(interaction(shape).sh_frame.n), sign * expected, atol=1e-6)
+            np.testing.assert_allclose(rows(interaction(shape).sh_frame.n), sign * expected, atol=1e-6)
     plain = mi.load_dict({"type": "sphere"})
-    assert vector(interaction(plain).p)[2] == pytest.approx(np.sqrt(1 - 0.13**2 - 0.21**2), abs=1e-5)
+    assert rows(interaction(plain).p)[0, 2] == pytest.approx(np.sqrt(1 - 0.13**2 - 0.21**2), abs=1e-5)
 
 
 @every_array_variant
-def test_shapes_are_freed_with_their_scenes():
-    shape = make()
-    scene = mi.load_dict({"type": "scene", "shape": shape})
-    scene.ray_intersect(top())
-    alive = weakref.ref(shape._exact), weakref.ref(shape)
-    del shape
+def test_shapes_live_as_long_as_their_scenes():
+    shapes = [make(), make()]
+    scene, top = scene_with(a=shapes[0], b=shapes[1]), down(*TOP)
+    before = normal(scene, top)
+    assert np.linalg.norm(before - [0, 0, 1]) > 0.05
+    alive = [weakref.ref(each) for shape in shapes for each in (shape, shape._exact)]
+    del shapes
     gc.collect()
-    # The scene has it still.
-    assert alive[0]() is not None
+    assert None not in [each() for each in alive]
+    np.testing.assert_array_equal(normal(scene, top), before)
     del scene
     gc.collect()
-    assert [each() for each in alive] == [None, None]
-
-
-@llvm
-def test_a_scene_outlives_the_names_of_its_shapes():
-    scenes = [mi.load_dict({"type": "scene", "shape": make(), "other": make()}) for _ in range(3)]
-    gc.collect()
-    normals = [vector(each.ray_intersect(top()).n) for each in scenes]
-    np.testing.assert_array_equal(normals, [normals[0]] * len(scenes))
-    assert np.linalg.norm(normals[0] - [0, 0, 1]) > 0.05
+    assert [each() for each in alive] == [None] * 4
 
 
 @llvm
@@ -482,34 +431,32 @@ def test_variants_side_by_side():
         shapes[name] = make()
     for name in reversed(names):
         mi.set_variant(name)
-        found[name] = vector(interaction(shapes[name]).sh_frame.n)
-    for normal in found.values():
-        np.testing.assert_allclose(normal, found["llvm_ad_rgb"], atol=1e-6)
+        found[name] = rows(interaction(shapes[name]).sh_frame.n)
+    for normals in found.values():
+        np.testing.assert_allclose(normals, found["llvm_ad_rgb"], atol=1e-6)
 
 
 @llvm
 def test_inactive_lanes_may_have_any_triangle():
-    shape = make()
-    scene = mi.load_dict({"type": "scene", "shape": shape})
-    ray = mi.Ray3f(mi.Point3f([0.13, 0.21], [0.21, 9], 4), [0, 0, -1])
+    shape, ray = make(), down([0.13, 0.21], [0.21, 9], 4)
+    scene = scene_with(shape=shape)
     preliminary = scene.ray_intersect_preliminary(ray)
     is_hit = preliminary.is_valid()
     assert np.array(is_hit).tolist() == [True, False]
     preliminary.prim_index = dr.select(is_hit, preliminary.prim_index, 0xFFFFFFF0)
     found = shape.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, is_hit)
-    np.testing.assert_array_equal(np.array(found.n)[:, 0], np.array(scene.ray_intersect(ray).n)[:, 0])
+    np.testing.assert_array_equal(rows(found.n)[0], rows(scene.ray_intersect(ray).n)[0])
 
 
 @every_array_variant
 def test_all_hits_are_counted_for_the_log(monkeypatch):
     """With the level Debug, by where they were found; the shape logs those before the latest."""
     shape = load(sheet(1, 1, boundary="edge_and_corner"), tessellation_rate=1, shading="exact")
-    scene, count, logged = mi.load_dict({"type": "scene", "shape": shape}), 5, []
+    scene, count, logged = scene_with(shape=shape), 5, []
     monkeypatch.setattr(mi, "Log", lambda _level, text: logged.append(text))
     monkeypatch.setattr(mi, "log_level", lambda: mi.LogLevel.Debug)
     for _ in range(2):
-        ray = mi.Ray3f(mi.Point3f(mi.Float([0.3] * count), 0.6, 3), mi.Vector3f(0, 0, -1))
-        dr.eval(scene.ray_intersect(ray).n)
+        dr.eval(scene.ray_intersect(down([0.3] * count, 0.6, 3)).n)
     (text,) = logged
     assert f"of {count} hits, 100.00% are on the ray, 0.00% are along" in text
 

@@ -4,7 +4,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, upload
-from mitsuba_subdivision.cage.named_cages import tetrahedron
 from shapes.cages import cube
 from shapes.scenes import buffer
 from shapes.variants import scalar
@@ -62,14 +61,5 @@ def test_materials_share_their_vertices_bit_by_bit(file, given):
 def test_unknown_materials_and_faces_are_errors(file):
     with pytest.raises(RuntimeError, match='"material" is "green"; expected one of "", "red", "dark blue"'):
         shape(filename=file, material="green")
-    with pytest.raises(RuntimeError, match='parameter "shown_faces" has 6; expected 0 to 5'):
-        shape(filename=file, shown_faces=upload(mi.TensorXu, [6]))
     with pytest.raises(RuntimeError, match='"material" and "shown_faces" contradict each other'):
         shape(filename=file, material="red", shown_faces=upload(mi.TensorXu, [1]))
-    # Mitsuba would render no other shape of the scene beside one without triangles.
-    with pytest.raises(RuntimeError, match='parameter "shown_faces" shows no face; expected one at least'):
-        shape(filename=file, shown_faces=upload(mi.TensorXu, []))
-    with pytest.raises(
-        RuntimeError, match='expected none for the scheme "doo_sabin", whose surface belongs to vertices'
-    ):
-        shape(**tetrahedron().as_properties(mi), scheme="doo_sabin", shown_faces=upload(mi.TensorXu, [1]))

@@ -42,12 +42,9 @@ def test_the_shape_has_the_surface(cage):
 
 
 @every_variant
-@pytest.mark.parametrize(
-    ("strict", "message"), [(True, "expected a manifold surface"), (1, '"strict" is 1; expected true or false')]
-)
-def test_strict_is_an_error(strict, message):
-    with pytest.raises(Exception, match=message):
-        load(cage_of("book"), strict=strict)
+def test_strict_is_an_error():
+    with pytest.raises(Exception, match="expected a manifold surface"):
+        load(cage_of("book"), strict=True)
 
 
 @every_ad_variant

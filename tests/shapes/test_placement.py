@@ -1,7 +1,5 @@
 """Where the shape lies: object space, ``to_world`` as a parameter, and places far from the origin."""
 
-import re
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -208,41 +206,6 @@ def test_to_world_is_of_the_type_that_mitsubas_shapes_have():
     ours, theirs = mi.traverse(make(cube())), mi.traverse(mi.load_dict({"type": "rectangle"}))
     assert type(ours["to_world"]) is type(theirs["to_world"])
     assert ours.flags("to_world") == theirs.flags("to_world")
-
-
-def points_with(*values):
-    """Coordinates of the cube, of which those from the third vertex's y on are others."""
-    points = cube().positions.ravel()
-    return np.array([*points[:7], *values, *points[7 + len(values) :]])
-
-
-VERTEX = 'parameter "control_points": vertex 2 has the coordinates'
-
-
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        (np.diag([1, 0, 1, 1]), 'parameter "to_world" has the determinant 0.0; expected an invertible matrix'),
-        (np.diag([np.inf, 1, 1, 1]), 'parameter "to_world" has the determinant inf; expected an invertible matrix'),
-        (2 * np.eye(4), 'parameter "to_world" has the last row (0.0, 0.0, 0.0, 2.0); expected (0, 0, 0, 1)'),
-        (points_with(np.nan), f"{VERTEX} (-1.0, nan, -1.0); expected finite numbers (1 such vertex in all)"),
-        (
-            points_with(np.inf, -np.inf, np.nan, np.nan),
-            f"{VERTEX} (-1.0, inf, -inf); expected finite numbers (2 such vertices in all)",
-        ),
-    ],
-)
-@every_variant
-def test_an_impossible_value_is_an_error_and_changes_nothing(value, message):
-    shape = make(cube())
-    before, parameters = buffer(shape, "vertex_positions"), mi.traverse(shape)
-    if value.shape == (4, 4):
-        given = {"to_world": type(parameters["to_world"])(value)}
-    else:
-        given = {"control_points": upload(type(parameters["control_points"]), value)}
-    with pytest.raises(ValueError, match=re.escape(message)):
-        update(parameters, given)
-    np.testing.assert_array_equal(buffer(shape, "vertex_positions"), before)
 
 
 @pytest.mark.usefixtures("no_other_scene")

@@ -1,19 +1,17 @@
 """The shape's parameters, messages, buffers, gradients and its place in a scene."""
 
-import re
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface, example_file, upload
+from mitsuba_subdivision import LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
 from reference.exact_samples import SCHEMES, angle, samples_at
 from shapes.cages import cube, described, load
 from shapes.scenes import SINGLE, buffer, hit, perspective, vertices
 from shapes.updates import MODES, derivative, update
-from shapes.variants import every_ad_variant, every_variant, llvm, mirrors, scalar
+from shapes.variants import every_ad_variant, every_variant, mirrors, scalar
 
 SCENE = """<scene version="3.0.0">
 <shape type="subdivision"><string name="filename" value="{}"/></shape></scene>"""
@@ -123,44 +121,6 @@ def test_the_shape_has_its_bsdf_emitter_and_medium_and_says_what_it_is():
     assert text.count("[") == text.count("]")
 
 
-NO_CAGE = dict.fromkeys(("positions", "face_sizes", "face_vertices"))
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"tesselation_rate": 3}, 'unknown parameter "tesselation_rate", did you mean "tessellation_rate"?'),
-        ({"colour": "red"}, 'unknown parameter "colour"; known parameters: filename, positions, face_sizes'),
-        ({"tessellation_rate": 0}, 'parameter "tessellation_rate" is 0; expected 1 to 1024'),
-        ({"tessellation_rate": 2.5}, 'parameter "tessellation_rate" is 2.5; expected an integer'),
-        ({"tessellation_rate": True}, 'parameter "tessellation_rate" is True; expected an integer'),
-        ({"scheme": "butterfly"}, 'parameter "scheme": unknown scheme "butterfly"; known schemes: catmull_clark'),
-        ({"scheme": ""}, 'parameter "scheme": unknown scheme ""; known schemes: catmull_clark'),
-        ({"scheme": 3}, 'parameter "scheme" is 3; expected a string'),
-        ({"face_normals": 1}, 'parameter "face_normals" is 1; expected true or false'),
-        ({"flip_normals": "yes"}, "parameter \"flip_normals\" is 'yes'; expected true or false"),
-        ({"filename": "cage.obj"}, 'parameters "filename" and "positions" contradict each other'),
-        ({"face_sizes": None}, 'no control cage: expected "filename", or "face_sizes" as well'),
-        (NO_CAGE, 'no control cage: expected "filename", or "positions", "face_sizes"'),
-        ({"positions": "here"}, "parameter \"positions\" is 'here'; expected a tensor"),
-        ({"positions": np.zeros((8, 2))}, 'parameter "positions" has shape (8, 2); expected (n, 3)'),
-        ({"face_sizes": np.full(6, 4.5)}, 'parameter "face_sizes" has values that are not integers'),
-        ({"face_vertices": np.arange(24)}, "vertex"),
-        ({"to_world": np.diag([1.0, 1, 0, 1])}, 'parameter "to_world" has the determinant 0.0'),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
-)
-@every_variant
-def test_errors_say_what_was_expected(parameters, message):
-    given = described(cube())
-    for name, value in parameters.items():
-        if isinstance(value, np.ndarray):
-            value = mi.ScalarTransform4f(value) if name == "to_world" else upload(mi.TensorXf, value)  # noqa: PLW2901
-        given[name] = value
-    with pytest.raises(RuntimeError, match=re.escape(message)):
-        mi.load_dict({name: value for name, value in given.items() if value is not None})
-
-
 @scalar
 def test_missing_file_is_an_error_that_names_the_place_in_the_scene():
     with pytest.raises(RuntimeError, match=r'(?s)line 2.*there is no file "none.obj"; looked in'):
@@ -231,14 +191,6 @@ def test_unrelated_update_keeps_the_surface():
     shape.parameters_changed([])
     shape.parameters_changed(["bsdf"])
     np.testing.assert_array_equal(vertices(shape), before)
-
-
-@pytest.mark.parametrize("distance", [0, 1000])
-@llvm
-def test_another_number_of_control_points_is_an_error(distance):
-    shape = make(cube().with_positions(cube().positions + distance))
-    with pytest.raises(ValueError, match='parameter "control_points": 21 coordinates; expected 24'):
-        update(shape, control_points=dr.zeros(mi.Float, 21))
 
 
 # Gradients
@@ -332,15 +284,3 @@ def test_renders():
     # The shape reflects half of the sky, which is behind it.
     assert 0.3 < image[8, 8].min() < 0.7
     assert np.allclose(image[0, 0], 1)
-
-
-@llvm
-@pytest.mark.parametrize("name", ["vertex_positions", "vertex_normals", "vertex_texcoords"])
-def test_a_buffer_of_another_length_is_refused(name):
-    """Mitsuba would read and write beyond its end."""
-    shape = mi.load_dict({"type": "subdivision", "filename": example_file("cages/jar.obj"), "tessellation_rate": 1})
-    parameters = mi.traverse(shape)
-    whole = mi.Float(parameters[name])
-    with pytest.raises(ValueError, match=f'parameter "{name}": 10 numbers; expected {len(whole)}'):
-        update(parameters, {name: upload(mi.Float, np.array(whole)[:10])})
-    update(parameters, {name: whole})

@@ -8,11 +8,11 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.errors import CageWarning
+from mitsuba_subdivision import CageWarning, upload
 from shapes.cages import ISLANDS, RING, cube, described, load
-from shapes.scenes import buffer, perspective
+from shapes.scenes import buffer, perspective, scene_with
 from shapes.updates import derivative, differentiated, update
-from shapes.variants import every_ad_variant
+from shapes.variants import every_ad_variant, exact
 
 pytestmark = every_ad_variant
 
@@ -36,9 +36,7 @@ def views_of(integrator, cage=None, resolution=16, **parameters):
     # Nothing here has shadows, whose derivatives would take seconds.
     integrator = {"type": integrator, **({"sppi": 0} if integrator.endswith("_projective") else {})}
     shape = described(cage or cube(), tessellation_rate=4, **parameters)
-    return mi.load_dict(
-        {"type": "scene", "integrator": integrator, **sensors, "sky": {"type": "constant"}, "shape": shape}
-    )
+    return scene_with(integrator=integrator, **sensors, sky={"type": "constant"}, shape=shape)
 
 
 def loss_of(image, _view=0):
@@ -66,15 +64,23 @@ def gradient_by(scene, how, kept):
     return np.array(dr.grad(points))
 
 
-CASES = {"prb": [("once", False), ("sum", False), ("sum", True), ("once", True)], "direct_projective": [("once", True)]}
+ONCE, SUM, KEPT_SUM, KEPT_ONCE = ("once", False), ("sum", False), ("sum", True), ("once", True)
 
 
-@pytest.mark.parametrize("integrator", CASES)
-def test_each_view_has_its_gradients_however_they_are_asked_for(integrator):
-    scene = views_of(integrator, to_world=mi.ScalarTransform4f().translate([0.1, 0, 0]))
+@pytest.mark.parametrize(
+    ("integrator", "shading", "cases"),
+    [
+        ("prb", "vertex", [ONCE, SUM, KEPT_SUM, KEPT_ONCE]),
+        ("direct_projective", "vertex", [KEPT_ONCE]),
+        pytest.param("direct", "exact", [ONCE], marks=exact),
+    ],
+)
+def test_each_view_has_its_gradients_however_they_are_asked_for(integrator, shading, cases):
+    to_world = mi.ScalarTransform4f().translate([0.1, 0, 0])
+    scene = views_of(integrator, shading=shading, to_world=to_world)
     expected = gradient_by(scene, "updates", kept=False)
     assert np.abs(expected).max() > 0
-    for case in CASES[integrator]:
+    for case in cases:
         found = gradient_by(scene, *case)
         assert np.linalg.norm(found - expected) <= ROUNDING * np.linalg.norm(expected), case
 
@@ -103,15 +109,34 @@ def test_what_users_assign_to_vertices_stays_when_gradients_pass():
     np.testing.assert_array_equal(parameters[key], dr.detach(attached) * 2)
 
 
-@pytest.mark.parametrize("key", [KEY, "shape.to_world"])
-def test_gradients_that_end_at_the_shape_are_told_of(key):
-    scene = views_of("prb")
+def bitmap():
+    return {"type": "bitmap", "data": upload(mi.TensorXf, np.eye(4)[..., None]), "raw": True}
+
+
+COLOURED = cube(texcoords=ISLANDS, attributes={"colour": cube().positions + 0.6})
+COLOUR = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
+POINTS = "control_points or to_world"
+HEIGHTS = "control_points, to_world or heights"
+
+
+@pytest.mark.parametrize(
+    ("key", "parameters", "told"),
+    [
+        (KEY, dict, POINTS),
+        ("shape.to_world", dict, POINTS),
+        ("shape.cage_colour", lambda: COLOUR, "cage_colour"),
+        ("shape.displacement.data", lambda: {"displacement": bitmap()}, HEIGHTS),
+        ("shape.displacement_scale", lambda: {"displacement": bitmap()}, HEIGHTS),
+    ],
+)
+def test_gradients_that_end_at_the_shape_are_told_of(key, parameters, told):
+    scene = views_of("prb", COLOURED, **parameters())
     parameters, size = mi.traverse(scene), dr.opaque(mi.Float, 1)
-    start = mi.Float(parameters[KEY])
+    start = type(parameters[key])(parameters[key])
     dr.enable_grad(size)
 
     def assign():
-        update(parameters, {key: start * size if key == KEY else mi.AffineTransform4f().scale(size)})
+        update(parameters, {key: mi.AffineTransform4f().scale(size) if key.endswith("to_world") else start * size})
 
     def differentiate(view):
         dr.backward(loss_at(scene, parameters, view))
@@ -119,7 +144,8 @@ def test_gradients_that_end_at_the_shape_are_told_of(key):
 
     assign()
     first = differentiate(0)
-    with pytest.warns(CageWarning, match=r"control cage: gradients came to control_points or to_world a second time"):
+    assert first != 0
+    with pytest.warns(CageWarning, match=f"control cage: gradients came to {told} a second time since the last"):
         assert differentiate(1) == first
     assign()
     second = differentiate(1)
@@ -146,11 +172,19 @@ def test_losses_of_views_are_those_of_the_views():
         msub.loss_of_views(mi.load_dict({"type": "scene"}), parameters, loss)
 
 
-def test_derivatives_do_not_keep_shapes_alive():
-    shape = load(SEAMED["seams"])
+@pytest.mark.parametrize(
+    ("given", "seen", "shading"),
+    [
+        ("control_points", "vertex_normals", "vertex"),
+        ("cage_colour", "vertex_colour", "vertex"),
+        pytest.param("cage_colour", "vertex_colour", "exact", marks=exact),
+    ],
+)
+def test_derivatives_do_not_keep_shapes_alive(given, seen, shading):
+    shape = load(COLOURED, shading=shading)
     parameters = mi.traverse(shape)
-    differentiated(parameters, "control_points")
-    dr.backward(dr.sum(mi.traverse(shape)["vertex_normals"]))
+    differentiated(parameters, given)
+    dr.backward(dr.sum(parameters[seen]))
     alive = weakref.ref(shape)
     del shape, parameters
     gc.collect()

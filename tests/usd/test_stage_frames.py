@@ -14,7 +14,7 @@ from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_pr
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.studio_entries import Look
-from mitsuba_usd import loaded_shapes, stage_scenes
+from mitsuba_usd import shapes, stage_scenes
 from mitsuba_usd.limit_surfaces import Surfaces
 from mitsuba_usd.scene_entries import SceneEntries
 from mitsuba_usd.stage_scenes import StageReader, StageScenes
@@ -110,7 +110,7 @@ def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
 def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, variant):
     """Points, transforms, instances, lights and camera move; weights are made once for each cage."""
     request.getfixturevalue(f"variant_{variant}")
-    made = recorded(monkeypatch, loaded_shapes, "subdivision")
+    made = recorded(monkeypatch, shapes, "subdivision")
     path, times = write(tmp_path, WHOLE), (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
     found = frames(path, times)
     assert sorted(shape.name for (shape, *_), _ in made) == ["/ball", "/moving", "/still", "/tinted"]

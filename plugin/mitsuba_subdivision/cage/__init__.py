@@ -1,4 +1,4 @@
-"""Control cages: validation, tags, attributes, what files hold of them, and named examples."""
+"""Control cages: validation, tags, attributes, contents of files, and named examples."""
 
 from .attributes import Attribute
 from .contents import CageContents, same, same_topology

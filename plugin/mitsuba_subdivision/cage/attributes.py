@@ -1,4 +1,4 @@
-"""Data that a control cage carries besides its points: texture coordinates, colours, weights."""
+"""Attributes of a control cage, such as texture coordinates, colours and weights."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying"
 class Attribute:
     """Values at the vertices or face corners of a control cage.
 
-    A cage that takes an attribute keeps a validated copy of it, with read-only arrays, ``values`` of float64 and
-    ``indices`` of int64.
+    A cage stores a validated copy of an attribute, with read-only arrays: ``values`` float64, ``indices`` int64.
 
     Parameters
     ----------
     values : (n, k) array
-        One row for each vertex of the cage. With "face_varying", as many rows as there are distinct values.
+        One row for each vertex of the cage. With "face_varying", one row for each distinct value.
     interpolation : "vertex", "varying" or "face_varying"
-        How values are subdivided: "vertex" as points are; "varying" bilinearly over each face; "face_varying", as for
-        texture coordinates, as points are but with discontinuities, since each face corner may have a value of its own.
+        "vertex": values are subdivided like points. "varying": values are interpolated bilinearly over each face.
+        "face_varying", usual for texture coordinates: values belong to face corners, and are subdivided like points,
+        but may be discontinuous along edges.
     indices : (n_h,) int array, optional
         With "face_varying" only: the 0-based row of ``values`` at each face corner, in the order of the cage's
         ``face_vertices``. By default ``values`` has one row for each face corner, in that order.
@@ -49,7 +49,7 @@ class Attribute:
     def validated(
         self, name: str, topology: Topology, source: CageSource, width: int | None = None, order: IntArray | None = None
     ) -> Attribute:
-        """Same attribute with read-only arrays, ``values`` of float64 and ``indices`` of int64, checked against a mesh.
+        """Check the attribute against a mesh, and return it with read-only arrays of float64 and int64.
 
         Parameters
         ----------
@@ -58,25 +58,25 @@ class Attribute:
         topology : Topology
         source : CageSource
         width : int, optional
-            Numbers that each value must have.
+            Required number of columns.
         order : (n_h,) int64, optional
-            Where faces were turned over: which given face corner became each face corner of the mesh.
+            If faces were turned over, the given face corner of each face corner of the mesh.
 
         Raises
         ------
         CageError
             If sizes do not match, an index is out of range, a value is not finite, or the interpolation is unknown.
         """
-        what = f'{source.name}: attribute "{shortened(name)}"'
+        label = f'{source.name}: attribute "{shortened(name)}"'
         if self.interpolation not in INTERPOLATIONS:
             expected = ", ".join(INTERPOLATIONS)
-            raise CageError(f'{what} has the interpolation "{self.interpolation}"; expected one of {expected}')
-        values = _validated_values(self.values, what, width)
+            raise CageError(f'{label} has the interpolation "{self.interpolation}"; expected one of {expected}')
+        values = _validated_values(self.values, label, width)
         if self.interpolation != "face_varying":
             if self.indices is not None:
-                raise CageError(f"{what} has indices; expected them with face-varying interpolation only")
+                raise CageError(f"{label} has indices; expected them with face-varying interpolation only")
             if len(values) != topology.vertex_count:
-                raise CageError(f"{what} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
+                raise CageError(f"{label} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
             return Attribute(values, self.interpolation)
         indices = self._validated_indices(name, len(values), topology, source, order)
         return Attribute(values, self.interpolation, indices)
@@ -90,7 +90,7 @@ class Attribute:
                 f'{source.name}: attribute "{shortened(name)}" has {value_count} values and no indices; expected '
                 f"{corner_count} values, one per face corner"
             )
-        # Not copied before the length is checked, as a damaged file may promise any number of indices.
+        # Not copied before the length is checked, as a damaged file may have any number of indices.
         indices = np.arange(corner_count) if self.indices is None else self.indices
         if indices.shape != (corner_count,) or not np.issubdtype(indices.dtype, np.integer):
             raise CageError(
@@ -114,7 +114,7 @@ class Attribute:
 def validated_texcoords(
     texcoords: Attribute | ArrayLike | None, topology: Topology, source: CageSource, order: IntArray | None = None
 ) -> Attribute | None:
-    """Check the texture coordinates of a cage; a bare array has a row for each vertex.
+    """Check the texture coordinates of a cage. An array has a row for each vertex.
 
     Raises CageError if they are invalid.
     """
@@ -129,9 +129,9 @@ def validated_attributes(
     source: CageSource,
     order: IntArray | None = None,
 ) -> dict[str, Attribute]:
-    """Check all attributes of a cage except its texture coordinates; bare arrays have a row for each vertex.
+    """Check all attributes of a cage except texture coordinates. Arrays have a row for each vertex.
 
-    Raises CageError if one is invalid, or is called "texcoords".
+    Raises CageError if an attribute is invalid, or is called "texcoords".
     """
     if attributes is None:
         return {}
@@ -143,36 +143,37 @@ def validated_attributes(
             "given apart from attributes"
         )
     return {
-        name: _as_attribute(given).validated(name, topology, source, order=order) for name, given in attributes.items()
+        name: _as_attribute(attribute).validated(name, topology, source, order=order)
+        for name, attribute in attributes.items()
     }
 
 
-def _as_attribute(given: Attribute | ArrayLike) -> Attribute:
-    return given if isinstance(given, Attribute) else Attribute(given)
+def _as_attribute(attribute: Attribute | ArrayLike) -> Attribute:
+    return attribute if isinstance(attribute, Attribute) else Attribute(attribute)
 
 
-def _validated_values(given: NDArray, what: str, width: int | None) -> NDArray[np.float64]:
+def _validated_values(unchecked: NDArray, label: str, width: int | None) -> NDArray[np.float64]:
     try:
-        # Values that are no array are wrapped in one without dimensions.
-        values = np.array(given if given.ndim else given.item(), dtype=np.float64)
+        # A zero-dimensional array contains values that could not be converted, see `_array`.
+        values = np.array(unchecked if unchecked.ndim else unchecked.item(), dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise CageError(f"{what} has values that are no table of numbers: {error}") from error
+        raise CageError(f"{label} has values that are no table of numbers: {error}") from error
     if values.ndim != 2 or not values.shape[1] or width not in (None, values.shape[1]):
-        raise CageError(f"{what} has values of shape {values.shape}; expected (n, {width or 'k'})")
+        raise CageError(f"{label} has values of shape {values.shape}; expected (n, {width or 'k'})")
     wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(wrong):
         value = shortened(str(values[wrong[0]].tolist()))
         such = number_of_such(len(wrong), "value")
-        raise CageError(f"{what}: value {wrong[0]} is {value}; expected finite numbers ({such})")
+        raise CageError(f"{label}: value {wrong[0]} is {value}; expected finite numbers ({such})")
     values.flags.writeable = False
     return values
 
 
 def _array(values: ArrayLike) -> NDArray:
-    """An array, or one object where that is impossible: the cage then raises an error with the attribute's name."""
+    """Return an array, or a zero-dimensional object array if ``values`` are none; the cage then raises an error."""
     try:
         return np.asarray(values)
     except (TypeError, ValueError):  # Such as rows of different lengths.
-        kept = np.empty((), dtype=object)
-        kept[()] = values
-        return kept
+        wrapped = np.empty((), dtype=object)
+        wrapped[()] = values
+        return wrapped

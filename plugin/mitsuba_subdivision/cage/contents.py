@@ -1,4 +1,4 @@
-"""Contents of a file that has a control cage, and whether those of two are equal."""
+"""Contents of a file with a control cage, and their comparison."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .source import CageSource
 
 @dataclass(frozen=True, eq=False)
 class CageContents:
-    """Contents of a file that has a control cage, not yet validated.
+    """Contents of a file with a control cage, not yet validated.
 
-    A reader of files returns it, and `ControlCage.from_arrays` validates it. A writer of files takes that of a cage,
-    `ControlCage.contents`.
+    Readers of files return it, and `ControlCage.from_arrays` validates it. Writers of files take the contents of a
+    cage, `ControlCage.contents`.
     """
 
     positions: NDArray  # (n_v, 3)
     face_sizes: IntArray  # (n_f,) int: number of vertices of each face
-    face_vertices: NDArray  # (n_h,) int: 0-based vertices of all faces, one face after the other
+    face_vertices: NDArray  # (n_h,) int: 0-based vertices of all faces, face by face
     # (n, 3) float64: rows (vertex, vertex, sharpness), one for each sharp edge
     creases: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
     # (n, 2) float64: rows (vertex, sharpness), one for each sharp vertex
@@ -33,31 +33,31 @@ class CageContents:
     holes: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     texcoords: Attribute | None = None
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
-    # (n,) int: 0-based faces of each material that the file names
+    # (n,) int: 0-based faces of each material, by name
     materials: Mapping[str, IntArray] = field(default_factory=dict)
-    # Names and values as in `RULES`, for those rules that the file chooses
+    # Names and values as in `RULES`, for the rules that the file specifies
     rules: Mapping[str, str] = field(default_factory=dict)
     scheme: str | None = None  # Subdivision scheme that the file names
-    # How messages name the file, its lines, vertices and faces
+    # Names of the file, its lines, vertices and faces in messages
     source: CageSource = field(default_factory=CageSource)
 
     @property
     def material_of_face(self) -> IntArray:
-        """``(n_f,)`` index of each face's material among ``materials``, the last one of several; -1 for none."""
-        found = np.full(len(self.face_sizes), -1)
-        for number, faces in enumerate(self.materials.values()):
-            found[faces] = number
-        return found
+        """``(n_f,)`` index of each face's material in ``materials``, the last one of several; -1 for none."""
+        material = np.full(len(self.face_sizes), -1)
+        for index, faces in enumerate(self.materials.values()):
+            material[faces] = index
+        return material
 
     def as_arguments(self) -> dict[str, Any]:
-        """Contents as the arguments of `ControlCage.from_arrays`, in which each rule is an argument of its own."""
-        return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "rules"} | {**self.rules}
+        """Return the arguments of `ControlCage.from_arrays`, with each rule as a separate argument."""
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.name != "rules"} | {**self.rules}
 
 
 def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
-    """Whether nested records, mappings, lists, arrays and values are equal; their sources are not compared.
+    """Return whether nested dataclasses, mappings, lists, arrays and values are equal, except for `CageSource` values.
 
-    ``but`` names fields of ``a`` and ``b`` themselves that may differ.
+    ``but`` names top-level fields of ``a`` and ``b`` that may differ.
     """
     if a is b or (isinstance(a, CageSource) and isinstance(b, CageSource)):
         return True
@@ -66,7 +66,7 @@ def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         return False
     if is_dataclass(a):
-        names = [each.name for each in fields(a) if each.name not in but]
+        names = [attribute.name for attribute in fields(a) if attribute.name not in but]
         return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in names)
     if isinstance(a, Mapping) and isinstance(b, Mapping):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
@@ -76,5 +76,5 @@ def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
 
 
 def same_topology(a: CageContents, b: CageContents) -> bool:
-    """Whether two cages differ in their positions only."""
+    """Return whether two cages differ in their positions only."""
     return len(a.positions) == len(b.positions) and same(a, b, frozenset({"positions"}))

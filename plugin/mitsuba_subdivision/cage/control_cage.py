@@ -1,4 +1,4 @@
-"""The control cage: the polygon mesh that a subdivision surface is made from."""
+"""The control cage: the polygon mesh that is subdivided."""
 
 from __future__ import annotations
 
@@ -38,16 +38,17 @@ if TYPE_CHECKING:
 class ControlCage:
     """A polygon mesh to be subdivided, closed or with boundary. Immutable.
 
-    Faces wound against their neighbours are turned over. Where the faces are not a manifold, OpenSubdiv's rules hold:
+    Faces with a winding opposite to their neighbours' are turned over. Where the faces are not a manifold, OpenSubdiv's
+    rules apply:
 
     - An edge is non-manifold, and infinitely sharp, if it has more than two faces, if one face has it twice, if its two
-      ends are the same vertex, or if its two faces remain wound against each other, as somewhere on a Möbius strip.
-    - A vertex at the end of a non-manifold edge, or between several fans of faces, is an infinitely sharp corner. It
-      lies on a crease instead if it has three fans or more, all from one to the other of the same two non-manifold
-      edges.
+      ends are the same vertex, or if its two faces cannot be wound consistently, as on a Möbius strip.
+    - A vertex at the end of a non-manifold edge, or with several fans of faces, is an infinitely sharp corner. It is on
+      a crease instead if it has three or more fans, each of which runs from one to the other of the same two
+      non-manifold edges.
 
-    Under Doo-Sabin nothing is sharp: the surface ends at non-manifold edges, and each fan that closes around a vertex
-    has an element of its own.
+    Under Doo-Sabin nothing is sharp: the surface ends at non-manifold edges, and each closed fan of a vertex has a
+    separate element.
 
     Parameters
     ----------
@@ -57,47 +58,47 @@ class ControlCage:
         0-based vertices of each face, counter-clockwise from outside. Faces have three vertices or more. A face that is
         turned over keeps its first vertex.
     creases : sequence of (vertex, vertex, sharpness), or (n, 3) array, optional
-        Sharp edges. Sharpness 0 is smooth, and 10 or more is infinitely sharp. An edge with a sharpness between them is
-        semi-sharp: sharp for as many refinements, and smooth from then on.
+        Sharp edges. Sharpness 0 is smooth, and 10 or more is infinitely sharp. Edges with a sharpness between them are
+        semi-sharp: sharp for this number of refinements, then smooth.
     corners : sequence of (vertex, sharpness), or (n, 2) array, optional
-        Sharp vertices, with the same meaning of sharpness.
+        Sharp vertices, with the same scale of sharpness.
     boundary : "edge_and_corner", "edge_only" or "none"
-        Where the surface of an open cage ends, as OpenSubdiv and USD name it. With "edge_and_corner" and "edge_only",
-        along smooth boundary curves; with "edge_and_corner", vertices of one face only are corners of these curves.
-        With "none", faces that touch the boundary are not part of the surface.
+        Boundary interpolation of open cages, named as in OpenSubdiv and USD. With "edge_and_corner" and "edge_only",
+        the surface ends along smooth boundary curves; with "edge_and_corner", vertices of one face only are corners of
+        these curves. With "none", faces that touch the boundary are not part of the surface.
     crease_method : "uniform" or "chaikin"
-        How refinement lowers the sharpness of semi-sharp creases: by one everywhere, or by Chaikin's rule, which also
-        averages the sharpness of creases that meet at a vertex.
+        Decay of semi-sharp creases in a refinement: sharpness is lowered by one, or by Chaikin's rule, which also
+        averages the sharpness of creases at a vertex.
     triangle_rule : "catmull_clark" or "smooth"
-        Weights of Catmull-Clark for edges of triangles: the same as for other edges, or OpenSubdiv's special ones.
+        Weights of Catmull-Clark for edges of triangles: the same as for other edges, or OpenSubdiv's smooth weights.
     holes : sequence of int, optional
-        0-based faces that shape the surface but are not part of it.
+        0-based faces that influence the surface but are not part of it.
     texcoords : Attribute or (n_v, 2) array, optional
-        Texture coordinates, ``(n, 2)``. A bare array has one row for each vertex, subdivided as points are.
+        Texture coordinates, ``(n, 2)``. An array has one row for each vertex, and is subdivided like points.
     attributes : dict of str to Attribute or (n_v, k) array, optional
-        Further data. A bare array again has one row for each vertex.
+        Further data. An array has one row for each vertex.
     materials : dict of str to (n,) int, optional
-        0-based faces of each material, by its name; a shape can show those of one of them.
+        0-based faces of each material, by name. A shape can show the faces of one material.
     face_varying : str
-        Where face-varying data is interpolated linearly, as OpenSubdiv and USD name it: "corners_plus1", "none",
+        Where face-varying data is interpolated linearly, named as in OpenSubdiv and USD: "corners_plus1", "none",
         "corners_only", "corners_plus2", "boundaries" or "all".
     scheme : str, optional
-        The scheme that the file names. `LimitSurface` uses it by default.
+        The scheme named by the file. `LimitSurface` uses it by default.
     strict : bool
         Whether a cage that is not an oriented 2-manifold is an error.
     source : CageSource, optional
-        How messages name the cage, its vertices and its faces.
+        Names of the cage, its vertices and its faces in messages.
 
     Attributes
     ----------
     positions : (n_v, 3) float64
         Read-only.
     structure : CageStructure
-        All that does not depend on positions. Cages of the same faces, tags and rules have the same one.
+        Everything that does not depend on positions. Cages with the same faces, tags and rules share it.
     topology : Topology
-        Faces and half-edges. Half-edges of non-manifold edges have no twin here, like those of boundary edges.
+        Faces and half-edges. Half-edges of non-manifold edges have no twin, like those of boundary edges.
     non_manifold : NonManifold or None
-        Where the cage is not a manifold; None if it is one everywhere.
+        Non-manifold edges and vertices; None if the cage is a manifold.
     tags : Sharpness
         Sharpness of edges and vertices, from creases and corners.
     boundary, crease_method, triangle_rule, face_varying : str
@@ -118,8 +119,8 @@ class ControlCage:
     Warns
     -----
     CageWarning
-        If vertices belong to no face, faces are turned over, or the faces are not a manifold; if creases are along no
-        edge of a face, or corners at no vertex, which are ignored.
+        If vertices belong to no face, faces are turned over, or the faces are not a manifold; if creases that are no
+        edge of a face, or corners that are no vertex, are ignored.
     """
 
     positions: NDArray[np.float64]
@@ -170,8 +171,8 @@ class ControlCage:
         for name, rule in rules.items():
             if rule not in RULES[name]:
                 raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
-        kept = validated_positions(positions, source)
-        topology, non_manifold, order = validated_faces(len(kept), sizes, vertices, source, strict)
+        validated = validated_positions(positions, source)
+        topology, non_manifold, order = validated_faces(len(validated), sizes, vertices, source, strict)
         structure = CageStructure(
             topology=topology,
             non_manifold=non_manifold,
@@ -181,7 +182,7 @@ class ControlCage:
         ).shared()
         topology = structure.topology
         vars(self).update(
-            positions=kept,
+            positions=validated,
             structure=structure,
             texcoords=validated_texcoords(texcoords, topology, source, order),
             attributes=validated_attributes(attributes, topology, source, order),
@@ -191,7 +192,7 @@ class ControlCage:
             },
             scheme=scheme,
             source=source,
-            **{each.name: getattr(structure, each.name) for each in fields(structure)},
+            **{attribute.name: getattr(structure, attribute.name) for attribute in fields(structure)},
         )
 
     @classmethod
@@ -206,14 +207,14 @@ class ControlCage:
         face_sizes : (n_f,) int
             Number of vertices of each face.
         face_vertices : (sum of face_sizes,) int
-            0-based vertices of all faces, one after the other.
+            0-based vertices of all faces, face by face.
         **options
             Further arguments of the constructor.
 
         Raises
         ------
         CageError
-            As the constructor does, or if ``face_sizes`` do not add up to the length of ``face_vertices``.
+            As the constructor, or if ``face_sizes`` do not add up to the length of ``face_vertices``.
         """
         return cls(positions, _FlatFaces(np.asarray(face_sizes), np.asarray(face_vertices)), **options)
 
@@ -225,33 +226,31 @@ class ControlCage:
 
         OBJ files may have OpenSubdiv's tags. PLY and USD files need the extra ``files`` of this package.
 
-        Points of USD files are transformed to world space, but not for the file's units and up axis. A USD file opens
-        the files that it refers to, and a damaged one can crash the USD library.
+        Points of USD files are transformed to world space; the file's units and up axis are not applied. Files that a
+        USD file references are opened, too. A damaged USD file can crash the USD library.
 
         Parameters
         ----------
         path : str or Path
         prim : str, optional
             For USD files with several meshes: the path of one mesh, or of a prim with one mesh below it, such as
-            "/World/car"; or "*" for all meshes as one cage, whose scheme and rules must be the same. Meshes that are
-            not to be smoothed are skipped if there are others. With "*", so are meshes that are invisible, guides or
-            proxies.
+            "/World/car"; or "*" for all meshes as one cage, if their scheme and rules are the same. Meshes that are not
+            subdivision surfaces are skipped if there are others. With "*", invisible meshes, guides and proxies are
+            skipped, too.
         time : float, optional
-            For USD files, a time code. By default, each value is the one that does not depend on time, or else the one
-            at its first time. If a mesh has no points or faces at its first time, it is read at the first time at which
-            it has both.
+            For USD files, a time code. By default, values are read at the default time, or else at their first time
+            sample. A mesh without points or faces there is read at the first time at which it has both.
         strict : bool
             Whether a cage that is not an oriented 2-manifold is an error.
         **rules
-            ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme``, which replace the file's
-            own.
+            ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme``, to override the file's.
 
         Raises
         ------
         CageError
             If the format is unknown, the file is malformed or its cage invalid; the message names the file and, if
-            possible, the line or prim. If a USD mesh is not a subdivision surface and no ``scheme`` is given; if meshes
-            that become one cage differ in scheme or rules that no argument replaces.
+            possible, the line or prim. If a USD mesh is not a subdivision surface and no ``scheme`` is given. If meshes
+            that become one cage differ in scheme or rules that no argument overrides.
         OSError
             If the file cannot be read.
 
@@ -268,8 +267,8 @@ class ControlCage:
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
 
-        `from_file` reads the same cage back, except for data that the format cannot store: USD files are in single
-        precision, and PLY files hold no creases, corners, holes and rules. OBJ files keep every bit of the positions.
+        `from_file` reads the same cage, except for data that the format cannot store: USD files are in single
+        precision, and PLY files have no creases, corners, holes and rules. OBJ files store positions exactly.
 
         Raises
         ------
@@ -281,37 +280,36 @@ class ControlCage:
         Warns
         -----
         CageWarning
-            If the format cannot hold all that the cage has.
+            If the format cannot store all data of the cage.
         """
         from ..files.formats import write_file
 
         write_file(self.contents, path)
 
     def with_positions(self, positions: ArrayLike) -> ControlCage:
-        """Cage with other ``(n_v, 3)`` positions. It shares this cage's topology, which is not validated again.
+        """Return a cage with other ``(n_v, 3)`` positions. It shares this cage's structure, without new validation.
 
         Raises
         ------
         CageError
             If the positions are malformed or their number differs.
         """
-        kept = validated_positions(positions, CageSource())
-        if len(kept) != self.vertex_count:
+        validated = validated_positions(positions, CageSource())
+        if len(validated) != self.vertex_count:
             raise CageError(
-                f"{self.source.name}: {len(kept)} new positions; expected {self.vertex_count}, one per vertex"
+                f"{self.source.name}: {len(validated)} new positions; expected {self.vertex_count}, one per vertex"
             )
         cage = type(self).__new__(type(self))
-        # Without cached results.
-        names = {each.name for each in fields(self)}
+        # Omit cached results.
+        names = {attribute.name for attribute in fields(self)}
         values = {name: value for name, value in vars(self).items() if name in names}
-        vars(cage).update(values, positions=kept)
+        vars(cage).update(values, positions=validated)
         return cage
 
     def refined(self, scheme: str | Scheme | None = None) -> ControlCage:
         """Refine once: a cage with the same limit surface, and about four times as many control points.
 
-        It also has the same texture coordinates and attributes on the surface. `refinement` has more, and says what
-        raises.
+        It also has the same texture coordinates and attributes on the surface. See `refinement`, also for errors.
 
         Parameters
         ----------
@@ -321,10 +319,10 @@ class ControlCage:
         return self.refinement(scheme).cage
 
     def refinement(self, scheme: str | Scheme | None = None) -> CageRefinement:
-        """Refine once, with the maps from this cage to the refined one.
+        """Refine once, and return the refined cage with the maps from this cage to it.
 
-        Sharpness between 0 and 10 is lowered as the cage's ``crease_method`` says. ``face_varying`` becomes another
-        rule where that keeps the same corners and the cage's own does not.
+        Sharpness between 0 and 10 is lowered by the cage's ``crease_method``. ``face_varying`` may change to another
+        rule, if that is necessary to keep the same corners.
 
         Parameters
         ----------
@@ -338,11 +336,10 @@ class ControlCage:
         Raises
         ------
         CageError
-            If no cage has the refined surface, because its edges would have the same two ends; or the refined values of
-            an attribute, because of its seams.
+            If no cage represents the refined surface, because two of its edges would have the same ends; or the refined
+            values of an attribute, because of its seams.
         SchemeError
-            As `LimitSurface`; or if the scheme numbers refined faces in a way of its own, or has no rules for an
-            attribute.
+            As `LimitSurface`; or if the scheme orders refined faces differently, or does not support an attribute.
         """
         from ..refinement.cage_refinement import refine_cage
 
@@ -350,17 +347,17 @@ class ControlCage:
 
     @property
     def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether each vertex is an infinitely sharp corner: by a tag, the boundary rule, or its faces."""
+        """``(n_v,)`` infinitely sharp corners, by a tag, by the boundary rule, or as non-manifold vertices."""
         return self.structure.is_corner
 
     @property
     def is_boundary(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether no other face shares the edge of each half-edge."""
+        """``(n_h,)`` whether the edge of each half-edge belongs to one face only."""
         return self.structure.is_boundary
 
     @property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether a boundary edge ends at the vertex."""
+        """``(n_v,)`` whether each vertex is on the boundary."""
         return self.structure.is_boundary_vertex
 
     @property
@@ -375,7 +372,7 @@ class ControlCage:
 
     @property
     def is_hole(self) -> NDArray[np.bool_]:
-        """``(n_f,)`` whether each face is not part of the surface: a hole, or at the boundary with the rule "none"."""
+        """``(n_f,)`` faces that are not part of the surface: holes, and with the rule "none" those at the boundary."""
         return self.structure.is_hole
 
     @property
@@ -388,32 +385,32 @@ class ControlCage:
 
     @property
     def face_sizes(self) -> IntArray:
-        """``(n_f,)`` int64, number of vertices of each face; read-only. If all are equal, they share one number."""
+        """``(n_f,)`` int64, number of vertices of each face; read-only. If all are equal, a broadcast scalar."""
         return self.topology.face_sizes
 
     @property
     def face_vertices(self) -> IndexArray:
-        """``(n_h,)`` int32, 0-based vertices of all faces, one face after the other; read-only."""
+        """``(n_h,)`` int32, 0-based vertices of all faces, face by face; read-only."""
         return self.topology.face_vertices
 
     @property
     def edges(self) -> IndexArray:
-        """``(n_e, 2)`` int32, 0-based ends of each edge, once; read-only.
+        """``(n_e, 2)`` int32, 0-based ends of each edge; read-only.
 
-        The lower number comes first. Rows are sorted by the higher number, then by the lower one.
+        The lower vertex comes first. Rows are sorted by the higher vertex, then by the lower.
         """
         return self.structure.edges
 
     @property
     def triangles(self) -> IndexArray:
-        """``(n, 3)`` int32, 0-based vertices of triangles that fan out from each face's first vertex; read-only."""
+        """``(n, 3)`` int32, 0-based vertices of the triangle fan at the first vertex of each face; read-only."""
         return self.structure.triangles
 
     def laplacian(self) -> sparse.csr_array:
-        """Uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.
+        """Return the uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.
 
-        Row i times values is the number of i's neighbours times its value, less the values of these. It is symmetric
-        and positive semi-definite; constants are in its null space. `LimitSurface.stiffness` knows lengths and angles.
+        The diagonal has the number of neighbours of each vertex, and neighbours have -1. The matrix is symmetric and
+        positive semi-definite; constants are in its null space. `LimitSurface.stiffness` respects lengths and angles.
         """
         from .structure import laplacian_of
 
@@ -421,7 +418,7 @@ class ControlCage:
 
     @property
     def contents(self) -> CageContents:
-        """Contents of a file of the cage."""
+        """Contents of a file that stores the cage."""
         return CageContents(
             positions=self.positions,
             face_sizes=self.face_sizes,
@@ -438,7 +435,7 @@ class ControlCage:
         )
 
     def as_properties(self, mi: ModuleType | str) -> dict[str, Any]:
-        """Properties of the shape ``subdivision``, to merge into ``mi.load_dict({"type": "subdivision", ...})``.
+        """Return properties of the shape ``subdivision``, to merge into ``mi.load_dict({"type": "subdivision", ...})``.
 
         Parameters
         ----------
@@ -457,7 +454,7 @@ class ControlCage:
         Raises
         ------
         ValueError
-            If ``mi`` is something else, there is no such variant, or none is set.
+            If ``mi`` is something else, the variant does not exist, or no variant is set.
         """
         return shape_properties(self.contents, variant_module(mi))
 
@@ -466,20 +463,20 @@ class ControlCage:
 
 
 class _FlatFaces(NamedTuple):
-    """Faces as `ControlCage.from_arrays` hands them to the constructor: sizes and concatenated vertices."""
+    """Faces as flat arrays, passed by `ControlCage.from_arrays` to the constructor."""
 
     sizes: NDArray
     vertices: NDArray
 
 
 def shape_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
-    """Properties by name, with arrays as Mitsuba's tensors; see `ControlCage.as_properties`."""
+    """Return properties by name, with arrays as Mitsuba tensors; see `ControlCage.as_properties`."""
     tables = {"creases": contents.creases, "corners": contents.corners}
     indices = {"face_sizes": contents.face_sizes, "face_vertices": contents.face_vertices}
     if len(contents.holes):
         indices["holes"] = contents.holes
     return {
-        # In double precision: far from the origin, single precision would change the normals visibly.
+        # Double precision, as far from the origin single precision would change the normals visibly.
         "positions": mapped(mi.TensorXd, contents.positions),
         **{name: mapped(mi.TensorXu, array) for name, array in indices.items()},
         **contents.rules,
@@ -490,14 +487,16 @@ def shape_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
 
 
 def _attribute_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
-    """Tensors of the values and of the indices of texture coordinates and attributes."""
+    """Return tensors of the values and of the indices of texture coordinates and attributes."""
     named = [
-        (f"{each.interpolation}_{name}", f"face_varying_{name}_indices", each)
-        for name, each in contents.attributes.items()
+        (f"{attribute.interpolation}_{name}", f"face_varying_{name}_indices", attribute)
+        for name, attribute in contents.attributes.items()
     ]
     if contents.texcoords is not None:
         name = "varying_texcoords" if contents.texcoords.interpolation == "varying" else "texcoords"
         named.append((name, "texcoord_indices", contents.texcoords))
-    values = {name: mapped(mi.TensorXf, each.values) for name, _, each in named}
-    indices = {name: mapped(mi.TensorXu, each.indices) for _, name, each in named if each.indices is not None}
+    values = {name: mapped(mi.TensorXf, attribute.values) for name, _, attribute in named}
+    indices = {
+        name: mapped(mi.TensorXu, attribute.indices) for _, name, attribute in named if attribute.indices is not None
+    }
     return values | indices

@@ -32,7 +32,7 @@ def warn(message: str) -> None:
         return
     level = 1
     frame: FrameType | None = sys._getframe()
-    # The stack may end inside this package: Mitsuba loads shapes in threads of its own.
+    # The stack may end inside this package, as Mitsuba loads shapes in its own threads.
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == _PACKAGE:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, CageWarning, stacklevel=level)
@@ -40,7 +40,7 @@ def warn(message: str) -> None:
 
 @contextmanager
 def noting_warnings() -> Iterator[list[str]]:
-    """Collect the messages of `warn` in a list, besides warning."""
+    """Collect the messages of `warn` in a list, in addition to warning."""
     noted: list[str] = []
     token = _noted.set(noted)
     try:
@@ -51,7 +51,7 @@ def noting_warnings() -> Iterator[list[str]]:
 
 @contextmanager
 def without_warnings() -> Iterator[None]:
-    """Have `warn` issue no warnings, where they were issued before."""
+    """Suppress the warnings of `warn`, for operations whose warnings were already issued."""
     token = _warns.set(False)
     try:
         yield
@@ -60,24 +60,24 @@ def without_warnings() -> Iterator[None]:
 
 
 def shortened(text: str, length: int = 80) -> str:
-    """Text from a file or a library as a message shows it: cut off, with an ellipsis, where it is long."""
+    """Truncate text from a file or a library for a message, with an ellipsis."""
     return text if len(text) <= length else f"{text[:length]}..."
 
 
 def in_digits(numbers: ArrayLike) -> str:
-    """A number, or a tuple of numbers, as a message shows it: with all digits that tell it from others."""
-    found = np.asarray(numbers)
-    if found.ndim:
-        return f"({', '.join(map(in_digits, found))})"
-    return str(found[()]).removesuffix(".0")
+    """Format a number, or a tuple of numbers, for a message, with all digits that distinguish it from others."""
+    array = np.asarray(numbers)
+    if array.ndim:
+        return f"({', '.join(map(in_digits, array))})"
+    return str(array[()]).removesuffix(".0")
 
 
 def number_of(count: int, noun: str) -> str:
-    """A count with its noun: "1 vertex", "2 vertices"."""
+    """Format a count with its noun: "1 vertex", "2 vertices"."""
     plurals = {"vertex": "vertices", "index": "indices"}
     return f"{count} {noun if count == 1 else plurals.get(noun, f'{noun}s')}"
 
 
 def number_of_such(count: int, noun: str) -> str:
-    """A count of things with the same problem, with their noun: "1 such vertex", "2 such vertices"."""
+    """Format a count of items with the same problem: "1 such vertex", "2 such vertices"."""
     return number_of(count, noun).replace(" ", " such ")

@@ -1,4 +1,4 @@
-"""Small control cages with names, for tests and scenes."""
+"""Small named control cages, for tests and scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from .control_cage import ControlCage
 from .errors import CageError
 from .source import CageSource
 
-# Quads along each side of a sector of `extraordinary`, and across its band: nearly square for valences 4 to 8.
+# Number of quads along each side of a sector of `extraordinary`, and across its band; quads are nearly square for
+# valences 4 to 8.
 _SECTOR_ROWS = 3
 _BAND_ROWS = 4
 
@@ -37,12 +38,11 @@ def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: floa
     Parameters
     ----------
     columns, rows : int
-        Number of quads around the axis and around the tube, 3 or more. Vertex and face ``(column, row)`` have the
-        number ``column * rows + row``. Face (0, 0) begins at vertex 0, which is on the x axis, and leads to vertex
+        Number of quads around the axis and around the tube, 3 or more. Vertex and face ``(column, row)`` have the index
+        ``column * rows + row``. The first edge of face (0, 0) runs from vertex 0, which is on the x axis, to vertex
         (1, 0).
     major_radius, minor_radius : float
-        The vertices lie on circles of radius ``minor_radius``, with centres at the distance ``major_radius`` from the
-        axis.
+        Vertices are on circles of radius ``minor_radius`` whose centres have the distance ``major_radius`` to the axis.
     """
     if columns < 3 or rows < 3:
         raise CageError(f"torus of {columns} columns and {rows} rows; expected at least 3 of each")
@@ -60,9 +60,9 @@ def torus(columns: int, rows: int, major_radius: float = 2.0, minor_radius: floa
 def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     """Ball of quads with a vertex of the given valence on top, isolated from all other extraordinary vertices.
 
-    The ball is a prism over a regular polygon, pushed out to the unit sphere; for valence 4, a cube. It is symmetric
-    about the z axis and in the plane z = 0. The top consists of ``valence`` square grids around the pole, the bottom is
-    its mirror image, and a band joins them. The two poles have the given valence, the ``2 * valence`` corners of the
+    The ball is a prism over a regular polygon, projected to the unit sphere; for valence 4, a cube. It is symmetric
+    about the z axis and the plane z = 0. The top consists of ``valence`` square grids around the pole, the bottom is
+    its mirror image, and a band connects them. The two poles have the given valence, the ``2 * valence`` corners of the
     prism valence 3, and all other vertices valence 4.
 
     Returns ControlCage: vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring,
@@ -73,7 +73,7 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     valence : int
         3 or more.
     closed : bool
-        False makes a dome with boundary, without the band and the bottom.
+        False returns a dome with boundary, without the band and the bottom.
     """
     _require_extraordinary(valence)
     top, top_faces, loop = _prism_top(valence)
@@ -81,7 +81,7 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     if not closed:
         return ControlCage(_on_unit_sphere(top), top_faces, source=source)
 
-    # Loops of vertices from the rim of the top to the rim of the bottom. Those between the rims are new vertices.
+    # Loops of vertices from the rim of the top to the rim of the bottom. The loops between are new vertices.
     heights = np.tan(np.linspace(np.pi / 4, -np.pi / 4, _BAND_ROWS + 1))[1:-1, None, None]
     between = np.broadcast_to(top[loop], (_BAND_ROWS - 1, len(loop), 3)).copy()
     between[..., 2:] = heights
@@ -97,7 +97,7 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
 def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
     """Ball of triangles with a vertex of the given valence on top, isolated from all other extraordinary vertices.
 
-    The ball is a double pyramid over a regular polygon, each of its triangles cut into ``rows * rows``, pushed out to
+    The ball is a double pyramid over a regular polygon, with each triangle divided into ``rows * rows``, projected to
     the unit sphere. The poles have the given valence, the polygon's corners valence 4, all other vertices valence 6.
 
     Returns ControlCage: vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring,
@@ -119,21 +119,31 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
         return np.where(circle == 0, 0, starts[np.maximum(circle, 1) - 1] + step % (valence * np.maximum(circle, 1)))
 
     sector, circle, step = np.indices((valence, rows, rows)).reshape(3, -1)
-    # Circle by circle, so that the pole's triangles come first.
+    # Sort by circle, so that the triangles of the pole come first.
     order = np.argsort(circle, kind="stable")
     sector, circle, step = sector[order], circle[order], step[order]
-    here, beyond = sector * circle, sector * (circle + 1)
+    inner_start, outer_start = sector * circle, sector * (circle + 1)
     outward = step <= circle
     inward = step < circle
     up = np.stack(
-        [number(circle, here + step), number(circle + 1, beyond + step), number(circle + 1, beyond + step + 1)], axis=1
+        [
+            number(circle, inner_start + step),
+            number(circle + 1, outer_start + step),
+            number(circle + 1, outer_start + step + 1),
+        ],
+        axis=1,
     )[outward]
     down = np.stack(
-        [number(circle, here + step), number(circle + 1, beyond + step + 1), number(circle, here + step + 1)], axis=1
+        [
+            number(circle, inner_start + step),
+            number(circle + 1, outer_start + step + 1),
+            number(circle, inner_start + step + 1),
+        ],
+        axis=1,
     )[inward]
 
     circle, step = np.repeat(np.arange(1, rows + 1), lengths), ragged.index_in_row(lengths)
-    # Straight along the sector's side of the polygon first, then out to the sphere.
+    # Interpolate along the sector's side of the polygon, then project to the sphere.
     side, along = np.divmod(step, circle)
     angle = 2 * np.pi / valence * np.stack([side, side + 1])
     weight = np.stack([1 - along / circle, along / circle])
@@ -142,7 +152,7 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
     ring = np.concatenate([radius * flat / np.linalg.norm(flat, axis=1, keepdims=True), np.sqrt(1 - radius**2)], axis=1)
     upper = np.concatenate([[[0, 0, 1]], ring])
     below = len(upper) - valence * rows
-    # The equator is shared; the lower half lists the other vertices again, mirrored.
+    # The equator is shared; the lower half has mirrored copies of the other vertices.
     lower_number = np.concatenate([len(upper) + np.arange(below), np.arange(below, len(upper))])
     faces = np.concatenate([up, down])
     positions = np.concatenate([upper, upper[:below] * [1, 1, -1]])
@@ -154,9 +164,9 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
 
 
 def extraordinary_face(corners: int) -> ControlCage:
-    """Ball with a face of any size on top amid quads, and all vertices of valence 4: the dual of `extraordinary`.
+    """Ball with a face of any size on top, surrounded by quads; all vertices have valence 4. Dual of `extraordinary`.
 
-    Returns ControlCage: face 0 is the one on top, and begins at vertex 0. Raises CageError if ``corners < 3``.
+    Returns ControlCage: face 0 is the face on top, and begins at vertex 0. Raises CageError if ``corners < 3``.
 
     Parameters
     ----------
@@ -180,23 +190,23 @@ def _require_extraordinary(valence: int) -> None:
 
 
 def _prism_top(valence: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Flat regular polygon at z = 1, of one square grid ("sector") per side. Its inscribed circle has radius 1.
+    """Regular polygon at z = 1 with one square grid ("sector") per side. Its inscribed circle has radius 1.
 
     In sector ``k``, vertices have coordinates (i, j) from the polygon's centre: i runs to the middle of side ``k``, j
-    to the middle of side ``k + 1``. The polygon's corner between these sides is opposite the centre.
+    to the middle of side ``k + 1``. The polygon's corner between these sides is opposite to the centre.
 
     Returns positions, faces and the boundary loop.
     """
     rows = _SECTOR_ROWS
 
     def number(sector, i, j):
-        # The vertices of a sector with i = 0 are those of the next sector with j = 0, which owns them.
+        # Vertices with i = 0 are those with j = 0 of the next sector, which owns them.
         shared = i == 0
         sector, i, j = sector + shared, np.where(shared, j, i), np.where(shared, 0, j)
         return np.where(i == 0, 0, 1 + ((i - 1) * (rows + 1) + j) * valence + sector % valence)
 
     i, j, sector = np.meshgrid(np.arange(1, rows + 1), np.arange(rows + 1), np.arange(valence), indexing="ij")
-    # Tangents of equal angles, so that steps on the sphere are nearly equal.
+    # Tangents of equally spaced angles, so that steps on the sphere are nearly equal.
     along_i, along_j = np.tan(np.pi / 4 * np.stack([i, j]) / rows)
     middle = 2 * np.pi * sector / valence
     next_middle, corner = middle + 2 * np.pi / valence, middle + np.pi / valence

@@ -1,4 +1,4 @@
-"""Faces of a cage turned over and cut into an oriented manifold, with a warning or an error."""
+"""Orientation of the faces of a cage, and cuts at non-manifold edges, with warnings or errors."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from ..mesh.manifold import NonManifold, fan_counts, fan_labels, is_manifold, is
 from .errors import number_of, warn
 from .source import CageSource
 
-# A warning names this many things of a kind.
+# Maximum number of items of a kind that a message names.
 SHOWN = 3
 
 
 def oriented_faces(
     given: Topology, source: CageSource, strict: bool
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
-    """Turn over faces that are wound against their neighbours, and cut the mesh at non-manifold edges.
+    """Turn over faces with a winding opposite to their neighbours', and cut the mesh at non-manifold edges.
 
-    Returns the topology, in which half-edges of non-manifold edges have no twin, and non-manifold vertices have several
-    fans; where the faces are not a manifold, None if they are one everywhere; and, if faces were turned over, (n_h,)
-    int64: which given face corner became each face corner of the topology.
+    Returns the topology, in which half-edges of non-manifold edges have no twin, and vertices may have several fans;
+    non-manifold edges and vertices, None for a manifold; and, if faces were turned over, (n_h,) int64, the given face
+    corner of each face corner of the topology.
 
-    Raises CageError, with ``strict``, if a face has a vertex twice, an edge more than two faces, neighbouring faces are
-    wound against each other, or the faces of a vertex are not one fan. Without, warns about faces that were turned
-    over, and about edges and vertices that are non-manifold.
+    With ``strict``, raises CageError if a face has a vertex twice, an edge has more than two faces, neighbouring faces
+    have opposite windings, or the faces of a vertex are not one fan. Without ``strict``, warns about faces that were
+    turned over, and about non-manifold edges and vertices.
     """
     if is_manifold(given):
         return given, None, None
@@ -41,32 +41,32 @@ def oriented_faces(
             f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, as they were wound "
             f"against their neighbours: {source.faces(turned, SHOWN)} (numbers count from {source.index_base})"
         )
-    separate, found = separated(topology)
-    if found is None:
+    separate, non_manifold = separated(topology)
+    if non_manifold is None:
         return separate, None, order
-    warn(_description(separate, found, source))
-    return separate, found, order
+    warn(_description(separate, non_manifold, source))
+    return separate, non_manifold, order
 
 
-def _description(topology: Topology, found: NonManifold, source: CageSource) -> str:
-    """Text of the warning about non-manifold edges and vertices: how many of each kind, and the first of them."""
+def _description(topology: Topology, non_manifold: NonManifold, source: CageSource) -> str:
+    """Return the warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
     t = topology
     repeats = np.unique(t.face[is_repeated(t)])
-    half_edges = np.flatnonzero(found.is_edge & ~found.is_own_edge)
+    half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
     # One half-edge of each edge.
-    crowded = half_edges[np.unique(found.edge[half_edges], return_index=True)[1]]
-    fans = np.flatnonzero(fan_counts(t, fan_labels(t)[1]) > 1)
-    fans = fans[~t.ends_of(found.is_edge)[fans]]
+    crowded = half_edges[np.unique(non_manifold.edge[half_edges], return_index=True)[1]]
+    pinched = np.flatnonzero(fan_counts(t, fan_labels(t)[1]) > 1)
+    pinched = pinched[~t.ends_of(non_manifold.is_edge)[pinched]]
     kinds = (
         ("edge", "of more than two faces, or of two in one direction", crowded, lambda edge: _edge_at(t, edge, source)),
-        ("vertex", "between separate fans", fans, source.vertex),
+        ("vertex", "between separate fans", pinched, source.vertex),
         ("face", "with a vertex more than once", repeats, lambda face: source.faces(np.array([face]))),
     )
     parts = []
-    for noun, what, indices, name in kinds:
+    for noun, problem, indices, name in kinds:
         if count := len(indices):
             names = ", ".join(map(name, indices[:SHOWN].tolist()))
-            parts.append(f"{number_of(count, noun)} {what} ({names}{', ...' if count > SHOWN else ''})")
+            parts.append(f"{number_of(count, noun)} {problem} ({names}{', ...' if count > SHOWN else ''})")
     return (
         f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp, and such "
         "vertices are corners or lie on creases along these edges, as in OpenSubdiv; strict makes this an error "
@@ -126,18 +126,19 @@ def _edge_at(topology: Topology, half_edge: int, source: CageSource) -> str:
 
 
 def turning_order(topology: Topology) -> IntArray | None:
-    """Find an order of the face corners in which neighbouring faces are wound alike; None if they already are.
+    """Find an order of the face corners with consistent winding; None if the winding is already consistent.
 
-    Two faces are neighbours if they share an edge that no third face has. Of each connected piece the smaller part is
-    turned; of two equal parts, the one without the piece's lowest face. A turned face keeps its first corner. Faces
-    around a Möbius strip cannot all be wound alike; there as few neighbours as possible stay wound against each other.
+    Two faces are neighbours if they share an edge that no third face has. In each connected component the smaller part
+    is turned over; of two equal parts, the one without the component's lowest face. A turned face keeps its first
+    corner. Faces around a Möbius strip have no consistent winding; there as few pairs of neighbours as possible remain
+    inconsistent.
 
-    Returns (n_h,) int64: the present number of each corner of the new order.
+    Returns (n_h,) int64: the present index of each corner of the new order.
     """
     t = topology
     one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))
     other = t.twin[one]
-    # An edge that joins a vertex to itself does not count, and a face that has an edge twice is no neighbour of itself.
+    # Ignore edges that join a vertex to itself, and edges that a face has twice.
     joins = (t.face[one] != t.face[other]) & (t.face_vertices[one] != t.face_vertices[t.next[one]])
     one, other = one[joins], other[joins]
     disagrees = t.face_vertices[one] == t.face_vertices[other]
@@ -146,8 +147,8 @@ def turning_order(topology: Topology) -> IntArray | None:
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
-    # A tree of neighbours over each piece, of as few that disagree as possible. Along a tree all can be made to agree.
-    # SciPy before 1.16 takes graphs with indices of 32 bits only.
+    # A spanning tree of each component with as few inconsistent edges as possible; along a tree all faces can be made
+    # consistent. SciPy before 1.16 requires 32-bit indices.
     first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int32)
     order = np.lexsort((disagrees, second, first))
     first, second, disagrees = first[order], second[order], disagrees[order]
@@ -157,20 +158,20 @@ def turning_order(topology: Topology) -> IntArray | None:
     costs = (1 + disagrees[is_new], (first[is_new], second[is_new]))
     tree = minimum_spanning_tree(sparse.coo_array(costs, shape=(count, count))).tocoo()
 
-    # A graph that has every face twice, as it is and turned. It joins neighbours that agree, both as they are or both
-    # turned, and neighbours that disagree, one as it is to the other one turned.
+    # A graph with two nodes for each face, unturned and turned. Consistent neighbours are connected unturned to
+    # unturned and turned to turned, inconsistent ones unturned to turned.
     is_opposite = tree.data > 1
     starts = np.concatenate([tree.row, tree.row + count])
     ends = np.concatenate([tree.col + count * is_opposite, tree.col + count * ~is_opposite])
     graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(2 * count, 2 * count))
-    as_is, turned = connected_components(graph, directed=False)[1].reshape(2, count)
-    _, lowest, piece = np.unique(np.minimum(as_is, turned), return_index=True, return_inverse=True)
-    is_turned = as_is != as_is[lowest][piece]
-    is_turned ^= (2 * np.bincount(piece, is_turned) > np.bincount(piece))[piece]
+    unturned, turned = connected_components(graph, directed=False)[1].reshape(2, count)
+    _, lowest, component = np.unique(np.minimum(unturned, turned), return_index=True, return_inverse=True)
+    is_turned = unturned != unturned[lowest][component]
+    is_turned ^= (2 * np.bincount(component, is_turned) > np.bincount(component))[component]
     if not is_turned.any():
         return None
-    found = np.arange(t.half_edge_count)
+    corner_order = np.arange(t.half_edge_count)
     corners = t.half_edges_of(is_turned)
     begin, size = t.face_offsets[t.face[corners]], t.face_sizes[t.face[corners]]
-    found[corners] = begin + (size - (corners - begin)) % size
-    return found
+    corner_order[corners] = begin + (size - (corners - begin)) % size
+    return corner_order

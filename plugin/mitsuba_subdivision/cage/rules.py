@@ -1,4 +1,4 @@
-"""Rules of a cage, which OpenSubdiv and USD call options: their names, and what boundary rules do."""
+"""Rules of a cage (options in OpenSubdiv and USD): names, values, and the effect of boundary rules."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import Topology
 
-# Rules by name and the values of each, as OpenSubdiv and USD name them. The first value is the default.
+# Names of rules and their values, as in OpenSubdiv and USD. The first value is the default.
 RULES = {
     "boundary": ("edge_and_corner", "edge_only", "none"),
     "crease_method": ("uniform", "chaikin"),
@@ -17,18 +17,18 @@ RULES = {
 
 
 def boundary_corners(rule: str, t: Topology) -> NDArray[np.bool_]:
-    """``(n_v,)`` whether a boundary rule makes each vertex a corner: with "edge_and_corner", those of one face."""
+    """Return ``(n_v,)``: corners by the boundary rule: vertices with one face in "edge_and_corner"."""
     if rule != "edge_and_corner":
         return np.zeros(t.vertex_count, dtype=bool)
     return t.is_border_vertex & (t.vertex_face_count == 1)
 
 
 def boundary_holes(rule: str, t: Topology, is_boundary: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """``(n_f,)`` whether a boundary rule leaves each face out: with "none", those at a boundary.
+    """Return ``(n_f,)``: faces that the boundary rule removes from the surface: with "none", those at a boundary.
 
-    ``is_boundary``, ``(n_h,)``, has no infinitely sharp half-edges, which the surface reaches.
+    ``is_boundary``, ``(n_h,)``, is false for infinitely sharp half-edges, as faces there are part of the surface.
     """
-    found = np.zeros(t.face_count, dtype=bool)
+    is_hole = np.zeros(t.face_count, dtype=bool)
     if rule == "none":
-        found[t.face[np.flatnonzero(t.ends_of(is_boundary)[t.face_vertices])]] = True
-    return found
+        is_hole[t.face[np.flatnonzero(t.ends_of(is_boundary)[t.face_vertices])]] = True
+    return is_hole

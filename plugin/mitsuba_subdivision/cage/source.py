@@ -1,4 +1,4 @@
-"""How messages name a control cage, its vertices and its faces."""
+"""Names of a control cage, its vertices and its faces in messages."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from .errors import CageError, number_of_such
 
 @dataclass(frozen=True, eq=False)
 class CageSource:
-    """Where a control cage comes from: names it, its vertices and its faces in messages.
+    """Origin of a control cage, which names the cage, its vertices and its faces in messages.
 
-    All methods take 0-based numbers.
+    All methods take 0-based indices.
 
     Parameters
     ----------
     name : str
         Name of the whole cage; for a file, its quoted path.
     index_base : int
-        Number of the first vertex and face as the author of the cage counts: 0 in arrays, 1 in OBJ files.
+        Number of the first vertex and face in messages: 0 for arrays, 1 for OBJ files.
     vertex_lines, face_lines : (n_v,), (n_f,) int or None
         1-based line of each vertex and face in the file; None if the file has no lines.
     tag_lines : dict of str to sequence of int
-        1-based lines of "creases", "corners" and "holes", each if the file has lines.
+        1-based lines of "creases", "corners" and "holes", if the file has lines.
     """
 
     name: str = "control cage"
@@ -34,27 +34,27 @@ class CageSource:
     tag_lines: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:
-        """Beginning of a message about a face: ``"cube.obj", line 17: face 5``."""
+        """Return the beginning of a message about a face: ``"cube.obj", line 17: face 5``."""
         return f"{self._line_prefix(self.face_lines, face)}: face {face + self.index_base}"
 
     def at_vertex(self, vertex: int) -> str:
-        """Beginning of a message about a vertex."""
+        """Return the beginning of a message about a vertex."""
         return f"{self._line_prefix(self.vertex_lines, vertex)}: {self.vertex(vertex)}"
 
     def at_tag(self, kind: str, row: int) -> str:
-        """Beginning of a message about a row of "creases", "corners" or "holes"."""
+        """Return the beginning of a message about a row of "creases", "corners" or "holes"."""
         return self._line_prefix(self.tag_lines.get(kind), row)
 
     def vertex(self, vertex: int) -> str:
-        """Name of a vertex inside a message."""
+        """Return the name of a vertex within a message."""
         return f"vertex {vertex + self.index_base}"
 
     def edge(self, start: int, end: int) -> str:
-        """Name of the edge between two vertices inside a message."""
+        """Return the name of the edge between two vertices within a message."""
         return f"edge ({start + self.index_base}, {end + self.index_base})"
 
     def faces(self, faces: IntArray, shown: int = 6) -> str:
-        """Names of the first few faces, with their lines, inside a message, and how many more there are."""
+        """Return the names of the first few faces, with their lines, within a message, and the number of the rest."""
         names = [
             f"{face + self.index_base}" + ("" if self.face_lines is None else f" (line {self.face_lines[face]})")
             for face in faces[:shown].tolist()
@@ -63,9 +63,10 @@ class CageSource:
         return ("faces " if len(faces) > 1 else "face ") + ", ".join(names) + more
 
     def error(self, where: str, problem: str, expected: str, count: int, noun: str) -> CageError:
-        """An error about the first of several vertices, faces, edges or indices with the same problem.
+        """Return an error about the first of several vertices, faces, edges or indices with the same problem.
 
-        ``where`` begins the message, from `at_face` or `at_vertex`; ``count`` and ``noun`` ("vertex") say how many.
+        ``where``, from `at_face` or `at_vertex`, begins the message; ``count`` is the number of items, ``noun`` their
+        kind ("vertex").
         """
         such = number_of_such(count, noun)
         return CageError(f"{where} {problem}; expected {expected} ({such}; numbers count from {self.index_base})")

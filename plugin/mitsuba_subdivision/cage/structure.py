@@ -1,4 +1,4 @@
-"""All of a control cage that does not depend on where its vertices are."""
+"""Data of a control cage that does not depend on positions."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class CageStructure:
-    """Faces, tags and rules of a control cage, and data derived from these.
+    """Faces, tags and rules of a control cage, and derived data.
 
-    Cages of equal structure share one, see `shared`. Attributes and properties are those of `ControlCage`.
+    Cages with equal structure share one object, see `shared`. Attributes and properties are as in `ControlCage`.
     """
 
     topology: Topology
@@ -39,7 +39,7 @@ class CageStructure:
     holes: IntArray
 
     def shared(self) -> CageStructure:
-        """The shared structure that equals this one; this one itself if there is none yet."""
+        """Return the shared structure that equals this one, or this one if there is none yet."""
         t = self.topology
         names = None if t.edge_names is None else Content(t.edge_names)
         arrays = (t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)
@@ -48,15 +48,15 @@ class CageStructure:
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:
-        t, found = self.topology, self.tags.is_corner
+        t, is_corner = self.topology, self.tags.is_corner
         if self.non_manifold is not None:
-            found = found | self.non_manifold.is_corner
-        return found | boundary_corners(self.boundary, t)
+            is_corner = is_corner | self.non_manifold.is_corner
+        return is_corner | boundary_corners(self.boundary, t)
 
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:
-        is_border, found = self.topology.twin < 0, self.non_manifold
-        return is_border if found is None else is_border & ~found.is_edge | found.is_own_edge
+        is_border, non_manifold = self.topology.twin < 0, self.non_manifold
+        return is_border if non_manifold is None else is_border & ~non_manifold.is_edge | non_manifold.is_own_edge
 
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
@@ -93,9 +93,9 @@ _SHARED: Shared[CageStructure] = Shared()
 
 
 def edges_of(topology: Topology) -> IndexArray:
-    """``(n_e, 2)`` int32 ends of each edge, once, the lower number first; sorted by the higher one, then the lower.
+    """Return ``(n_e, 2)`` int32 ends of each edge, the lower vertex first; sorted by the higher vertex, then the lower.
 
-    Edges between the same two vertices count as one, as where a mesh is no manifold.
+    Edges between the same two vertices, which occur in non-manifold meshes, are one edge.
     """
     start, end = topology.face_vertices, topology.face_vertices[topology.next]
     low, high = np.minimum(start, end).astype(np.int64), np.maximum(start, end).astype(np.int64)
@@ -105,7 +105,7 @@ def edges_of(topology: Topology) -> IndexArray:
 
 
 def triangles_of(topology: Topology) -> IndexArray:
-    """``(n, 3)`` int32 vertices of triangles that fan out from each face's first vertex, in the order of the faces."""
+    """Return ``(n, 3)`` int32 vertices of the triangle fans at the first vertex of each face, in order of faces."""
     counts = topology.face_sizes - 2
     first = np.repeat(topology.face_offsets[:-1], counts)
     step = first + ragged.index_in_row(counts)
@@ -113,11 +113,11 @@ def triangles_of(topology: Topology) -> IndexArray:
 
 
 def laplacian_of(edges: IndexArray, vertex_count: int) -> sparse.csr_array:
-    """``(n_v, n_v)`` Laplacian of a graph: the number of neighbours on the diagonal, -1 for each neighbour."""
+    """Return the ``(n_v, n_v)`` Laplacian of a graph: number of neighbours on the diagonal, -1 for each neighbour."""
     from scipy import sparse
 
-    one, other = edges[edges[:, 0] != edges[:, 1]].T
-    rows, columns = np.concatenate([one, other]), np.concatenate([other, one])
+    start, end = edges[edges[:, 0] != edges[:, 1]].T
+    rows, columns = np.concatenate([start, end]), np.concatenate([end, start])
     shape = vertex_count, vertex_count
     adjacency = sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()
     return sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)

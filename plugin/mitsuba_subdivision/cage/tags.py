@@ -1,4 +1,4 @@
-"""Creases and corners of a control cage, checked."""
+"""Validation of the creases and corners of a control cage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .errors import CageError, in_digits, number_of_such, warn
 from .source import CageSource
 from .validation import read_only
 
-# Up to this number, float64 holds every integer.
+# float64 represents all integers up to this exactly.
 _LARGEST_INDEX = 2**53
 
 
@@ -24,12 +24,12 @@ def validated_tags(
     corners: Sequence[tuple[int, float]] | NDArray,
     source: CageSource,
 ) -> Sharpness:
-    """Check creases and corners. If an edge or vertex is given more than once, its last sharpness counts.
+    """Check creases and corners. If an edge or vertex occurs more than once, its last sharpness is used.
 
-    As in OpenSubdiv, those that name an edge or a vertex that the mesh does not have are ignored.
+    As in OpenSubdiv, creases and corners at edges and vertices that do not exist are ignored.
 
-    Raises CageError if rows are no numbers of vertices, or a sharpness is negative or not a number. Warns if creases or
-    corners are ignored.
+    Raises CageError if vertices are not integers, or a sharpness is negative or NaN. Warns if creases or corners are
+    ignored.
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
@@ -62,25 +62,27 @@ def validated_tags(
 
 
 def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) -> IntArray:
-    """Check pairs of vertices, and find a half-edge of each.
+    """Check edges, given as pairs of vertices, and return a half-edge of each.
 
-    Raises CageError if a pair is no edge of two faces, or is given twice.
+    Raises CageError if a pair is not an edge of two faces, or occurs twice.
     """
     t, ends = topology, np.asarray(edges)
     if ends.size and (ends.dtype.kind not in "iu" or ends.shape != (len(ends), 2)):
         raise CageError(f"{source.name}: edges of shape {ends.shape} and type {ends.dtype}; expected integers, (n, 2)")
     ends = ends.astype(np.int64).reshape(-1, 2)
-    found = _half_edges_between(t, *ends.T).astype(np.int64)
+    half_edges = _half_edges_between(t, *ends.T).astype(np.int64)
 
     def where(row: int) -> str:
         return f"{source.name}: {source.edge(*ends[row])}"
 
-    _require(found >= 0, where, "is no edge of a face", "edges of two faces", source)
-    _require(t.twin[found] >= 0, where, "is infinitely sharp, as it has not two faces", "edges of two faces", source)
-    is_first = np.zeros(len(found), dtype=bool)
-    is_first[np.unique(t.edge[found], return_index=True)[1]] = True
+    _require(half_edges >= 0, where, "is no edge of a face", "edges of two faces", source)
+    _require(
+        t.twin[half_edges] >= 0, where, "is infinitely sharp, as it has not two faces", "edges of two faces", source
+    )
+    is_first = np.zeros(len(half_edges), dtype=bool)
+    is_first[np.unique(t.edge[half_edges], return_index=True)[1]] = True
     _require(is_first, where, "is given twice", "each edge once", source)
-    return found
+    return half_edges
 
 
 def _require(
@@ -91,16 +93,16 @@ def _require(
 
 
 def _sharpness(count: int, indices: IntArray, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Read-only values at some indices, and zero elsewhere."""
+    """Return a read-only array with values at ``indices``, clamped to `INFINITE`, and zero elsewhere."""
     if not len(indices):
         return _zeros(count)
-    found = np.zeros(count)
-    found[indices] = np.minimum(values, INFINITE)
-    return read_only(found)
+    sharpness = np.zeros(count)
+    sharpness[indices] = np.minimum(values, INFINITE)
+    return read_only(sharpness)
 
 
 def _zeros(count: int) -> NDArray[np.float64]:
-    """Read-only zeros. As in most cages nothing is sharp, they take no memory."""
+    """Return read-only zeros. They take no memory, as in most cages nothing is sharp."""
     return np.broadcast_to(0.0, count)
 
 
@@ -121,20 +123,20 @@ def _table(
 
 
 def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntArray:
-    """A half-edge between each pair of vertices, in either direction; -1 where there is none."""
+    """Return a half-edge between each pair of vertices, in either direction; -1 if there is none."""
     if not len(starts):
         return np.zeros(0, dtype=np.int64)
     n = topology.vertex_count
     half_edges = topology.edge_half_edge
     a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
     keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
-    # Of several edges between the same vertices, the first is taken.
+    # If several edges have the same vertices, the first is used.
     order = np.argsort(keys, kind="stable")
-    wanted = np.minimum(starts, ends) * n + np.maximum(starts, ends)
-    index = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-    found = order[index]
+    pair_keys = np.minimum(starts, ends) * n + np.maximum(starts, ends)
+    index = np.minimum(np.searchsorted(keys[order], pair_keys), len(keys) - 1)
+    candidate = order[index]
     inside = (np.minimum(starts, ends) >= 0) & (np.maximum(starts, ends) < n)
-    return np.where(inside & (keys[found] == wanted), half_edges[found], -1)
+    return np.where(inside & (keys[candidate] == pair_keys), half_edges[candidate], -1)
 
 
 def _warn_of_ignored(
@@ -147,7 +149,7 @@ def _warn_of_ignored(
 
 
 def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
-    """Raise an error if a sharpness is negative or not a number; ``where`` is the beginning of its message by row."""
+    """Raise CageError if a sharpness is negative or NaN; ``where`` returns the beginning of the message for a row."""
     for row in np.flatnonzero(~(values >= 0))[:1]:
         raise CageError(
             f"{where(row)} has sharpness {in_digits(values[row])}; expected 0 for smooth, up to {INFINITE:g} for "

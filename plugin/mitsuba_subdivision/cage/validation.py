@@ -1,6 +1,6 @@
-"""Checks of a control cage.
+"""Validation of a control cage.
 
-Every error names the first wrong value, the number of such values, and the expected ones.
+Every error names the first invalid value, the number of invalid values, and the expected values.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from .errors import CageError, number_of_such, warn
 from .oriented_faces import oriented_faces
 from .source import CageSource
 
-# Vertices and half-edges of the cage and of the cage refined once have 31-bit numbers.
+# Vertices and half-edges of the cage, and of the cage refined once, must fit into 31 bits.
 MOST_FACE_CORNERS = MOST_VERTICES = (1 << 29) - 1
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
     """Check positions and return a read-only ``(n, 3)`` float64 copy.
 
-    Raises CageError if the shape is not ``(n, 3)`` with ``n > 0``, or a coordinate is not a finite number.
+    Raises CageError if the shape is not ``(n, 3)`` with ``n > 0``, or a coordinate is not finite.
     """
     expected = "expected an (n, 3) array of numbers"
     try:
-        given = np.asarray(positions)
+        array = np.asarray(positions)
     except ValueError as error:  # For example, rows of different lengths.
         raise CageError(f"{source.name}: positions are not an array ({error}); {expected}") from error
-    if given.dtype.kind not in "iuf" and given.size:
-        raise CageError(f"{source.name}: positions have type {given.dtype}; {expected}")
-    if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0:
-        raise CageError(f"{source.name}: positions have shape {given.shape}; {expected}, n > 0")
-    kept = np.array(given, dtype=np.float64, order="C")
-    if not np.isfinite(kept).all():
-        bad = np.flatnonzero(~np.isfinite(kept).all(axis=1))
-        problem = f"has the coordinates {tuple(kept[bad[0]].tolist())}"
-        raise source.error(source.at_vertex(bad[0]), problem, "finite numbers", len(bad), "vertex")
-    return read_only(kept)
+    if array.dtype.kind not in "iuf" and array.size:
+        raise CageError(f"{source.name}: positions have type {array.dtype}; {expected}")
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
+        raise CageError(f"{source.name}: positions have shape {array.shape}; {expected}, n > 0")
+    copy = np.array(array, dtype=np.float64, order="C")
+    if not np.isfinite(copy).all():
+        invalid = np.flatnonzero(~np.isfinite(copy).all(axis=1))
+        problem = f"has the coordinates {tuple(copy[invalid[0]].tolist())}"
+        raise source.error(source.at_vertex(invalid[0]), problem, "finite numbers", len(invalid), "vertex")
+    return read_only(copy)
 
 
 def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
-    """Sizes and concatenated vertices of faces, not yet validated.
+    """Return sizes and concatenated vertices of faces, not yet validated.
 
-    Raises CageError if ``faces`` are neither int sequences nor an (f, k) array.
+    Raises CageError if ``faces`` are neither sequences nor an (f, k) array.
     """
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
@@ -58,7 +58,7 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
             )
         return np.full(len(table), table.shape[1], dtype=np.int64), table.reshape(-1)
     try:
-        # Anything else fails here with a TypeError.
+        # Raises TypeError for other types.
         listed = list(cast("Sequence[Sequence[int]]", faces))
         return np.array([len(face) for face in listed], dtype=np.int64), np.array(list(chain.from_iterable(listed)))
     except (TypeError, ValueError) as error:
@@ -73,21 +73,21 @@ def validated_faces(
     source: CageSource,
     strict: bool,  # Whether the faces must be an oriented 2-manifold, closed or with boundary
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
-    """Check the faces of a cage, and make them an oriented manifold, as `oriented_faces` returns it.
+    """Check the faces of a cage, and return them as an oriented manifold, as `oriented_faces`.
 
     Raises CageError if there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is
-    not an integer or out of range; with ``strict``, also as `oriented_faces` does. Warns if vertices belong to no face,
+    not an integer or out of range; with ``strict``, also as `oriented_faces`. Warns if vertices belong to no face,
     faces are turned over, or the faces are not a manifold.
     """
-    given_sizes, given_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
-    sizes = _integers(given_sizes, "face_sizes", source)
-    _check_sizes(sizes, len(given_vertices), source)
+    flat_sizes, flat_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
+    sizes = _integers(flat_sizes, "face_sizes", source)
+    _check_sizes(sizes, len(flat_vertices), source)
     sizes = sizes.astype(np.int64)
-    vertices = _integers(given_vertices, "face_vertices", source, sizes)
+    vertices = _integers(flat_vertices, "face_vertices", source, sizes)
     _check_vertices(vertex_count, sizes, vertices, source)
     vertices = np.array(vertices, dtype=np.int32)
     if (sizes == sizes[0]).all():
-        # One number in memory stands for all faces.
+        # A broadcast scalar saves memory.
         sizes = np.broadcast_to(sizes[0], sizes.shape)
     topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
     oriented, non_manifold, order = oriented_faces(topology, source, strict)
@@ -97,7 +97,7 @@ def validated_faces(
 
 
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
-    """Check the faces that are holes, and return each once, in increasing order.
+    """Check the faces that are holes, and return them sorted, without repetitions.
 
     Raises CageError if an index is not an integer or out of range, or all faces are holes.
     """
@@ -108,23 +108,23 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
 
 
 def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, source: CageSource) -> IntArray:
-    """Check 0-based faces, and return each once, in increasing order; a message calls them ``noun``.
+    """Check 0-based faces, and return them sorted, without repetitions. Messages call a face ``noun``.
 
     Raises CageError if an index is not an integer or out of range.
     """
-    given = _integers(_flat(indices, f"{noun}s", source), f"{noun}s", source)
-    for row in np.flatnonzero((given < 0) | (given >= topology.face_count))[:1]:
+    faces = _integers(_flat(indices, f"{noun}s", source), f"{noun}s", source)
+    for row in np.flatnonzero((faces < 0) | (faces >= topology.face_count))[:1]:
         raise CageError(
-            f"{source.at_tag(f'{noun}s', row)}: {noun} {int(given[row]) + source.index_base} is no face; expected one "
+            f"{source.at_tag(f'{noun}s', row)}: {noun} {int(faces[row]) + source.index_base} is no face; expected one "
             f"of {topology.face_count} faces (numbers count from {source.index_base})"
         )
     is_chosen = np.zeros(topology.face_count, dtype=bool)
-    is_chosen[given] = True
+    is_chosen[faces] = True
     return read_only(np.flatnonzero(is_chosen))
 
 
 def require_range(indices: NDArray, count: int, where: str) -> None:
-    """Raise an error that begins with ``where`` if one of some indices is not 0 to ``count - 1``."""
+    """Raise CageError unless all indices are 0 to ``count - 1``; ``where`` is the beginning of the message."""
     wrong = np.flatnonzero((indices < 0) | (indices >= count))
     if len(wrong):
         such = number_of_such(len(wrong), "index")
@@ -134,39 +134,39 @@ def require_range(indices: NDArray, count: int, where: str) -> None:
 
 
 def read_only(array: NDArray) -> NDArray:
-    """``array`` itself, no longer writeable."""
+    """Make an array read-only, and return it."""
     array.flags.writeable = False
     return array
 
 
 def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
-    given = np.asarray(values)
-    if given.ndim != 1:
-        raise CageError(f"{source.name}: {name} has shape {given.shape}; expected a flat array of integers")
-    return given
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise CageError(f"{source.name}: {name} has shape {array.shape}; expected a flat array of integers")
+    return array
 
 
-def _integers(given: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
+def _integers(array: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
     """Check that an array has an integer type, and return it.
 
-    If the values are vertices of faces, ``sizes`` of these faces are for the name of the first wrong one.
+    If the values are vertices of faces, ``sizes`` are the face sizes, to name the first invalid face.
     """
-    if given.dtype.kind in "iu":
-        return given
-    if given.size == 0:
-        return given.astype(np.int64)
-    if given.dtype.kind != "f" or sizes is None:
-        raise CageError(f"{source.name}: {name} has type {given.dtype}; expected integers")
-    fractional = given != np.floor(given)
-    # If every number is whole, only the type is wrong: the first number then stands for all.
+    if array.dtype.kind in "iu":
+        return array
+    if array.size == 0:
+        return array.astype(np.int64)
+    if array.dtype.kind != "f" or sizes is None:
+        raise CageError(f"{source.name}: {name} has type {array.dtype}; expected integers")
+    fractional = array != np.floor(array)
+    # If no number has a fraction, only the type is wrong, and the message names the first number.
     first = int(np.argmax(fractional))
-    problem = f"has the vertex index {given[first]}"
-    count = int(fractional.sum()) or len(given)
+    problem = f"has the vertex index {array[first]}"
+    count = int(fractional.sum()) or len(array)
     raise source.error(source.at_face(_face_of(sizes, first)), problem, "an integer", count, "index")
 
 
 def _face_of(sizes: IntArray, corner: int) -> int:
-    """Face to which a face corner belongs."""
+    """Return the face to which a face corner belongs."""
     return int(np.searchsorted(np.cumsum(sizes), corner, side="right"))
 
 

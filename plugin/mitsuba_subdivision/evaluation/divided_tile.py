@@ -1,12 +1,12 @@
-"""Tiles that hold one piece or several, and how they are divided: for bounds, before there are samples.
+"""Division of tiles into polynomial pieces, for bounds of points and normals.
 
-A *tile* is the domain of a patch, or one of the four copies of a tile's domain. Tiles are never turned: their
-parameters run as those of the patch, but for the middle copies of triangles, whose run backwards.
+A *tile* is the domain of a patch, or one of the four children of a tile. Tiles are never turned: their parameters run
+in the directions of the patch's, except in the middle children of triangles, where they run backwards.
 
-A tile inside one polynomial piece has Bernstein coefficients as its control points, and so have its copies. One that
-holds several pieces is divided: into the copies that these lie in and, around an extraordinary point, ring by ring:
-three copies are pieces of a level, and the fourth, which holds the point, is divided alike. Tiles of different patches
-that are divided alike are the same `DividedTile`, over control points of their own, and share its bounds.
+The control points of a tile inside one polynomial piece are Bernstein coefficients, and so are those of its children. A
+tile with several pieces is divided into its four children. Around an extraordinary point three children are the regular
+pieces of a level, and the fourth, which contains the point, is divided in the same way. Tiles of different patches that
+are divided in the same way share one `DividedTile` and its bounds; only their control points differ.
 """
 
 from __future__ import annotations
@@ -23,31 +23,32 @@ from .irregular_patch import IrregularPatch, level_rows, rest_rows, transition
 from .patch_tree import PartKind, PatchTree
 from .polynomials import regular_bernstein, times
 
-# Divisions after which a tile is bounded by its pieces and by what is left: of surfaces, by whether rules are convex,
-# as others bound what is left some ten times worse; and of the curves along sides, which have few coefficients.
+# Number of divisions before a tile is bounded by its pieces and the parts that are still undivided. For surfaces it
+# depends on `Scheme.has_convex_rules`: without convex rules the bound of undivided parts is some ten times looser.
+# Curves along sides have few coefficients.
 DIVISIONS, DIVISIONS_OF_SIDES = {True: 8, False: 32}, 32
-# Normals are bounded on the pieces after this many divisions.
+# Number of divisions before normals are bounded on the pieces.
 DIVISIONS_OF_NORMALS = 4
 
 
 class DividedTile:
-    """A tile of one piece or several."""
+    """A tile of one or more polynomial pieces."""
 
     def __init__(
         self,
         scheme: Scheme,
-        # The element that it covers; or the patch around an extraordinary point, from any level on, whose
-        # control points here are its eigen-coordinates; None for a piece
+        # The element that the tile covers; or the patch around an extraordinary point, at any level, with
+        # eigen-coordinates as control points; or None for a polynomial piece
         source: PatchTree | IrregularPatch | None,
-        # How a patch around an extraordinary point is turned in the tile: `ParameterDomain.rotation` of this.
-        # Elements are not turned.
+        # Argument of `ParameterDomain.rotation` that maps the tile's parameters to those of the patch around an
+        # extraordinary point. 0 for elements.
         turn: int,
     ) -> None:
         self._scheme, self._source, self._turn = scheme, source, turn
 
     @property
     def control_count(self) -> int:
-        """K."""
+        """K, number of control points."""
         if self._source is None:
             return len(regular_bernstein(self._scheme).basis.indices)
         if isinstance(self._source, IrregularPatch):
@@ -56,52 +57,52 @@ class DividedTile:
 
     @property
     def is_piece(self) -> bool:
-        """Whether it lies inside one polynomial piece."""
+        """Whether the tile lies inside one polynomial piece."""
         return self._source is None
 
     @property
     def is_self_similar(self) -> bool:
-        """Whether it lies around an extraordinary point, so that one of the copies is like the tile."""
+        """Whether the tile has an extraordinary point at a corner, so that one child equals the tile."""
         return isinstance(self._source, IrregularPatch)
 
     @cached_property
     def children(self) -> tuple[tuple[DividedTile, FloatArray], ...]:
-        """The parts in the copies of the tile, in the order of `ParameterDomain.children`; see `part_of_tile`."""
+        """The children, in the order of `ParameterDomain.children`, as returned by `part_of_tile`."""
         scheme, source, turn = self._scheme, self._source, self._turn
         if source is None:
             return tuple((self, rows) for rows in regular_bernstein(scheme).basis.halves)
         if isinstance(source, PatchTree):
             return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
-        # The same tile, of the next level, and three pieces.
-        found = [(self, transition(source, 1))]
-        found += [(_tile(scheme, None, 0), _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
-        return tuple(found[own] for own in _own_copies(scheme.domain, turn))
+        # The same tile at the next level, and three pieces.
+        parts = [(self, transition(source, 1))]
+        parts += [(_tile(scheme, None, 0), _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
+        return tuple(parts[number] for number in _own_copies(scheme.domain, turn))
 
     @cached_property
     def corners(self) -> FloatArray:
-        """``(m, K)`` points of the surface at the tile's corners."""
-        found, every = [], np.eye(self.control_count)
+        """``(m, K)`` stencils of the surface points at the tile's corners."""
+        corners, identity = [], np.eye(self.control_count)
         if self.is_piece:
-            return every[regular_bernstein(self._scheme).basis.corners]
+            return identity[regular_bernstein(self._scheme).basis.corners]
         for number in range(self._scheme.domain.corner_count):
             tile, rows = self.children[number]
-            # Eigen-coordinates begin with the extraordinary point.
-            found.append(every[0] if tile is self else (tile.corners @ rows)[number])
-        return np.array(found)
+            # The first eigen-coordinate is the extraordinary point.
+            corners.append(identity[0] if tile is self else (tile.corners @ rows)[number])
+        return np.array(corners)
 
     @property
     def control_points(self) -> FloatArray:
-        """``(n, K)`` the control points of the one-ring."""
+        """``(n, K)`` stencils of the control points of the one-ring."""
         if isinstance(self._source, IrregularPatch):
             return self._source.basis.vectors
         return np.eye(self.control_count)
 
     @cached_property
     def control_faces(self) -> IntArray:
-        """``(4, f)`` rows of `control_points` at the ends of one diagonal, then of the other, of the one-ring's faces.
+        """``(4, f)`` rows of `control_points`: ends of one diagonal, then of the other, of the one-ring's faces.
 
-        Of triangles, two sides. At a dart, where one vertex of the ring is left out as it equals another, so are its
-        faces. None of a piece.
+        For triangles, two sides in place of diagonals. At a dart one of two equal vertices of the ring is left out, and
+        so are its faces. A piece has no faces.
         """
         if self._source is None:
             return np.empty((4, 0), dtype=np.int64)
@@ -116,33 +117,33 @@ class DividedTile:
         return vertices[:, (vertices >= 0).all(axis=0)]
 
     def one_ring_points(self, points: FloatArray) -> FloatArray:
-        """Control points of one-rings ``(n, d, t)``, from those of tiles ``(K, d, t)``: the same but for tips."""
+        """Return control points ``(n, d, t)`` of one-rings, from those of t tiles ``(K, d, t)``."""
         return times(self.control_points, points) if self.is_self_similar else points
 
     @cached_property
     def tangents(self) -> FloatArray | None:
-        """``(2, b, p, K)`` Bernstein coefficients of derivatives by u and v, on pieces with all normals, or nearly all.
+        """``(2, b, p, K)`` Bernstein coefficients of derivatives by u and v, on pieces that cover nearly all normals.
 
-        Nearer to extraordinary points than these, normals turn less than on them. None where parts are left after some
-        divisions that hold neither pieces nor one extraordinary point.
+        The undivided parts lie around extraordinary points, where normals vary less than on the pieces. None if other
+        parts are undivided after `DIVISIONS_OF_NORMALS`.
         """
         pieces, rest = self._divided(DIVISIONS_OF_NORMALS)
         if not all(tile.is_self_similar for tile, _ in rest):
             return None
-        found: FloatArray = np.tensordot(regular_bernstein(self._scheme).basis.derivatives, np.stack(pieces), (2, 1))
-        return found
+        tangents: FloatArray = np.tensordot(regular_bernstein(self._scheme).basis.derivatives, np.stack(pieces), (2, 1))
+        return tangents
 
     @cached_property
     def hull(self) -> FloatArray | None:
-        """``(h, K)`` points around the surface: it lies in their convex hull, which is hardly larger.
+        """``(h, K)`` stencils of points whose convex hull contains the surface, and is hardly larger.
 
-        None where rules are not convex and parts are left that hold neither pieces nor one extraordinary point.
+        None where rules are not convex and parts are undivided that are not around one extraordinary point.
         """
         return self._hull(DIVISIONS[self._scheme.has_convex_rules])
 
     @cached_property
     def side_hulls(self) -> list[FloatArray | None]:
-        """Likewise around the curve along each side of the tile."""
+        """Like `hull`, for the curve along each side of the tile."""
         return [self._hull(DIVISIONS_OF_SIDES, side) for side in range(self._scheme.domain.corner_count)]
 
     def _hull(self, divisions: int, side: int | None = None) -> FloatArray | None:
@@ -153,7 +154,7 @@ class DividedTile:
 
     @cached_property
     def _reach(self) -> FloatArray:
-        """``(n, K)`` points around the tile: its one-ring or, if rules are not convex, far enough from its tip."""
+        """``(n, K)`` stencils of points around an undivided tile: its one-ring, or a bound of `rest_rows`."""
         if self._scheme.has_convex_rules or not isinstance(self._source, IrregularPatch):
             return self.control_points
         # The sum of n vectors is the mean of n times each of them.
@@ -163,53 +164,53 @@ class DividedTile:
     def _divided(
         self, divisions: int, side: int | None = None
     ) -> tuple[list[FloatArray], list[tuple[DividedTile, FloatArray]]]:
-        """The tile after some divisions, or what of it lies along one side.
+        """Divide the tile; with ``side``, only along one side.
 
-        Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the tiles that are left, with
-        their control points.
+        Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the undivided tiles with the
+        stencils of their control points.
         """
-        every, m = np.eye(self.control_count), self._scheme.domain.corner_count
+        identity, m = np.eye(self.control_count), self._scheme.domain.corner_count
         if self.is_piece:
-            return [every if side is None else every[regular_bernstein(self._scheme).basis.sides[side]]], []
+            return [identity if side is None else identity[regular_bernstein(self._scheme).basis.sides[side]]], []
         if not divisions:
-            return [], [(self, every)]
-        # Copies of a domain at its corners come first, and share the sides that meet there.
-        copies = range(4) if side is None else (side, (side + 1) % m)
-        # Around an extraordinary point, one part is left, but along a semi-sharp crease many.
-        fewer = divisions - 1 if self.is_self_similar else divisions // 2
+            return [], [(self, identity)]
+        # The children at the corners come first; those at the ends of a side cover it.
+        numbers = range(4) if side is None else (side, (side + 1) % m)
+        # A division leaves one undivided part around an extraordinary point, but many along a semi-sharp crease.
+        remaining = divisions - 1 if self.is_self_similar else divisions // 2
         pieces: list[FloatArray] = []
         rest: list[tuple[DividedTile, FloatArray]] = []
-        for tile, rows in (self.children[number] for number in copies):
-            inner, left = tile._divided(fewer, side)
-            pieces += [own @ rows for own in inner]
-            rest += [(each, own @ rows) for each, own in left]
+        for tile, rows in (self.children[number] for number in numbers):
+            child_pieces, child_rest = tile._divided(remaining, side)
+            pieces += [coefficients @ rows for coefficients in child_pieces]
+            rest += [(part, stencils @ rows) for part, stencils in child_rest]
         return pieces, rest
 
 
 def part_of_tile(
     element: PatchTree,
-    stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the tile
+    stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the parent tile
 ) -> tuple[DividedTile, FloatArray]:
-    """The part of a tile that an element covers; the same tile for equal ones.
+    """Return the tile of an element that is a part of a parent tile; equal tiles are the same object.
 
     Returns
     -------
     tile : DividedTile
     rows : (n, K) float64
-        Its control points over those of the tile that it is part of.
+        Control points of the tile over those of the parent tile.
     """
     scheme, piece = element.scheme, element.piece
     if piece is None:
         if element.kind == PartKind.ONLY_CHILD:
-            child, of_child = element.child(0)
-            return part_of_tile(child, of_child @ stencils)
+            child, child_stencils = element.child(0)
+            return part_of_tile(child, child_stencils @ stencils)
         return _tile(scheme, element, 0), stencils
     if piece.patch is None:
         return _tile(scheme, None, 0), regular_bernstein(scheme).of_controls @ piece.stencils @ stencils
     return _tile(scheme, piece.patch, element.turn), piece.coordinates @ stencils
 
 
-# Tiles take some 20 kB each.
+# A tile takes some 20 kB.
 @lru_cache(maxsize=4096)
 def _tile(scheme: Scheme, source: PatchTree | IrregularPatch | None, turn: int) -> DividedTile:
     return DividedTile(scheme, source, turn)
@@ -217,15 +218,16 @@ def _tile(scheme: Scheme, source: PatchTree | IrregularPatch | None, turn: int) 
 
 @lru_cache(maxsize=64)
 def _turned(scheme: Scheme, turn: int) -> FloatArray:
-    """``(b, b)`` map from Bernstein coefficients to those by parameters that are turned."""
+    """Return the ``(b, b)`` map from Bernstein coefficients to those of the polynomial in turned parameters."""
     basis, domain = regular_bernstein(scheme).basis, scheme.domain
     return basis.coefficients(basis.values(domain.rotation(turn)(basis.indices / basis.degree)))
 
 
 @lru_cache(maxsize=64)
 def _own_copies(domain: ParameterDomain, turn: int) -> tuple[int, ...]:
-    """For each copy of a domain, which one it is as a turned part counts them."""
-    rotation, copies = domain.rotation(turn), domain.children
+    """Return, for each child of a domain, its number among the children of the turned domain."""
+    rotation, children = domain.rotation(turn), domain.children
     return tuple(
-        next(i for i, own in enumerate(copies) if (own @ rotation).is_same(rotation @ copy)) for copy in copies
+        next(i for i, turned in enumerate(children) if (turned @ rotation).is_same(rotation @ child))
+        for child in children
     )

@@ -13,24 +13,24 @@ from ..schemes.domain import FloatArray
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Computed eigenvalues closer than this count as one eigenvalue: rounding splits a defective pair by about the square
-# root of the machine precision, 1.5e-8, while different eigenvalues of the schemes differ by 1e-3 and more.
+# Computed eigenvalues closer than this are treated as one eigenvalue: rounding splits a defective pair by about the
+# square root of the machine precision, 1.5e-8, while distinct eigenvalues of the schemes differ by 1e-3 and more.
 CLUSTER_WIDTH = 1e-6
-# Where the smallest singular value of a cluster's computed eigenvectors is below this, the vectors count as dependent.
+# Smallest singular value of a cluster's computed eigenvectors below which they are treated as dependent.
 DEPENDENT = 1e-3
-# A block that differs from a multiple of the identity by less than this is taken as that multiple.
+# A block that differs from a multiple of the identity by less than this is replaced by the multiple.
 DIAGONAL = 1e-11
 # Tolerance of the equations that define the basis.
 RESIDUAL = 1e-10
-# Steps of inverse iteration; each divides the error by about nine.
+# Number of steps of inverse iteration; each divides the error by about nine.
 INVERSE_ITERATIONS = 25
-# The second eigenvalue must be below one by more than this, or refinement does not converge.
+# The modulus of the second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
-# Power of the matrix that a basis is checked with.
+# Power of the matrix with which `require_basis` checks a basis.
 POWER = 20
-# Powers of a nilpotent matrix below this are taken as zero.
+# Powers of a nilpotent matrix with entries below this are treated as zero.
 NILPOTENT = 1e-13
-# Powers of a nilpotent part that are formed. If they have not ended by then, the block has complex eigenvalues.
+# Maximum number of powers of a nilpotent part. If none of them is zero, the block has complex eigenvalues.
 LONGEST_CHAIN = 4
 
 
@@ -40,36 +40,35 @@ class EigenbasisError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Eigenbasis:
-    """``A = V T L`` with ``L = V^-1``; T is diagonal but for the blocks of defective or complex eigenvalues.
+    """``A = V T L`` with ``L = V^-1``; T is diagonal except for the blocks of defective or complex eigenvalues.
 
-    Eigenvalues are sorted by decreasing modulus. Column 0 of V is exactly one everywhere, so row 0 of L is the limit
-    stencil of the extraordinary point.
+    Eigenvalues are sorted by decreasing modulus. All entries of column 0 of V are exactly one, so row 0 of L is the
+    limit stencil of the extraordinary point.
     """
 
     vectors: FloatArray  # (K, K) float64: V, right eigenvectors in columns
     inverse: FloatArray  # (K, K) float64: L, left eigenvectors in rows
-    # (K,) float64: one for each column of V. The columns of a block all have the mean of the real parts of its
-    # eigenvalues.
+    # (K,) float64: one for each column of V; in a block, the mean of the real parts of its eigenvalues
     eigenvalues: FloatArray
-    moduli: FloatArray  # (K,) float64: the modulus of each eigenvalue; in a block, the largest of them
-    # tuple of (slice, (m, m) float64): the blocks of T that are not multiples of the identity, and the rows and
-    # columns where they stand
+    moduli: FloatArray  # (K,) float64: the modulus of each eigenvalue; in a block, the largest modulus
+    # tuple of (slice, (m, m) float64): the blocks of T that are not multiples of the identity, with the slice of their
+    # rows and columns
     blocks: tuple[tuple[slice, FloatArray], ...]
 
     @property
     def subdominant(self) -> float:
-        """λ_2, the second eigenvalue: how much each refinement shrinks the one-ring."""
+        """λ_2, the second eigenvalue: the factor by which each refinement contracts the one-ring."""
         return float(self.eigenvalues[1])
 
     def block_matrix(self, power: int = 1) -> FloatArray:
-        """T, or a power of it, dense ``(K, K)``."""
+        """Return a power of T as a dense matrix ``(K, K)``."""
         matrix = np.diag(self.eigenvalues**power)
         for block_slice, block in self.blocks:
             matrix[block_slice, block_slice] = np.linalg.matrix_power(block, power)
         return matrix
 
     def times_blocks(self, coordinates: FloatArray) -> FloatArray:
-        """T times eigen-coordinates ``(K, ..)``."""
+        """Multiply eigen-coordinates ``(K, ..)`` by T."""
         product = self.eigenvalues[:, None] * coordinates
         for block_slice, block in self.blocks:
             product[block_slice] = block @ coordinates[block_slice]
@@ -86,19 +85,19 @@ class Eigenbasis:
 
 
 def eigenbasis(
-    matrix: FloatArray,  # (K, K) float64: one is a simple eigenvalue and all others are smaller
-    # (K,) float64: the eigenvector of one; where rows sum to one, it is one everywhere
+    matrix: FloatArray,  # (K, K) float64: 1 is a simple eigenvalue, and all others are smaller
+    # (K,) float64: the eigenvector of the eigenvalue 1. By default all ones, for rows that sum to one.
     constant: FloatArray | None = None,
 ) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
     ``numpy.linalg.eig`` alone is not enough. Rounding turns a repeated eigenvalue into a conjugate pair, whose vectors
     have equal real parts, and the vectors of a defective eigenvalue come out nearly parallel. So close eigenvalues are
-    put into clusters, and each cluster gets an orthonormal basis of its invariant subspace, by inverse iteration where
-    the computed vectors are dependent. In all these bases together the matrix is block-diagonal.
+    grouped into clusters. The basis consists of an orthonormal basis of each cluster's invariant subspace, computed by
+    inverse iteration where the eigenvectors are dependent. In this basis the matrix is block-diagonal.
 
-    Raises EigenbasisError if the second eigenvalue is not below one, different eigenvalues are too close to find
-    vectors for each, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
+    Raises EigenbasisError if the second eigenvalue is not below one, distinct eigenvalues are too close to separate
+    their vectors, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
     """
     size = len(matrix)
     eigenvalues, eigenvectors = np.linalg.eig(matrix)
@@ -124,8 +123,8 @@ def eigenbasis(
     transformed = inverse @ matrix @ vectors
 
     means, blocks, begin = np.empty(size), [], 0
-    for of_cluster, centre in zip(bases, centres, strict=True):
-        block_slice = slice(begin, begin + of_cluster.shape[1])
+    for cluster_basis, centre in zip(bases, centres, strict=True):
+        block_slice = slice(begin, begin + cluster_basis.shape[1])
         block = transformed[block_slice, block_slice]
         means[block_slice] = centre
         if np.abs(block - centre * np.eye(len(block))).max() >= DIAGONAL:
@@ -140,11 +139,11 @@ def eigenbasis(
 def require_basis(
     matrix: FloatArray | sparse.csr_array,  # (K, K) float64, or sparse array
     basis: Eigenbasis,
-    # (K, p) float64: vectors that the equations are multiplied by: all unit vectors, or a few of random signs,
-    # which the products of wrong matrices cannot but differ for [Freivalds 1977]
+    # (K, p) float64: vectors by which the equations are multiplied: all unit vectors, or a few vectors of random
+    # signs, which detect wrong products with high probability [Freivalds 1977]
     probes: FloatArray,
 ) -> None:
-    """Check that a basis is one of a matrix."""
+    """Raise EigenbasisError unless ``basis`` is the eigenbasis of a matrix."""
     coordinates = basis.inverse @ probes
     image: NDArray = probes
     powers: NDArray = coordinates
@@ -168,13 +167,13 @@ def times_block_powers(
     rows: NDArray,  # (d, s, m) float: their precision is the precision of the product
     levels: NDArray[np.int64],  # (s,) int64
     block: FloatArray,  # (m, m) float64
-    mean: float,  # Of the block's eigenvalues
+    mean: float,  # Mean of the block's eigenvalues
 ) -> NDArray:
-    """Multiply each row by its power of a block of T: ``rows[.., s, :] @ block^levels[s]``.
+    """Multiply each row by a power of a block of T: ``rows[.., s, :] @ block^levels[s]``.
 
-    A Jordan block is ``mean`` times the identity plus a nilpotent part Z. Powers of Z end, at ``Z^2 = 0`` for the
-    blocks of two that subdivision matrices have, so ``(mean + Z)^n`` is a short sum. The blocks of complex eigenvalues
-    have no such part, and are multiplied out for each level.
+    A Jordan block is ``mean`` times the identity plus a nilpotent matrix Z. In the blocks of two rows that subdivision
+    matrices have, ``Z^2 = 0``, so ``(mean + Z)^n`` is a short sum. Blocks of complex eigenvalues have no nilpotent
+    part; their powers are computed for each level.
     """
     real = rows.dtype.type
     nilpotent = block - mean * np.eye(len(block))
@@ -184,10 +183,10 @@ def times_block_powers(
     if len(chain) > LONGEST_CHAIN:
         product = np.empty_like(rows)
         for level in np.unique(levels):
-            at = np.flatnonzero(levels == level)
-            product[:, at] = rows[:, at] @ np.linalg.matrix_power(block, int(level)).astype(real)
+            at_level = np.flatnonzero(levels == level)
+            product[:, at_level] = rows[:, at_level] @ np.linalg.matrix_power(block, int(level)).astype(real)
         return product
-    # The sum over the orders k of binomial(n, k) mean^(n - k) Z^k.
+    # The sum over k of binomial(n, k) mean^(n - k) Z^k.
     product = rows * (real(mean) ** levels.astype(real))[:, None]
     binomial = np.ones(len(levels))
     for order, power in enumerate(chain[:-1], start=1):
@@ -198,12 +197,12 @@ def times_block_powers(
 
 
 def sorting_key(moduli: FloatArray, real_parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Keys of `numpy.lexsort`: by decreasing modulus; of two opposite eigenvalues the positive one comes first."""
+    """Return keys for `numpy.lexsort`: by decreasing modulus; of opposite eigenvalues the positive one comes first."""
     return -real_parts, -np.round(moduli / CLUSTER_WIDTH)
 
 
 def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
-    """Indices of equal eigenvalues, conjugates together, in the order of `sorting_key`."""
+    """Return indices of equal or conjugate eigenvalues for each cluster, in the order of `sorting_key`."""
     points = eigenvalues.real + 1j * np.abs(eigenvalues.imag)
     left = np.lexsort(sorting_key(np.abs(points), points.real))
     clusters = []
@@ -217,25 +216,25 @@ def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
 def _spans(
     eigenvectors: NDArray[np.complex128], clusters: list[NDArray[np.int64]]
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Left singular vectors and singular values of the span of each cluster's vectors, real and imaginary parts."""
-    found: list[Any] = [None] * len(clusters)
-    # Those of clusters of the same size in one call.
+    """Return left singular vectors and singular values of each cluster's eigenvectors, real and imaginary parts."""
+    spans: list[Any] = [None] * len(clusters)
+    # Clusters of the same size are decomposed in one call.
     for size in {len(members) for members in clusters}:
-        alike = [number for number, members in enumerate(clusters) if len(members) == size]
-        vectors = eigenvectors[:, [clusters[number] for number in alike]].transpose(1, 0, 2)
+        same_size = [number for number, members in enumerate(clusters) if len(members) == size]
+        vectors = eigenvectors[:, [clusters[number] for number in same_size]].transpose(1, 0, 2)
         left, singular, _ = np.linalg.svd(np.concatenate([vectors.real, vectors.imag], axis=2), full_matrices=False)
-        for index, number in enumerate(alike):
-            found[number] = left[index], singular[index]
-    return found
+        for index, number in enumerate(same_size):
+            spans[number] = left[index], singular[index]
+    return spans
 
 
 def _closest(eigenvalues: NDArray[np.complex128], clusters: list[NDArray[np.int64]]) -> str:
-    """The two closest eigenvalues of different clusters."""
-    number = np.empty(len(eigenvalues), dtype=np.int64)
+    """Format the two closest eigenvalues of different clusters."""
+    cluster_of = np.empty(len(eigenvalues), dtype=np.int64)
     for cluster, members in enumerate(clusters):
-        number[members] = cluster
+        cluster_of[members] = cluster
     gaps = np.abs(eigenvalues[:, None] - eigenvalues)
-    gaps[number[:, None] == number] = np.inf
+    gaps[cluster_of[:, None] == cluster_of] = np.inf
     first, second = eigenvalues[list(np.unravel_index(gaps.argmin(), gaps.shape))]
     return f"{first:.9g} and {second:.9g}"
 
@@ -247,18 +246,18 @@ def _cluster_basis(
     left: FloatArray,
     singular: FloatArray,
 ) -> FloatArray:
-    """Orthonormal basis of the invariant subspace of a cluster of eigenvalues."""
-    own, span = eigenvalues[members], left[:, : len(members)]
+    """Return an orthonormal basis of the invariant subspace of a cluster of eigenvalues."""
+    cluster, span = eigenvalues[members], left[:, : len(members)]
     if singular[len(members) - 1] >= DEPENDENT:
         return span
-    gap = np.abs(np.delete(eigenvalues, members)[:, None] - own).min()
-    return _invariant_subspace(matrix, own.real.mean() + 0.1 * gap, span)
+    gap = np.abs(np.delete(eigenvalues, members)[:, None] - cluster).min()
+    return _invariant_subspace(matrix, cluster.real.mean() + 0.1 * gap, span)
 
 
 def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> FloatArray:
-    """Orthonormal basis of the generalised eigenspace nearest to ``shift``, by block inverse iteration."""
+    """Compute an orthonormal basis of the generalised eigenspace nearest to ``shift``, by block inverse iteration."""
     solve = np.linalg.inv(matrix - shift * np.eye(len(matrix)))
-    # Dependent vectors leave directions of the subspace out: start from a full block.
+    # Dependent start vectors do not span the subspace, so noise is added.
     block = start + 0.1 * np.random.default_rng(0).standard_normal(start.shape)
     for _ in range(INVERSE_ITERATIONS):
         block, _ = np.linalg.qr(solve @ block)

@@ -1,4 +1,4 @@
-"""Points, derivatives, normals and curvature at any parameters of elements, and their limit stencils."""
+"""Points, derivatives, normals, curvature and limit stencils of elements at arbitrary parameters."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from .normals import unit_normals
 from .patch_tree import isolated_signature, patch_tree
 from .refined_rings import refined_children
 
-# Curvature near an extraordinary point goes with (|λ_4| / λ_2²)ⁿ. A ratio nearer to one than this counts as one.
+# Tolerance of `irregular_curvature` when comparing |λ_4| / λ_2² with one. Curvature near an extraordinary point is
+# proportional to the power n of this ratio.
 CONSTANT = 1e-9
 
 
@@ -30,16 +31,16 @@ CONSTANT = 1e-9
 class ElementSamples:
     """Values and derivatives at samples."""
 
-    values: FloatArray  # (3 or 6, s, x): the value; by u and v; by uu, uv and vv if requested
-    # (s, 3) unit normals. Zero where the surface has none, but not in the published forms "power" and "stam". Not a
-    # number where values are no points in space.
+    values: FloatArray  # (3 or 6, s, x): value; derivatives by u and v; by uu, uv and vv if requested
+    # (s, 3) unit normals. Zero where the surface has none, except in the published forms "power" and "stam". NaN where
+    # values are not points in space.
     normal: FloatArray
-    level: NDArray[np.int64]  # (s,)
-    curvature: FloatArray  # (2, s) Gaussian and mean; not a number unless requested
+    level: NDArray[np.int64]  # (s,) as in `SampleRows`
+    curvature: FloatArray  # (2, s) Gaussian and mean; NaN unless requested
 
     @classmethod
     def empty(cls, count: int, width: int, dtype: DTypeLike, derivatives: int) -> ElementSamples:
-        """Samples without values yet."""
+        """Return samples with uninitialized values."""
         return cls(
             np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype),
             np.empty((count, 3), dtype=dtype),
@@ -48,90 +49,92 @@ class ElementSamples:
         )
 
     def put(self, at: IntArray, some: ElementSamples) -> None:
-        """Put some samples in the rows ``at``."""
+        """Copy the samples ``some`` to the indices ``at``."""
         self.values[:, at], self.normal[at] = some.values, some.normal
         self.level[at], self.curvature[:, at] = some.level, some.curvature
 
 
 def evaluate_samples(
     located: LocatedSamples,
-    # list of (m, K, x) float64: control points of the samples of each element, in arrays that may be changed.
-    # They are rounded to the type of the evaluation.
+    # list of (m, K, x) float64: for each element, the control points of each of its samples. They are rounded to
+    # `dtype`, and may be overwritten.
     points: list[FloatArray],
     extent: FloatArray,  # (x,) float64: bound of the extent of an element's control points along each axis
-    # The stabilised and the limit form take one control point of the element as the origin, so their precision
-    # does not depend on where the model stands. The others are as published.
+    # "stabilized" and "limit" compute relative to one control point of the element, so their precision does not
+    # depend on the model's distance from the origin. "power" and "stam" are as published.
     evaluator: Evaluator,
-    dtype: DTypeLike,  # Of all arithmetic
+    dtype: DTypeLike,  # Type of all arithmetic
     derivatives: int,
 ) -> ElementSamples:
-    """Evaluate samples of any elements."""
+    """Evaluate samples."""
     count, has_origin = len(located.leaf_sample), evaluator not in ("power", "stam")
-    # Samples are along the last axis, as operations along rows of three would be slow.
+    # Samples are along the last axis, as operations along an axis of length three are slow.
     origin: FloatArray = np.zeros((len(extent), count), dtype=dtype)
-    points = [own.astype(dtype, copy=False) for own in points]
+    points = [control_points.astype(dtype, copy=False) for control_points in points]
     if has_origin:
-        origin = np.concatenate([own[:, 0] for own in points]).T
-        for of_element in points:
-            np.subtract(of_element, of_element[:, :1].copy(), out=of_element)
+        origin = np.concatenate([control_points[:, 0] for control_points in points]).T
+        for control_points in points:
+            np.subtract(control_points, control_points[:, :1].copy(), out=control_points)
     rows = located.rows(evaluator, dtype, derivatives)
-    values = _times_points(located.weights([each.rows for each in rows], power=evaluator == "power"), points)
+    weights = located.weights([leaf_rows.rows for leaf_rows in rows], power=evaluator == "power")
+    values = _times_points(weights, points)
     curvature = np.full((2, count), np.nan, dtype=dtype)
     if derivatives == 2 and len(extent) == 3:
         curvature = _curvature(located, values, points, evaluator)
     values[0] += origin
     jacobian, scale = located.jacobian.astype(dtype, copy=False), located.per_sample([r.derivative_scale for r in rows])
     tangents = _by_uv(values[1:3], jacobian)
-    # At levels far beyond any that float32 can hold, the scale overflows.
+    # At levels that float32 parameters cannot reach, the scale overflows.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         values[1:3] = tangents * scale[0]
         if derivatives == 2:
             values[3:] = _second_by_uv(values[3:], jacobian) * scale[1]
     normal: FloatArray = np.full((3, count), np.nan, dtype=dtype)
-    # Only points in space have normals; texture coordinates, for example, have none.
+    # Only points in space have normals, texture coordinates do not.
     if len(extent) == 3:
         framed = np.flatnonzero(located.per_sample([np.full(len(r.level), r.frame is not None) for r in rows]))
         if len(framed):
-            some, some_points = located.chosen(framed), _chosen(points, located, framed)
-            frames = some.weights([each.tangents for each in some.rows(evaluator, dtype, 1)])
-            tangents[..., framed] = _by_uv(_times_points(frames, some_points), jacobian[..., framed])
+            framed_samples, framed_points = located.chosen(framed), _chosen(points, located, framed)
+            frames = framed_samples.weights([r.tangents for r in framed_samples.rows(evaluator, dtype, 1)])
+            tangents[..., framed] = _by_uv(_times_points(frames, framed_points), jacobian[..., framed])
         if has_origin:
-            magnitude = located.per_sample([frame_magnitude(*each) for each in zip(located.leaves, rows, strict=True)])
+            magnitude = located.per_sample([frame_magnitude(*pair) for pair in zip(located.leaves, rows, strict=True)])
             magnitude = _by_uv(magnitude, np.abs(jacobian))
             normal = unit_normals(tangents, magnitude, extent.astype(dtype)[:, None])
+            # Repeat with the extent of each sample's control points, which is a tighter bound of the rounding error.
             suspect = np.flatnonzero(~normal.any(axis=0))
             if len(suspect):
-                own_extent = np.concatenate([np.abs(each).max(axis=1) for each in _chosen(points, located, suspect)])
-                normal[:, suspect] = unit_normals(tangents[..., suspect], magnitude[:, suspect], own_extent.T)
+                extents = np.concatenate([np.abs(near).max(axis=1) for near in _chosen(points, located, suspect)])
+                normal[:, suspect] = unit_normals(tangents[..., suspect], magnitude[:, suspect], extents.T)
                 curvature[:, ~normal.any(axis=0)] = np.nan
         else:
             normal = unit_normals(tangents)
-    level = located.per_sample([each.level for each in rows])
+    level = located.per_sample([leaf_rows.level for leaf_rows in rows])
     return ElementSamples(values.swapaxes(1, 2), normal.T, level, curvature)
 
 
 def element_stencils(
     scheme: Scheme,
     signature: Signature,
-    uv: FloatArray,  # (s, 2) float64: with (0, 0) at the sample's corner
-    corner: IntArray | None = None,  # (s,) int64: by default the first corner
+    uv: FloatArray,  # (s, 2) float64: parameters with (0, 0) at the sample's corner
+    corner: IntArray | None = None,  # (s,) int64; by default the first corner
 ) -> FloatArray:
-    """Limit stencils of samples over an element's one-ring.
+    """Compute limit stencils of samples over an element's one-ring.
 
     Returns
     -------
     (3, s, K) float64, read-only
         Weights of the point, which sum to one, and of two tangents, which sum to zero. The cross product of the
-        tangents is along the normal, at extraordinary points too. Away from these, and from borders and sharp features,
-        they are the derivatives, times a positive factor for each sample. They are zero where the surface is folded
-        whatever the control points are.
+        tangents is along the normal, also at extraordinary points. Away from extraordinary points, borders and sharp
+        features, the tangents are the derivatives times a positive factor, which may differ between samples. They are
+        zero where the surface is folded for all control points.
     """
     uv = np.asarray(uv, dtype=np.float64)
     corner = np.zeros(len(uv), dtype=np.int64) if corner is None else corner
     located = LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
     rows = located.rows("stabilized", np.float64, 1)
-    magnitude = located.per_sample([frame_magnitude(*each) for each in zip(located.leaves, rows, strict=True)])
-    (weights,) = located.weights([np.concatenate([each.rows[:1], each.tangents]) for each in rows])
+    magnitude = located.per_sample([frame_magnitude(*pair) for pair in zip(located.leaves, rows, strict=True)])
+    (weights,) = located.weights([np.concatenate([leaf_rows.rows[:1], leaf_rows.tangents]) for leaf_rows in rows])
     stencils = np.ascontiguousarray(weights.swapaxes(0, 1))
     stencils[1:] = _by_uv(stencils[1:].swapaxes(1, 2), located.jacobian).swapaxes(1, 2)
     without_collapsed(stencils[1:], _by_uv(magnitude, np.abs(located.jacobian)))
@@ -142,64 +145,63 @@ def element_stencils(
 def derivative_stencils(
     scheme: Scheme, signature: Signature, uv: FloatArray, corner: IntArray, derivatives: int
 ) -> FloatArray:
-    """Weights of points and derivatives over an element's one-ring.
+    """Compute the weights over an element's one-ring that `evaluate_samples` applies to control points.
 
-    Returns (3 or 6, s, K) float64: the point; derivatives by u and v; those by uu, uv and vv, as `evaluate_samples`
-    computes them.
+    Returns (3 or 6, s, K) float64: of the point; of the derivatives by u and v; of those by uu, uv and vv.
     """
     located = LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
     rows = located.rows("stabilized", np.float64, derivatives)
-    (weights,) = located.weights([each.rows for each in rows])
-    found, scale = weights.transpose(1, 2, 0), located.per_sample([each.derivative_scale for each in rows])
-    found[1:3] = _by_uv(found[1:3], located.jacobian) * scale[0]
+    (weights,) = located.weights([leaf_rows.rows for leaf_rows in rows])
+    stencils, scale = weights.transpose(1, 2, 0), located.per_sample([r.derivative_scale for r in rows])
+    stencils[1:3] = _by_uv(stencils[1:3], located.jacobian) * scale[0]
     if derivatives == 2:
-        found[3:] = _second_by_uv(found[3:], located.jacobian) * scale[1]
-    return found.swapaxes(1, 2)
+        stencils[3:] = _second_by_uv(stencils[3:], located.jacobian) * scale[1]
+    return stencils.swapaxes(1, 2)
 
 
 def _times_points(weights: list[FloatArray], points: list[FloatArray]) -> FloatArray:
-    """``(d, x, s)`` weights ``(m, d, K)`` of each element's samples times their control points ``(m, K, x)``."""
+    """Return ``(d, x, s)``: for each element, weights ``(m, d, K)`` times control points ``(m, K, x)`` of samples."""
     return np.concatenate(
-        [(own.astype(of.dtype, copy=False) @ of).transpose(1, 2, 0) for own, of in zip(weights, points, strict=True)],
+        [(w.astype(p.dtype, copy=False) @ p).transpose(1, 2, 0) for w, p in zip(weights, points, strict=True)],
         axis=2,
     )
 
 
 def _chosen(points: list[FloatArray], located: LocatedSamples, which: IntArray) -> list[FloatArray]:
-    """Control points ``(m, K, x)`` of some samples, in increasing order, for each element."""
+    """Select the control points ``(m, K, x)`` of the samples ``which``, in increasing order, for each element."""
     slices = [*located.slices()]
-    ends = np.searchsorted(which, [at.stop for at in slices])
-    own = np.split(which, ends[:-1])
-    return [of[samples - at.start] for of, samples, at in zip(points, own, slices, strict=True)]
+    ends = np.searchsorted(which, [samples.stop for samples in slices])
+    split = np.split(which, ends[:-1])
+    return [p[chosen - samples.start] for p, chosen, samples in zip(points, split, slices, strict=True)]
 
 
 def _curvature(
     located: LocatedSamples, values: FloatArray, points: list[FloatArray], evaluator: Evaluator
 ) -> FloatArray:
-    """``(2, s)`` Gaussian and mean curvature; ``values`` ``(6, 3, s)`` have derivatives by parameters of leaves."""
+    """Return ``(2, s)`` Gaussian and mean curvature, from ``values`` ``(6, 3, s)`` by the parameters of leaves."""
     derivatives = values[1:].swapaxes(1, 2)
-    found = curvature(derivatives[:2], derivatives[2:])
+    curvatures = curvature(derivatives[:2], derivatives[2:])
     for leaves in located.leaves if evaluator == "stabilized" else ():
         if leaves.patch is None:
             continue
         which = np.flatnonzero(located.is_in(leaves))
-        some, size = located.chosen(which), len(leaves.patch.basis.eigenvalues)
-        each_one = np.repeat(np.eye(size)[:, None], len(which), axis=1)
-        weights, of = some.weights([each_one]), _chosen(points, located, which)
-        coordinates = np.concatenate([own.astype(x.dtype, copy=False) @ x for own, x in zip(weights, of, strict=True)])
-        found[:, which] = irregular_curvature(leaves.patch, some.leaf_uv, coordinates, np.arange(len(which)))
-    return found
+        samples, size = located.chosen(which), len(leaves.patch.basis.eigenvalues)
+        unit_rows = np.repeat(np.eye(size)[:, None], len(which), axis=1)
+        weights, near = samples.weights([unit_rows]), _chosen(points, located, which)
+        coordinates = np.concatenate([w.astype(p.dtype, copy=False) @ p for w, p in zip(weights, near, strict=True)])
+        curvatures[:, which] = irregular_curvature(leaves.patch, samples.leaf_uv, coordinates, np.arange(len(which)))
+    return curvatures
 
 
 def _by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Derivatives ``(2, .., s)`` by parameters of leaves, turned into those by the samples' own (u, v)."""
+    """Transform derivatives ``(2, .., s)`` by the leaf's parameters to derivatives by the sample's (u, v)."""
     (a, b), (c, d) = jacobian
     u, v = tangents
     return np.stack([a * u + c * v, b * u + d * v])
 
 
 def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Second derivatives ``(3, x, s)`` by a leaf's parameters, turned into those by the samples' own (u, v)."""
+    """Transform second derivatives ``(3, x, s)`` by the leaf's parameters to those by the sample's (u, v)."""
     (ss, st, tt), ((a, b), (c, d)) = second, jacobian
     return np.stack(
         [
@@ -213,9 +215,9 @@ def curvature(
     first: FloatArray,  # (2, s, 3): derivatives by u, by v
     second: FloatArray,  # (3, s, 3): by uu, uv, vv
 ) -> FloatArray:
-    """Curvatures from the fundamental forms.
+    """Compute curvatures from the fundamental forms.
 
-    Returns (2, s): Gaussian and mean, the latter positive where the surface bends towards ``du x dv``.
+    Returns (2, s): Gaussian and mean; the mean is positive where the surface bends towards ``du x dv``.
     """
     du, dv = first
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -229,18 +231,17 @@ def curvature(
 def irregular_curvature(
     patch: IrregularPatch,
     uv: FloatArray,  # (s, 2) float64: parameters in the patch
-    coordinates: FloatArray,  # (e, K, 3): eigen-coordinates of every element
+    coordinates: FloatArray,  # (e, K, 3): eigen-coordinates of each element
     which: IntArray,  # (s,) int64: element of each sample
 ) -> FloatArray:
-    """Curvatures in an irregular patch, relative to the frame of its limit normal.
+    """Compute curvatures in an irregular patch, in the frame of its limit normal.
 
-    Near the extraordinary point second derivatives are almost tangential, and rounding drowns their small part along
-    the normal. So coordinates in the limit tangent plane and heights over it are summed apart. The coordinates go with
-    powers of λ_2 and the heights with powers of λ_4, as the eigenvectors of λ_2 and λ_3 have no height at all. Every
-    term of the second fundamental form has one height as a factor, so its power comes out in front.
+    Near the extraordinary point second derivatives are almost tangential, and their small normal part is lost to
+    rounding. So coordinates in the limit tangent plane and heights over it are summed separately. Coordinates scale
+    with powers of λ_2. Heights scale with powers of λ_4, as the eigenvectors of λ_2 and λ_3 have no height. Every term
+    of the second fundamental form has one height as a factor, so the power of λ_4 can be factored out.
 
-    Returns (2, s): Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else not
-    a number.
+    Returns (2, s): Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else NaN.
     """
     level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])
@@ -256,7 +257,7 @@ def irregular_curvature(
     growth = second_largest / largest**2
     real = coordinates.dtype.type
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        # In units of λ_2ⁿ in the tangent plane and of λ_4ⁿ across it. The relief is the ratio of the two.
+        # The unit is λ_2ⁿ in the tangent plane and λ_4ⁿ along the normal; `relief` is their ratio.
         relief = real(second_largest / largest) ** level.astype(real)
         normal = np.stack([y[1] * z[2] - z[1] * y[2], z[1] * x[2] - x[1] * z[2], x[1] * y[2] - y[1] * x[2]])
         e, f, g = normal[0] * x[3:] + normal[1] * y[3:] + normal[2] * z[3:]
@@ -265,13 +266,13 @@ def irregular_curvature(
         power = real(growth) ** level.astype(real)
         gaussian = power**2 * (e * g - f * f) / area**2
         mean = power * (e * c - 2 * f * b + g * a) / (2 * area**1.5)
-    found = np.stack([gaussian, mean])
-    found[:, patch.scheme.domain.extent(uv) == 0] = 0 if growth < 1 - CONSTANT else np.nan
-    return found
+    curvatures = np.stack([gaussian, mean])
+    curvatures[:, patch.scheme.domain.extent(uv) == 0] = 0 if growth < 1 - CONSTANT else np.nan
+    return curvatures
 
 
 def _orthonormal_frames(coordinates: FloatArray) -> FloatArray:
-    """Orthonormal frames ``(e, 3, 3)``: in columns, two tangents at the extraordinary point and the normal."""
+    """Return ``(e, 3, 3)`` orthonormal frames: columns are two tangents at the extraordinary point and the normal."""
     first = coordinates[:, 1]
     normal = unit_normals(coordinates[:, 1:3].transpose(1, 2, 0)).T
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -284,18 +285,18 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 class LimitStencil(NamedTuple):
-    """Weights over the one-ring of an extraordinary point amid regular faces and vertices.
+    """Weights over the one-ring of an extraordinary point whose neighbours are regular.
 
-    For a vertex, over the centre, the edge ring and the face ring, counter-clockwise; the face ring's vertex i lies
-    between the edge ring's i and i + 1, and it is empty where faces are triangles. For a face of a vertex-based scheme,
-    over its vertices, counter-clockwise.
+    For a vertex the order is the centre, the edge ring and the face ring, each ring counter-clockwise. Vertex i of the
+    face ring lies between vertices i and i + 1 of the edge ring; triangles have no face ring. For a face of a
+    vertex-based scheme the order is its vertices, counter-clockwise.
 
     Attributes
     ----------
     position : (m,) float64
         Sums to one.
     tangents : (2, m) float64
-        Sum to zero. Weights on the edge ring, or the face's vertices, are ``cos(2 pi i / n)`` and ``sin(2 pi i / n)``;
+        Sum to zero. Weights of the edge ring, or of the face, are ``cos(2 pi i / n)`` and ``sin(2 pi i / n)``;
         the cross product of the two tangents points outward.
     """
 
@@ -304,14 +305,14 @@ class LimitStencil(NamedTuple):
 
 
 def limit_stencil(scheme: str, valence: int) -> LimitStencil:
-    """Weights over a one-ring that make its limit point and two tangents: left eigenvectors of its subdivision matrix.
+    """Compute the limit point and two tangents of a one-ring: left eigenvectors of its subdivision matrix.
 
     Parameters
     ----------
     scheme : str
     valence : int
-        Of a vertex amid regular faces (true after one refinement of any cage); for Doo-Sabin, corners of a face amid
-        regular vertices. At least 3.
+        Valence of a vertex whose faces are regular, as after one refinement of any cage. For Doo-Sabin, number of
+        corners of a face whose vertices are regular. At least 3.
 
     Returns
     -------
@@ -320,7 +321,7 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
     Raises
     ------
     SchemeError
-        If the scheme is unknown, or the valence no integer or below 3.
+        If the scheme is unknown, or the valence is not an integer or below 3.
     """
     rules = scheme_named(scheme)
     if not isinstance(valence, (int, np.integer)):
@@ -338,13 +339,13 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
     angles = 2 * np.pi * np.arange(valence) / valence
     target = np.stack([np.cos(angles), np.sin(angles)])
     plane = basis.inverse[1:3]
-    # The eigenvectors span the plane of the first Fourier mode; take the pair that is cosine and sine on the ring.
+    # The eigenvectors span the plane of the first Fourier mode. Choose the pair that is cosine and sine on the ring.
     combination = target @ plane[:, ring].T @ np.linalg.inv(plane[:, ring] @ plane[:, ring].T)
     return LimitStencil(basis.inverse[0, slots], (combination @ plane)[:, slots])
 
 
 def _vertex_ring(topology: Topology, valence: int) -> tuple[list[int], list[int]]:
-    """Vertices of the stencil at vertex 0 of a one-ring, and those of them that are its edge ring."""
+    """Return the vertices of a limit stencil at vertex 0 of a one-ring, and the edge ring among them."""
     half_edge, edge_ring, face_ring = 0, [], []
     for _ in range(valence):
         ahead = topology.next[half_edge]

@@ -24,10 +24,10 @@ surface is a polynomial there. Child 0 is divided in the same way, and so on, un
 Symbols; indices begin with 1, those of arrays with 0::
 
     S           the point of the limit surface at (u, v); S_u, S_v: its derivatives; N: its normal
-    C           the K control points of the patch, a row for each
+    C           the K control points of the patch, in rows
     A           subdivision matrix, (K, K): A C are the control points of child 0
     Ā           extended subdivision matrix, (M, K): Ā C are the control points of all four children together
-    P_k         picks the R control points of the regular child k out of those M
+    P_k         selects the R control points of the regular child k from these M
     (u', v')    the sample's parameters in its regular child
     b           the R basis functions of a regular patch, at (u', v'); they sum to one; b_u, b_v: their derivatives
     s_k         1; for the child in the middle of a triangle -1, because its parameters run backwards
@@ -39,7 +39,7 @@ Powers of A::
 
     (4)     S   = bᵀ P_k Ā Aⁿ C
 
-Stam's form: with Aⁿ = V Tⁿ V⁻¹, all that depends on the level are powers of eigenvalues::
+Stam's form: with Aⁿ = V Tⁿ V⁻¹, only powers of eigenvalues depend on the level::
 
     (9)     S   = Σ_{i ≥ 1} (bᵀ P_k Ā v_i) λ_iⁿ ĉ_i
     (11)    S_u = 2ⁿ⁺¹ s_k Σ_{i ≥ 1} (b_uᵀ P_k Ā v_i) λ_iⁿ ĉ_i                        S_v likewise, with b_v
@@ -59,10 +59,10 @@ on the choice of v_2 and v_3. `irregular_patch` negates v_3 where f is negative,
 
 Second derivatives have 4ⁿ⁺¹ in place of 2ⁿ⁺¹ s_k, and (4 λ_2)ⁿ · 4 in place of (2 λ_2)ⁿ · 2 s_k.
 
-The functions below give *rows*: the coefficients of every sample, to be multiplied by C for (4) and by the
-eigen-coordinates for all others. `child_rows` makes the products with b, which all forms share; each of `power_rows`,
-`stam_rows` and `stabilized_rows` continues from there. Some matrices have fewer than K eigenvectors; T then has blocks
-on its diagonal, and `times_powers` multiplies by powers of these blocks.
+The functions below return *rows*: the coefficients of every sample, to be multiplied by C for (4) and by the
+eigen-coordinates for all other equations. `child_rows` computes the products with b, which all forms share;
+`power_rows`, `stam_rows` and `stabilized_rows` continue from there. Some matrices have fewer than K eigenvectors; T
+then has blocks on its diagonal, and `times_powers` multiplies by powers of these blocks.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, times_block_powers
 
-# Which equations are summed: (4); (9) and (11); (10) and (12), with (13) at the extraordinary point; (13) everywhere.
+# The equations: (4); (9) and (11); (10) and (12), with (13) at the extraordinary point; (13) everywhere.
 Evaluator = Literal["power", "stam", "stabilized", "limit"]
 EVALUATORS: tuple[Evaluator, ...] = ("power", "stam", "stabilized", "limit")
 # The level reported at the extraordinary point itself, which no finite number of refinements reaches.
 AT_EXTRAORDINARY_POINT = -1
-# In one product of matrices. For more, OpenBLAS starts threads, and where those of Dr.Jit wait for work in a loop, each
-# product then takes up to fifteen times as long.
+# Maximum number of multiplications in one matrix product. For larger ones OpenBLAS starts threads; they compete with
+# Dr.Jit's threads that wait for work in a loop, and a product takes up to fifteen times as long.
 MOST_MULTIPLICATIONS = 1 << 18
 
 
@@ -91,27 +91,26 @@ MOST_MULTIPLICATIONS = 1 << 18
 class SampleRows:
     """Coefficients of samples, to be multiplied by a patch's control points or eigen-coordinates."""
 
-    # (3, s, K) or (6, s, K): of the point; of its two first derivatives divided by ``derivative_scale[0]``; of its
-    # three second derivatives divided by ``derivative_scale[1]``
+    # (3, s, K) or (6, s, K): coefficients of the point; of the first derivatives by u and v, divided by
+    # ``derivative_scale[0]``; of the second derivatives by uu, uv and vv, divided by ``derivative_scale[1]``
     rows: FloatArray
-    # (2, s): ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ`` in the stabilised form; one in the other forms, and at the extraordinary
-    # point
+    # (2, s): ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ`` in the stabilised form; 1 in the other forms, and at the extraordinary point
     derivative_scale: FloatArray
     level: NDArray[np.int64]  # (s,) int64: n; `AT_EXTRAORDINARY_POINT` at the point itself
-    # (2, s, K) or None: of two tangents whose cross product is along the normal, where that of the derivatives is
-    # lost: on borders and creases and at sharp vertices. None elsewhere.
+    # (2, s, K): coefficients of two tangents whose cross product is along the normal, where the derivatives give none:
+    # on borders and creases and at sharp vertices. None elsewhere.
     frame: FloatArray | None = None
 
     @property
     def tangents(self) -> FloatArray:
-        """The frame, or the first derivatives where there is none."""
+        """The frame, or the first derivatives if there is no frame."""
         return self.rows[1:3] if self.frame is None else self.frame
 
 
 def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Level n of each sample, which regular child it lies in (0, 1, 2 for k = 1, 2, 3), and (u', v') in that child.
+    """Return each sample's level n, its regular child (0, 1, 2 for k = 1, 2, 3), and (u', v') in that child.
 
-    All three are exact. At (0, 0) the level is 0, and child and parameters have no meaning.
+    All three are exact. At (0, 0) the level is 0, and child and parameters are meaningless.
     """
     _, exponent = np.frexp(domain.extent(uv))
     level = np.maximum(-exponent.astype(np.int64), 0)
@@ -124,12 +123,12 @@ def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], 
 def child_rows(
     scheme: Scheme,
     uv: FloatArray,
-    # (3, R, K) float: `P_k Ā` for rows over control points, `P_k Ā V` for rows over eigen-coordinates. Their
-    # precision is that of the rows.
+    # (3, R, K) float: `P_k Ā` for rows over control points, `P_k Ā V` for rows over eigen-coordinates. The rows have
+    # the same precision.
     tables: FloatArray,
     derivatives: int,
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Factors that all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, as for samples at level 0.
+    """Compute the factors that all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, the rows of level 0.
 
     Returns
     -------
@@ -140,43 +139,43 @@ def child_rows(
     values = scheme.regular_basis(local.astype(tables.dtype), derivatives)
     rows = np.empty((*values.shape[:2], tables.shape[2]), dtype=tables.dtype)
     for k, table in enumerate(tables):
-        at = np.flatnonzero(child == k)
-        rows[:, at] = times(values[:, at], table)
+        in_child = np.flatnonzero(child == k)
+        rows[:, in_child] = times(values[:, in_child], table)
         # 2 s_k: the child's parameters run twice as fast, and backwards in a triangle's middle child.
         speed = scheme.domain.children[k + 1].matrix[0, 0].astype(tables.dtype)
-        rows[1:3, at] *= speed
-        rows[3:, at] *= speed**2
+        rows[1:3, in_child] *= speed
+        rows[3:, in_child] *= speed**2
     return level, rows
 
 
 def times(rows: FloatArray, matrix: FloatArray, out: FloatArray | None = None) -> FloatArray:
-    """Rows ``(d, n, K)`` times a matrix, in runs for which OpenBLAS starts no threads, see `MOST_MULTIPLICATIONS`."""
+    """Multiply rows ``(d, n, K)`` by a matrix, in products without OpenBLAS threads, see `MOST_MULTIPLICATIONS`."""
     if out is None:
         out = np.empty((*rows.shape[:2], matrix.shape[1]), dtype=np.result_type(rows, matrix))
     length = max(1, MOST_MULTIPLICATIONS // max(1, matrix.size))
-    for own, found in zip(rows, out, strict=True):
-        for begin in range(0, len(own), length):
-            np.matmul(own[begin : begin + length], matrix, out=found[begin : begin + length])
+    for source, product in zip(rows, out, strict=True):
+        for begin in range(0, len(source), length):
+            np.matmul(source[begin : begin + length], matrix, out=product[begin : begin + length])
     return out
 
 
 def power_rows(rows: FloatArray, level: NDArray[np.int64], matrix: FloatArray) -> FloatArray:
-    """Equation (4) with its derivatives, over the control points: ``bᵀ P_k Ā`` times ``Aⁿ``."""
+    """Apply equation (4) and its derivatives, over the control points: ``bᵀ P_k Ā`` times ``Aⁿ``."""
     matrix = matrix.astype(rows.dtype)
     result = np.empty_like(rows)
     for n in np.unique(level):
-        at = np.flatnonzero(level == n)
-        result[:, at] = rows[:, at] @ np.linalg.matrix_power(matrix, int(n))
+        at_level = np.flatnonzero(level == n)
+        result[:, at_level] = rows[:, at_level] @ np.linalg.matrix_power(matrix, int(n))
     return _by_chain_rule(result, level)
 
 
 def stam_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> FloatArray:
-    """Equations (9) and (11), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``λ_iⁿ``."""
+    """Apply equations (9) and (11), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``λ_iⁿ``."""
     return _by_chain_rule(times_powers(rows, level, basis, 1.0), level)
 
 
 def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> tuple[FloatArray, FloatArray]:
-    """Equations (10) and (12), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``(λ_i / λ_2)ⁿ``.
+    """Apply equations (10) and (12), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``(λ_i / λ_2)ⁿ``.
 
     Returns
     -------
@@ -188,7 +187,7 @@ def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasi
     lambda_2 = rows.dtype.type(basis.subdominant)
     occurring, which = distinct_levels(level)
     n = occurring.astype(rows.dtype)
-    # λ_1 is larger than λ_2, so the first column becomes zero: the sums begin at i = 2.
+    # λ_1 is larger than λ_2, so the first column becomes zero, and the sums begin at i = 2.
     rows = times_powers(rows, level, basis, basis.subdominant)
     rows[0] *= (lambda_2**n).take(which)[:, None]
     rows[0, :, 0] = 1
@@ -196,9 +195,9 @@ def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasi
 
 
 def limit_rows(size: int) -> FloatArray:
-    """Equation (13), ``(3, K)`` over the eigen-coordinates: the point ``ĉ_1``, and the tangents ``ĉ_2`` and ``ĉ_3``.
+    """Return the rows of (13), ``(3, K)`` over the eigen-coordinates: point ``ĉ_1``, tangents ``ĉ_2`` and ``ĉ_3``.
 
-    The sign of `characteristic_jacobian` is that of their cross product along the normal.
+    Their cross product points along the normal if `characteristic_jacobian` is positive, else against it.
     """
     return np.eye(3, size)
 
@@ -208,13 +207,13 @@ def characteristic_jacobian(
     children: FloatArray,  # (3, R, K) float64: `P_k Ā`
     vectors: FloatArray,  # (K, K) float64: V
 ) -> float:
-    """The f of equation (13), in the middle of the first regular child. Its sign is the same all over the patch."""
+    """Return f of equation (13) in the middle of the first regular child. Its sign is constant over the patch."""
     b_u, b_v = scheme.regular_basis(scheme.domain.centre[None], 1)[1:, 0]
     return float(np.linalg.det(np.stack([b_u, b_v]) @ children[0] @ vectors[:, 1:3]))
 
 
 def distinct_levels(level: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Levels that occur, in increasing order, and which of these each sample has."""
+    """Return the distinct levels in increasing order, and the index of each sample's level among them."""
     occurs = np.bincount(level) > 0
     return np.flatnonzero(occurs), (np.cumsum(occurs) - 1).take(level)
 
@@ -227,14 +226,14 @@ def times_powers(
 ) -> FloatArray:
     """Multiply each sample's row by ``(T / base)ⁿ``: its entries by ``(λ_i / base)ⁿ``.
 
-    Terms of eigenvalues larger than the base become zero; the stabilised forms leave them out.
+    Terms of eigenvalues larger than the base become zero, as the stabilised forms require.
 
     Returns (d, s, K) of the same precision.
     """
     real = rows.dtype.type
     kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)
     ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)
-    # Powers are made once for each level that occurs.
+    # Powers are computed once for each level that occurs.
     occurring, which = distinct_levels(level)
     powers: NDArray = ratios ** occurring.astype(real)[:, None]
     scaled = rows * powers.take(which, axis=0)
@@ -247,7 +246,7 @@ def times_powers(
 
 
 def _by_chain_rule(rows: FloatArray, level: NDArray[np.int64]) -> FloatArray:
-    """Multiply derivatives by ``2ⁿ`` and ``4ⁿ``: a child's parameters run ``2ⁿ`` times as fast at level n as at 0."""
+    """Multiply derivatives by ``2ⁿ`` and ``4ⁿ``, as parameters run ``2ⁿ`` times as fast at level n as at level 0."""
     rows[1:3] *= np.ldexp(rows.dtype.type(1), level)[:, None]
     rows[3:] *= np.ldexp(rows.dtype.type(1), 2 * level)[:, None]
     return rows

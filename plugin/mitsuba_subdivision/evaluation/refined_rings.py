@@ -1,7 +1,7 @@
-"""One-rings refined once.
+"""One refinement of one-rings.
 
-Usually an element has four children, the copies of its domain. An element that does not fit the domain, such as a
-pentagon's corner under Catmull-Clark, has one child, which does.
+An element usually has four children, which are copies of its domain. An element that does not fit the domain, such as a
+corner of a pentagon under Catmull-Clark, has one child that does.
 """
 
 from __future__ import annotations
@@ -22,47 +22,47 @@ from ..mesh.signature import (
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 
-# Rounding error of the sum of a stencil's weights.
+# Tolerance when comparing the sum of a stencil's weights with 1.
 ROW_SUM = 1e-12
 
 
 class RingPattern:
     """The refinement of a one-ring without its semi-sharp features.
 
-    Semi-sharp features change the weights of refined vertices. They change neither the refined faces nor the numbers of
-    faces and vertices. So the children are found once, without such features.
+    Semi-sharp features change the weights of refined vertices, but not the refined connectivity. So the children are
+    computed once for all one-rings that differ in semi-sharp features only.
 
     Attributes
     ----------
     smooth : Signature
-        Without semi-sharp features.
+        Signature without semi-sharp features.
     refinement : Refinement
-        Of this one-ring.
+        Refinement of this one-ring.
     half_edges : list of int
-        Half-edges of the refined mesh that name the children.
+        Half-edge of each child in the refined mesh.
     domains : tuple of AffineMap
-        From the element's parameters to those of each child.
+        Maps from the element's parameters to those of each child.
     """
 
     def __init__(self, scheme: Scheme, smooth: Signature) -> None:
         self.scheme, self.smooth = scheme, smooth
-        before = one_ring(smooth).topology
-        self.refinement = scheme.refine(before)
-        children = scheme.children(before, self.refinement.topology, 0)
+        topology = one_ring(smooth).topology
+        self.refinement = scheme.refine(topology)
+        children = scheme.children(topology, self.refinement.topology, 0)
         self.domains = tuple(domain for domain, _ in children)
         self.half_edges = [half_edge for _, half_edge in children]
         self._children: dict[int, tuple[Signature, IndexArray, IndexArray]] = {}
 
     def child(self, number: int) -> tuple[Signature, IndexArray, IndexArray]:
-        """Signature, control points and half-edges of a child in the refined one-ring.
+        """Return signature, control points and half-edges of a child in the refined one-ring.
 
         Returns
         -------
         signature : Signature
-            Without semi-sharp features.
+            Signature without semi-sharp features.
         vertices : (K_child,) int32
         around : (n,) int32
-            Half-edges of the fans at its corners, one fan after the other, in each the clockwise ones first.
+            Half-edges of the fans at its corners, fan by fan; in each fan the clockwise ones come first.
         """
         if number not in self._children:
             topology, kind = self.refinement.topology, self.scheme.element
@@ -75,7 +75,7 @@ class RingPattern:
 
 @lru_cache(maxsize=1024)
 def ring_pattern(scheme: Scheme, smooth: Signature) -> RingPattern:
-    """How a one-ring is refined; ``smooth`` is its signature without semi-sharp features."""
+    """Return the refinement of a one-ring whose signature without semi-sharp features is ``smooth``."""
     return RingPattern(scheme, smooth)
 
 
@@ -87,22 +87,22 @@ class RefinedRing:
         self._topology, self._stencils = self._pattern.refinement.topology, self._pattern.refinement.stencils
         if signature.is_semi_sharp:
             refined, self._stencils = scheme.refine(one_ring(signature).topology)
-            # Connectivity is computed once for all that differ in semi-sharp features only.
+            # Reuse the connectivity, which does not depend on semi-sharp features.
             self._topology = self._topology.with_rules(refined.rules, refined.semi_sharpness)
 
     def signature(self, number: int) -> Signature:
-        """Signature of a child."""
+        """Return the signature of a child."""
         smooth, _, around = self._pattern.child(number)
         return with_sharpness(smooth, self._topology, around)
 
     def stencils(self, number: int) -> FloatArray:
-        """Control points of a child over those of the element, ``(K_child, K)``.
+        """Return ``(K_child, K)`` stencils of a child's control points over those of the element.
 
-        Raises SchemeError if weights of a control point do not sum to one.
+        Raises SchemeError if the weights of a control point do not sum to one.
         """
         stencils = self._stencils.dense(self._pattern.child(number)[1])
         error = np.abs(stencils.sum(axis=1) - 1)
-        # Written so that a sum that is not a number is refused as well.
+        # `not <=` also refuses NaN.
         if not error.max() <= ROW_SUM:
             smooth = self._pattern.smooth
             raise SchemeError(
@@ -114,11 +114,11 @@ class RefinedRing:
 
 @lru_cache(maxsize=1024)
 def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRing:
-    """The refined one-ring of a signature."""
+    """Return the refined one-ring of a signature."""
     return RefinedRing(scheme, signature)
 
 
 def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
-    """All children of an element: map of the parameters, signature, and control points over those of the element."""
+    """Return domain, signature and stencils of all children of an element, see `RingPattern` and `RefinedRing`."""
     ring, domains = refined_ring(scheme, signature), ring_pattern(scheme, signature.smoothed).domains
     return [(domain, ring.signature(number), ring.stencils(number)) for number, domain in enumerate(domains)]

@@ -1,4 +1,4 @@
-"""Laws that the rules of every scheme keep, for tests of a scheme of one's own."""
+"""Laws that the rules of every scheme obey, to test new schemes."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from .located_samples import LocatedSamples
 from .patch_tree import irregular_structure, isolated_signature, lattice_stencils, patch_tree, regular_signature
 from .refined_rings import refined_children
 
-# Valences, and numbers of corners, at which a scheme is tried where it supports them.
+# Valences, and numbers of corners, with which a scheme is tested if it supports them.
 VALENCES, SIZES = range(3, 9), (3, 4, 5)
-# Rounding error of weights in double precision.
+# Tolerance when comparing weights.
 SAME_WEIGHTS = 1e-12
-# Derivatives are compared with central differences over this step, whose error goes with its square.
+# Step of the central differences that derivatives are compared with, and tolerance of the comparison, relative to the
+# largest derivative. The error of central differences is proportional to the square of the step.
 STEP, SAME_SLOPE = 1e-4, 1e-5
-# Each derivative of the regular basis: its row, the row that it is the derivative of, and the parameter.
+# For each derivative of the regular basis: its row, the row that it is the derivative of, and the parameter.
 DIFFERENCES = ((1, 0, 0), (2, 0, 1), (3, 1, 0), (4, 1, 1), (5, 2, 1))
 
 
 def check_scheme(scheme: Scheme) -> None:
-    """Try the rules of a scheme on small meshes.
+    """Test the rules of a scheme on small meshes.
 
     Raises
     ------
@@ -42,10 +43,10 @@ def check_scheme(scheme: Scheme) -> None:
         _check_basis_fits(scheme, signature)
     inside = np.full((1, 2), 1 / 3)
     for signature in _irregular_signatures(scheme):
-        found = scheme.unsupported(one_ring(signature).topology)
-        # The first face and the first vertices of a one-ring are the element's own.
-        own = 1 if found is None or found.kind == "face" else len(signature.fans)
-        if found is not None and np.min(found.indices) < own:
+        unsupported = scheme.unsupported(one_ring(signature).topology)
+        # The first face and the first vertices of a one-ring are those of the element; the others may be unsupported.
+        element_count = 1 if unsupported is None or unsupported.kind == "face" else len(signature.fans)
+        if unsupported is not None and np.min(unsupported.indices) < element_count:
             continue
         for _, _, stencils in refined_children(scheme, signature):
             _check_signs(scheme, stencils)
@@ -63,8 +64,8 @@ def _check_basis(scheme: Scheme) -> None:
     error = np.abs(rows.sum(axis=2) - np.eye(len(rows), 1)).max()
     _require(error < SAME_WEIGHTS, scheme, f"the regular basis and its derivatives have sums wrong by {error:.1e}")
     _check_signs(scheme, rows[0])
-    for derivative, of, by in DIFFERENCES:
-        ahead, behind = (scheme.regular_basis(uv + step * np.eye(2)[by], 1)[of] for step in (STEP, -STEP))
+    for derivative, source, axis in DIFFERENCES:
+        ahead, behind = (scheme.regular_basis(uv + step * np.eye(2)[axis], 1)[source] for step in (STEP, -STEP))
         error = np.abs((ahead - behind) / (2 * STEP) - rows[derivative]).max()
         scale = max(1.0, np.abs(rows[derivative]).max())
         _require(error <= SAME_SLOPE * scale, scheme, f"row {derivative} of the regular basis is wrong by {error:.1e}")
@@ -104,7 +105,7 @@ def _check_signs(scheme: Scheme, weights: FloatArray) -> None:
 
 
 def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
-    """Signatures of elements on a border that must be regular patches."""
+    """Generate signatures of elements on a border that must be regular patches."""
     size, count = scheme.regular_face_size, scheme.regular_border_faces
     inner = list(regular_signature(scheme).fans)
     if not scheme.has_phantom_points:
@@ -120,7 +121,7 @@ def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
 
 
 def _irregular_signatures(scheme: Scheme) -> Iterator[Signature]:
-    """Signatures of elements with an extraordinary point, and of those that do not fit the domain."""
+    """Generate signatures of elements with an extraordinary point, and of elements that do not fit the domain."""
     yield from (isolated_signature(scheme, valence) for valence in VALENCES)
     for size in SIZES:
         fan: Fan = (scheme.regular_face_size,) * size
@@ -131,7 +132,7 @@ def _irregular_signatures(scheme: Scheme) -> Iterator[Signature]:
 
 
 def _inner(scheme: Scheme) -> FloatArray:
-    """Some parameters inside the domain."""
+    """Return a few parameters inside the domain."""
     inner = 0.25 + 0.5 * scheme.domain.corners
     return inner[scheme.domain.inside(inner) > 0]
 

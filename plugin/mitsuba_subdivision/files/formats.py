@@ -11,13 +11,15 @@ import os
 import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
 from ..cage.errors import CageError, warn
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def require_triangle_format(path: str | Path) -> str:
     """The suffix of a file of triangles. Raises ValueError if the format is unknown."""
     if not isinstance(path, (str, os.PathLike)):
         raise ValueError(f"path {path!r}; expected a str or Path")
-    suffix, known = Path(path).suffix.lower(), triangle_writers()
+    suffix, known = os.path.splitext(path)[1].lower(), triangle_writers()
     if suffix not in known:
         raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(known)}')
     return suffix

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,9 @@ from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .obj_text import SPACE, Arguments, ObjText, parsed, require_text, run_starts
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 _SLASH = ord("/")
 # Patterns for messages; compiled when there is an error.
@@ -44,7 +46,8 @@ def read_obj(path: str | Path) -> CageContents:
     there are no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture
     coordinates.
     """
-    content = Path(path).read_bytes()
+    with open(path, "rb") as file:
+        content = file.read()
     require_text(f'"{path}"', content)
     obj = ObjText.split(f'"{path}"', content)
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
@@ -56,7 +59,7 @@ def read_obj(path: str | Path) -> CageContents:
         warn(f"{obj.name}: colours of vertices are ignored; expected them as an attribute of a PLY or USD file")
     texcoords = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
     corners = _FaceCorners.read(obj, is_face)
-    vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices")
+    vertices = corners.checked(corners.vertices, is_vertex, "vertex", "vertices", slice(None))
     lines = obj.statement_lines()
     tags, tag_lines = _read_tags(obj)
     return CageContents(
@@ -141,17 +144,12 @@ class _FaceCorners:
         return cls(obj, is_face, sizes, arguments, *indices)
 
     def checked(
-        self,
-        indices: IntArray,  # (n,) int: as they are written
-        # (number of statements,) bool: the statements that the indices count: vertices or texture coordinates
-        counted: NDArray[np.bool_],
-        # The values of these statements
-        noun: str,
-        nouns: str,
-        # (n_h,) bool: the face corners that have these indices; by default all
-        corners: NDArray[np.bool_] | slice = slice(None),
+        self, indices: IntArray, counted: NDArray[np.bool_], noun: str, nouns: str, corners: NDArray[np.bool_] | slice
     ) -> IntArray:
-        """0-based indices of face corners into the statements that they count, or an error if one is out of range."""
+        """0-based indices of some face corners, (n_h,) bool, from those that are written; an error if out of range.
+
+        They count statements, (number of statements,) bool, of vertices or texture coordinates, which the nouns name.
+        """
         count = int(counted.sum())
         if indices.min() > 0 and indices.max() <= count:
             return indices - 1

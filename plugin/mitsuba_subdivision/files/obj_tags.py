@@ -84,12 +84,8 @@ class ObjTags:
         return rows[order]
 
 
-def take_plain_tags(
-    tags: ObjTags,
-    obj: ObjText,
-    statements: IntArray,  # (n,) int: numbers of the statements that are tags
-) -> NDArray[np.bool_]:
-    """Add tags of one edge, vertex or face each to ``tags``, by whole-array operations.
+def take_plain_tags(tags: ObjTags, obj: ObjText, statements: IntArray) -> NDArray[np.bool_]:
+    """Add those of ``n`` numbered statements to ``tags`` that tag one edge, vertex or face, by whole-array operations.
 
     Returns (n,) bool: whether each statement has been added. `parse_tag` is to read the others, among them all that are
     malformed.
@@ -119,13 +115,10 @@ def take_plain_tags(
     return is_taken
 
 
-def parse_tag(
-    tags: ObjTags,
-    file: str,  # Its name in messages
-    line: int,  # 1-based
-    arguments: str,  # The statement after its keyword `t`
-) -> None:
-    """Add the tag of one statement to ``tags``. If a rule is given more than once, the last value counts.
+def parse_tag(tags: ObjTags, file: str, line: int, arguments: str) -> None:
+    """Add the tag of one statement, with what follows its keyword ``t``, to ``tags``; ``line`` is 1-based.
+
+    If a rule is given more than once, the last value counts.
 
     Raises CageError if the statement is malformed. Warns if the tag has no effect, so that the surface may differ from
     what its author saw: hierarchical edits, unknown tags and unknown values.

@@ -66,7 +66,10 @@ def write_obj_triangles(
             if values is not None:
                 stream.writelines(_number_statements(keyword, values))
         corner = "{0}//{0}" if texcoords is None else "{0}/{0}/{0}"
-        stream.writelines(_triangle_statements(triangles, len(positions), corner))
+        corners = np.array([corner.format(vertex) for vertex in range(1, len(positions) + 1)], dtype=object)
+        for start in range(0, len(triangles), ROWS):
+            rows = triangles[start : start + ROWS]
+            stream.write(("f %s %s %s\n" * len(rows)) % tuple(corners[rows.ravel()].tolist()))
 
 
 def _cage_text(contents: CageContents, texcoords: Attribute | None) -> str:
@@ -104,10 +107,3 @@ def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:
     for start in range(0, len(values), ROWS):
         rows = values[start : start + ROWS]
         yield (form * len(rows)) % tuple(rows.ravel().tolist())
-
-
-def _triangle_statements(triangles: NDArray, vertex_count: int, corner: str) -> Iterator[str]:
-    corners = np.array([corner.format(vertex) for vertex in range(1, vertex_count + 1)], dtype=object)
-    for start in range(0, len(triangles), ROWS):
-        rows = triangles[start : start + ROWS]
-        yield ("f %s %s %s\n" * len(rows)) % tuple(corners[rows.ravel()].tolist())

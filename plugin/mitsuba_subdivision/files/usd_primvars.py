@@ -38,6 +38,7 @@ class PrimvarChoice:
 class AttributeReader(Protocol):
     """What primvars are read with; see `usd_reader.MeshReader`."""
 
+    mesh: UsdGeom.Mesh
     location: str
 
     def value(self, attribute: Usd.Attribute, /) -> Any: ...
@@ -50,7 +51,6 @@ class AttributeReader(Protocol):
 
 def read_primvars(
     reader: AttributeReader,
-    mesh: UsdGeom.Mesh,
     # (n_h,) int64, if the orientation of faces is reversed: which face corner of the file becomes each face corner
     order: IntArray | None,
     topology: Topology | None = None,  # What values are checked against. By default, the cage does so later.
@@ -70,20 +70,20 @@ def read_primvars(
     found: dict[str, Attribute] = {}
     types: dict[str, str] = {}
     left_out: dict[str, str] = {}
-    for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
+    for primvar in UsdGeom.PrimvarsAPI(reader.mesh).GetPrimvarsWithAuthoredValues():
         name, kind, interpolation = primvar.GetPrimvarName(), str(primvar.GetTypeName()), primvar.GetInterpolation()
         if interpolation == UsdGeom.Tokens.constant or name == "normals" or name.startswith("skel:"):
             continue
         if choice and not (name in choice.names or kind.startswith("texCoord2")):
             continue
-        attribute, where = primvar.GetAttr(), f'{reader.location}: primvar "{shortened(name)}"'
+        attribute = primvar.GetAttr()
         table = _table(reader.value(attribute), primvar.GetElementSize())
         known = (*INTERPOLATIONS, "uniform") if choice else INTERPOLATIONS
         if table is None or interpolation not in known:
             left_out[str(attribute.GetPath())] = f'"{name}" ({kind}, {interpolation})'
             continue
         width = 2 if choice and name in choice.texcoords else None
-        read = partial(_read, reader, mesh, primvar, table, order, topology, width, where)
+        read = partial(_read, reader, primvar, table, order, topology, width)
         made = reader.fitting(attribute, "the primvar is left out", read, None)
         if made is not None:
             found[name], types[name] = made, kind
@@ -141,15 +141,14 @@ def with_shared_values(
 
 def _read(
     reader: AttributeReader,
-    mesh: UsdGeom.Mesh,
     primvar: UsdGeom.Primvar,
     values: NDArray[np.float64],
     order: IntArray | None,
     topology: Topology | None,
     width: int | None,
-    where: str,
 ) -> Attribute:
     """A primvar as an attribute, checked against a topology if there is one."""
+    mesh, where = reader.mesh, f'{reader.location}: primvar "{shortened(primvar.GetPrimvarName())}"'
     indices = reader.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
     if primvar.GetInterpolation() == "uniform":
         # Values of whole faces become those of their corners, which a change of the orientation leaves as they are.

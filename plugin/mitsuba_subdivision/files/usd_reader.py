@@ -93,15 +93,10 @@ class MeshReader:
         self.mesh, self.location, self.skinning = mesh, location, skinning
         self.rules, self._report = rules or {}, report
 
-    def contents(
-        self,
-        *,
-        is_local: bool = False,  # Whether points are left in the mesh's own space instead of the world's
-        choice: PrimvarChoice | None = None,  # Which primvars are read, by default all
-    ) -> CageContents:
-        """The mesh as contents of a cage.
+    def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
+        """The mesh as contents of a cage in the world's space, or its own; by default, all primvars are read.
 
-        Returns CageContents: in its own space, a mesh that is not to be smoothed has no scheme.
+        In its own space, a mesh that is not to be smoothed has no scheme.
         """
         mesh = self.mesh
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
@@ -137,7 +132,7 @@ class MeshReader:
             mesh.GetHoleIndicesAttr(), "the holes are left out", lambda: self.holes(topology), no_faces
         )
         rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
-        texcoords, attributes = read_primvars(self, mesh, order, topology, choice)
+        texcoords, attributes = read_primvars(self, order, topology, choice)
         return CageContents(
             points,
             sizes,
@@ -152,16 +147,11 @@ class MeshReader:
             source=CageSource(self.location),
         )
 
-    def fitting(
-        self,
-        attribute: Usd.Attribute,
-        consequence: str,  # End of the message, such as "the creases are left out"
-        read: Callable[[], Read],
-        otherwise: Read,
-    ) -> Read:
+    def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
         """What a function reads of an attribute; something else, with a report, where that does not fit the mesh.
 
-        Raises CageError as ``read`` does, if nothing takes reports.
+        The report ends with the consequence: "the creases are left out". Raises CageError as ``read`` does, if nothing
+        takes reports.
         """
         try:
             return read()

@@ -38,13 +38,9 @@ class Skinning:
         return self._skinned(query, points) if query.HasJointInfluences() else points
 
     def normals(
-        self,
-        mesh: UsdGeom.Mesh,
-        points: NDArray[np.float64],  # (n, 3) float64
-        corners: IntArray,  # (n_h,) int64: the point of each face corner
-        normals: NDArray[np.float64],  # (n_h, 3) float64
+        self, mesh: UsdGeom.Mesh, points: NDArray[np.float64], corners: IntArray, normals: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Normals ``(n_h, 3)`` at face corners after joints.
+        """Normals ``(n_h, 3)`` at face corners after joints; ``corners`` (n_h,) are the points, of (n, 3), at each.
 
         Joints move each point by an affine map; its linear part is the difference of the images of shifted points.
         """

@@ -44,8 +44,8 @@ def time_of(attribute: Usd.Attribute, time: Usd.TimeCode) -> Usd.TimeCode:
 
 
 def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
-    """Value of an attribute."""
-    return attribute.Get(time_of(attribute, time))
+    """Value of an attribute; None if there is no such attribute."""
+    return attribute.Get(time_of(attribute, time)) if attribute else None
 
 
 def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:

@@ -18,22 +18,22 @@ class AffineMap:
 
     rows: tuple[Sequence[Float], ...]  # The linear map
     translation: Sequence[Float]
-    inverse: tuple[Sequence[Float], ...]  # Of the linear map
+    inverse: tuple[Sequence[Float], ...]  # Inverse of the linear map
 
     @classmethod
     def of(
         cls,
-        # Of Dr.Jit or NumPy. An inverse that is not given is computed, with derivatives.
+        # Of Dr.Jit or NumPy. A missing inverse is computed, and is differentiable.
         matrix: Matrix4,
         inverse: Matrix4 | None = None,
     ) -> AffineMap:
-        """The map of a 4x4 matrix, whose last row is not used."""
+        """The map of a 4x4 matrix, whose last row is ignored."""
         rows = _rows(matrix)
         return cls(rows, [matrix[i, 3] for i in range(3)], _inverse(rows) if inverse is None else _rows(inverse))
 
     def point(self, point: Vector3) -> Vector3:
         """Map a point."""
-        # The translation comes last, so that points far from the world's origin are rounded once.
+        # Add the translation last: the coordinates of points far from the world's origin are then rounded once.
         return like([x + y for x, y in zip(self.direction(point), self.translation, strict=True)], point)
 
     def direction(self, vector: Vector3) -> Vector3:
@@ -41,23 +41,23 @@ class AffineMap:
         return like([dot(row, vector) for row in self.rows], vector)
 
     def normal(self, normal: Vector3) -> Vector3:
-        """Map the direction of a normal by the inverse transpose; reflections keep it on the outside."""
+        """Map a normal by the inverse transpose, without normalization. Reflections keep it on the outside."""
         return like([dot(column, normal) for column in zip(*self.inverse, strict=True)], normal)
 
     def inverse_point(self, point: Vector3) -> Vector3:
-        """The point that is mapped to a given one."""
+        """Map a point by the inverse."""
         # Subtract the translation first: both points may be far from the world's origin.
         return self.inverse_direction(like([x - y for x, y in zip(point, self.translation, strict=True)], point))
 
     def inverse_direction(self, vector: Vector3) -> Vector3:
-        """The vector that is mapped to a given one without the translation."""
+        """Map a vector by the inverse, without the translation."""
         return like([dot(row, vector) for row in self.inverse], vector)
 
 
 def placed(
     positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4, vector3: type
 ) -> tuple[FloatBuffer, FloatBuffer]:
-    """Map flat positions and unit normals; differentiable with respect to all."""
+    """Map flat positions and unit normals; differentiable with respect to these and the matrix."""
     p: Vector3 = dr.unravel(vector3, positions)
     n: Vector3 = dr.unravel(vector3, normals)
     if dr.grad_enabled(matrix):
@@ -67,12 +67,11 @@ def placed(
 
 
 def _rows(matrix: Matrix4) -> tuple[Sequence[Float], ...]:
-    """The linear part of a 4x4 matrix."""
     return tuple([matrix[i, k] for k in range(3)] for i in range(3))
 
 
 def _inverse(rows: tuple[Sequence[Float], ...]) -> tuple[Sequence[Float], ...]:
-    # Divided by the largest entry, so that the determinant neither overflows nor underflows.
+    # Divide by the largest entry, so that the determinant neither overflows nor underflows.
     scale = 1 / reduce(dr.maximum, [dr.abs(dr.detach(entry)) for row in rows for entry in row])
     x, y, z = ([entry * scale for entry in row] for row in rows)
     columns = cross(y, z), cross(z, x), cross(x, y)
@@ -81,9 +80,9 @@ def _inverse(rows: tuple[Sequence[Float], ...]) -> tuple[Sequence[Float], ...]:
 
 
 class _Spread(dr.CustomOp):
-    """Broadcasts one matrix to all points.
+    """Broadcasts a matrix to all points.
 
-    Dr.Jit's own derivatives would sum over the points for each use of an entry, with a kernel for each sum.
+    With Dr.Jit's derivatives, each use of an entry would add a sum over the points, in a separate kernel.
     """
 
     def eval(self, matrix, count):

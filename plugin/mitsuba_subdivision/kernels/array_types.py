@@ -1,8 +1,8 @@
 """The Dr.Jit array types of a backend and a precision, the layout of arrays of vectors, and names for annotations.
 
 The classes of arrays depend on the backend and the precision, and are known at run time only, see `ArrayTypes`. An
-array has a number or a vector for each lane. In scalar variants there is one lane, and numbers are Python's float, int
-and bool. Annotations name them:
+array has a number or a vector for each lane. Scalar variants have one lane, and their numbers are Python's float, int
+and bool. Annotations use these names:
 
 Float
     A real number: a parameter u or v, a distance, a weight.
@@ -11,17 +11,17 @@ Index
 Mask
     A truth value. Inactive lanes read zeros and write nothing.
 Vector2, Vector3, Vector4
-    Parameters (u, v), say; a point, a direction or a normal, in `vectors` also a list of three arrays; a packet of a
-    table that is read by four numbers at once.
+    For example parameters (u, v); a point, a direction or a normal, in `vectors` also a list of three arrays; a packet
+    of four numbers of a table.
 Index4
     Four indices, such as a row of `PieceTable.half_edges` or `PieceTable.nodes`.
 Matrix4
-    A matrix of four rows and columns, of Dr.Jit or NumPy, which maps points as columns.
+    A 4x4 matrix of Dr.Jit or NumPy, which multiplies points as columns.
 Value
-    A value of a surface or of a channel, or a derivative of it: a number, or a vector of two or three.
+    A value of a surface or of a channel, or its derivative: a number, or a vector of two or three components.
 FloatBuffer, IndexBuffer
-    Numbers or indices in memory, one after the other, whatever the lanes: x, y, z of each point, say. NumPy arrays in
-    scalar variants.
+    Numbers or indices in memory, independent of the lanes, such as x, y, z of each point. NumPy arrays in scalar
+    variants.
 Ray
     An object with an origin ``o`` and a direction ``d``, such as Mitsuba's rays.
 """
@@ -54,7 +54,7 @@ from ..device_arrays import mapped
 from ..llvm import require_llvm
 from ..mesh.shared import Content, Shared, SharedArray
 
-# For scatters to distinct indices. In other modes, Dr.Jit runs a kernel before each further scatter to an array.
+# Mode of scatters to distinct indices. With other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
 _UPLOADED: Shared[SharedArray] = Shared()
 
@@ -63,7 +63,7 @@ _UPLOADED: Shared[SharedArray] = Shared()
 class ArrayTypes:
     """Types of one backend and precision."""
 
-    # ``index``, ``index2`` and ``index4`` hold unsigned 32-bit integers
+    # ``index``, ``index2`` and ``index4`` are unsigned 32-bit integers and vectors of these
     float: type
     index: type
     vector2: type
@@ -79,7 +79,7 @@ class ArrayTypes:
 
     @property
     def numpy_float(self) -> type:
-        """The same precision in NumPy."""
+        """The NumPy type of the same precision."""
         return np.float64 if self.is_double else np.float32
 
     @classmethod
@@ -97,26 +97,26 @@ class ArrayTypes:
 
     @property
     def _module(self) -> ModuleType:
-        """Dr.Jit's module of the type."""
+        """The Dr.Jit module of the types."""
         return sys.modules[self.float.__module__]
 
     @property
     def _many(self) -> type:
-        """Arrays of any number of floats."""
+        """Vectors of any number of floats."""
         return self._module.ArrayXf64 if self.is_double else self._module.ArrayXf
 
     @property
     def index64(self) -> type:
-        """Unsigned integers of 64 bits."""
+        """Unsigned 64-bit integers."""
         return self._module.UInt64
 
     @property
     def matrix4(self) -> type:
-        """Matrices of four rows and columns."""
+        """4x4 matrices."""
         return self._module.Matrix4f64 if self.is_double else self._module.Matrix4f
 
     def vector(self, size: int) -> type:
-        """The type of vectors of 2, 3 or 4 numbers; of single numbers for size 1."""
+        """The type of vectors of 2, 3 or 4 components; for size 1, the type of numbers."""
         return (self.float, self.vector2, self.vector3, self.vector4)[size - 1]
 
     def indices(self, *parts: NDArray[np.integer]) -> IndexBuffer:
@@ -128,17 +128,17 @@ class ArrayTypes:
         return mapped(self.float, values)
 
     def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
-        """Upload an array of numbers, flattened; equal ones share their memory while one is referenced."""
-        # In Dr.Jit's own memory, as frozen functions replace such values.
+        """Upload an array of numbers, flattened. Equal arrays share their memory while one is referenced."""
+        # Copied to memory of Dr.Jit, as frozen functions may replace the array.
         return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(dr.opaque(self.floats(values))))
 
     def given(self, kind: type, values: Any) -> Any:
-        """A user's values as an array of one of these types; vectors of NumPy have a row for each component."""
+        """Convert a user's values to one of these types; a NumPy array of vectors has a row for each component."""
         return mapped(kind, values.T) if isinstance(values, np.ndarray) else kind(values)
 
     def fetch(
         self,
-        kind: type,  # One of the attributes. Vectors are stored consecutively.
+        kind: type,  # One of the attributes. Components of a vector are consecutive in memory.
         buffer: FloatBuffer | IndexBuffer,
         index: Index,
         active: Mask = True,  # Inactive lanes read zero
@@ -147,19 +147,19 @@ class ArrayTypes:
         return dr.gather(kind, buffer, index, active)
 
     def row(self, buffer: FloatBuffer, size: int, index: Index, active: Mask = True) -> list[Float]:
-        """Gather a row of as many numbers from an array of such rows; more than one.
+        """Gather a row of ``size`` numbers, at least two, from an array of such rows.
 
-        In one operation, which reads them in the largest packets that the backend has.
+        Uses one operation, which reads the largest packets that the backend supports.
         """
         return [*dr.gather(self._many, buffer, index, active, shape=(size, dr.width(index)))]
 
     def padded(self, flat: FloatBuffer) -> FloatBuffer:
-        """Pad flat 3-vectors to four components, for packet loads."""
+        """Pad flat 3-vectors to packets of four components."""
         v: Vector3 = dr.unravel(self.vector3, flat)
         return dr.ravel(self.vector4(v.x, v.y, v.z, 0))
 
     def unpadded(self, padded: FloatBuffer, count: int) -> FloatBuffer:
-        """The first ``count`` of padded 3-vectors, flat."""
+        """The first ``count`` padded 3-vectors, flat and without padding."""
         v: Vector3 = dr.gather(self.vector4, padded, dr.arange(self.index, count))
         return dr.ravel(self.vector3(v.x, v.y, v.z))
 
@@ -169,14 +169,14 @@ class ArrayTypes:
         return self.vector3(value.x, value.y, value.z)
 
     def gathered(self, flat: FloatBuffer, index: IndexBuffer) -> FloatBuffer:
-        """Flat x, y, z of the 3-vectors at some indices; differentiable, forward and backward."""
+        """Gather flat 3-vectors at given indices; differentiable, forward and backward."""
         return dr.ravel(dr.gather(self.vector3, flat, index))
 
 
 def float_type_of(
     variant: str,  # Such as "llvm_ad_rgb"
 ) -> type:
-    """Flat float array type of a variant of Mitsuba.
+    """The flat float array type of a variant of Mitsuba.
 
     Raises ValueError if the variant is scalar, or its backend is unknown.
     """

@@ -1,4 +1,4 @@
-"""Evaluates attributes and texture coordinates, interpolated as in `patches.channel`, at any parameters."""
+"""Kernels that evaluate attributes and texture coordinates at any parameters, interpolated as in `patches.channel`."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 
 class SubdividedChannelKernel:
-    """Values subdivided like points."""
+    """Evaluates values that are subdivided like points."""
 
     def __init__(
         self,
-        channel: SubdividedChannel,  # Of 1, 2 or 3 numbers
+        channel: SubdividedChannel,  # Values of 1, 2 or 3 components
         float_type: type,  # Flat Dr.Jit array
     ) -> None:
         table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
@@ -40,8 +40,10 @@ class SubdividedChannelKernel:
         self._size = size = channel.values.shape[1]
 
         def make(values: FloatBuffer) -> FloatBuffer:
-            own: Value = values if size == 1 else dr.unravel(types.vector(size), values)
-            return coefficients(dr.ravel(types.vector3(*([own] if size == 1 else own), *[0] * (3 - size))))
+            components: Value = values if size == 1 else dr.unravel(types.vector(size), values)
+            return coefficients(
+                dr.ravel(types.vector3(*([components] if size == 1 else components), *[0] * (3 - size)))
+            )
 
         # Coefficients of pieces, padded to 3-vectors with zeros
         self.values = ControlValues(channel.values, types, make, key=coefficients)
@@ -51,15 +53,15 @@ class SubdividedChannelKernel:
         return _values(self, location, active)
 
     def piece(self, half_edge: Index, u: Float, v: Float, active: Mask = True) -> Piece:
-        """The values around a location, as `PieceKernel.piece`."""
+        """The piece that contains given parameters, see `PieceKernel.piece`."""
         return self._kernel.piece(self.values.flat, half_edge, u, v, active, size=self._size)
 
 
 @dataclass(frozen=True, eq=False)
 class BilinearPiece:
-    """Values linear along both parameters, with the interface of `Piece`."""
+    """Bilinear or linear values, with the interface of `Piece`."""
 
-    coefficients: Sequence[Value]  # Of 1, u, v and, on the square, u v
+    coefficients: Sequence[Value]  # Coefficients of 1, u, v and, on the square, u v
     monomials: Monomials
     u: Float
     v: Float
@@ -71,24 +73,28 @@ class BilinearPiece:
 
 
 class LinearChannelKernel:
-    """Linearly interpolated values."""
+    """Evaluates linearly interpolated values."""
 
     def __init__(
         self,
-        channel: LinearChannel,  # Of 1, 2 or 3 numbers
-        walk: ElementWalk,  # Over the surface's elements
+        channel: LinearChannel,  # Values of 1, 2 or 3 components
+        walk: ElementWalk,  # Elements of the surface
         float_type: type,  # Flat Dr.Jit array
     ) -> None:
         self._types, self._walk = ArrayTypes.of(float_type), walk
         patches = channel.patches
-        t, half_edges = patches.topology, patches.half_edge_of_corner
+        topology, half_edges = patches.topology, patches.half_edge_of_corner
         self._domain = patches.scheme.domain
         self._is_triangular = self._domain.corner_count == 3
         self._has_polygons = not patches.is_whole.all()
         rows, weights = channel.value_index[half_edges], None
         if self._has_polygons:
-            # Centre values follow all others, and their rows follow those of the half-edges.
-            rows, weights = np.stack([rows, len(channel.values) + t.face[half_edges]], axis=1), channel.with_centres
+            # Values at centres of elements are stored after all others. Rows alternate between a half-edge and its
+            # centre.
+            rows, weights = (
+                np.stack([rows, len(channel.values) + topology.face[half_edges]], axis=1),
+                channel.with_centres,
+            )
         size = channel.values.shape[1]
         make = None if weights is None else partial(WeightedValues(weights, float_type), size=size)
         self.values = ControlValues(channel.values, self._types, make)
@@ -100,7 +106,7 @@ class LinearChannelKernel:
         return _values(self, location, active)
 
     def piece(self, half_edge: Index, u: Float, v: Float, active: Mask = True) -> BilinearPiece:
-        """The values over the element or the corner of an element that a half-edge names."""
+        """The polynomial of a whole element, or of a corner of another element, from one of its half-edges."""
         row = self._walk.row(half_edge, active)
         following, preceding = row[FOLLOWING], row[PRECEDING]
         origin, along_u, along_v = (self._at(edge, active) for edge in (half_edge, following, preceding))
@@ -117,8 +123,8 @@ class LinearChannelKernel:
 
     def _at(self, half_edge: Index, active: Mask, *, of_centre: bool = False) -> Value:
         types = self._types
-        location = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
-        return self.values.fetch(types.fetch(types.index, self._rows, location, active), active)
+        row = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
+        return self.values.fetch(types.fetch(types.index, self._rows, row, active), active)
 
 
 ChannelKernel = SubdividedChannelKernel | LinearChannelKernel
@@ -130,10 +136,10 @@ def _values(kernel: ChannelKernel, location: Location, active: Mask) -> tuple[Va
     u, v = dr.detach(location.u), dr.detach(location.v)
     piece = kernel.piece(location.half_edge, u, v, active)
     if dr.grad_enabled(location.u, location.v):
-        found = piece.values(derivatives=2).shifted(location.u - u, location.v - v)
+        values = piece.values(derivatives=2).shifted(location.u - u, location.v - v)
     else:
-        found = piece.values()
-    return found.value, found.du, found.dv
+        values = piece.values()
+    return values.value, values.du, values.dv
 
 
 def channel_kernel(channel: Channel, walk: ElementWalk, float_type: type) -> ChannelKernel:

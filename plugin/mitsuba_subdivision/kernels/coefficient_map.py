@@ -41,28 +41,28 @@ class CoefficientMap:
     def __call__(
         self,
         points: FloatBuffer,  # x, y, z of each control point of the cage
-        made: FloatBuffer | None = None,  # The coefficients if they are known, to attach them to the points only
+        made: FloatBuffer | None = None,  # Known coefficients, which are then only attached to the points
     ) -> FloatBuffer:
         """Compute the coefficients, see `PieceTable`."""
         return dr.custom(_Coefficients, self, points, made)
 
     def apply(self, points: FloatBuffer) -> FloatBuffer:
-        """The coefficients on a device, without derivatives."""
+        """Compute the coefficients, without derivatives."""
         types, steps = self._types, self._steps
         padded = types.padded(points if steps.refinement is None else steps.refinement.product(points))
         if steps.parts is not None:
-            own, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
-            every: Index = dr.arange(types.index, steps.refined_count)
-            dr.scatter(padded, types.fetch(types.vector4, own, every), every, mode=NO_CONFLICTS)
-            steps.parts.write(own, padded)
-        found: FloatBuffer = dr.zeros(types.float, PACKET * self._table.packet_count)
+            refined, padded = padded, dr.zeros(types.float, PACKET * steps.point_count)
+            index: Index = dr.arange(types.index, steps.refined_count)
+            dr.scatter(padded, types.fetch(types.vector4, refined, index), index, mode=NO_CONFLICTS)
+            steps.parts.write(refined, padded)
+        coefficients: FloatBuffer = dr.zeros(types.float, PACKET * self._table.packet_count)
         if steps.rings is not None:
             control, first, packet = steps.rings
             origin = types.fetch(types.vector4, padded, first, first != NOTHING)
-            dr.scatter(found, types.fetch(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
+            dr.scatter(coefficients, types.fetch(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
         if steps.pieces is not None:
-            steps.pieces.write(padded, found)
-        return found
+            steps.pieces.write(padded, coefficients)
+        return coefficients
 
     def apply_transposed(self, gradient: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from the gradient by the coefficients."""
@@ -70,16 +70,16 @@ class CoefficientMap:
         sums: FloatBuffer = dr.zeros(types.float, PACKET * steps.point_count)
         if steps.rings is not None:
             control, first, packet = steps.rings
-            own: Vector4 = types.fetch(types.vector4, gradient, packet)
-            dr.scatter_add(sums, own, control)
-            dr.scatter_add(sums, -own, first, first != NOTHING)
+            ring_gradient: Vector4 = types.fetch(types.vector4, gradient, packet)
+            dr.scatter_add(sums, ring_gradient, control)
+            dr.scatter_add(sums, -ring_gradient, first, first != NOTHING)
         if steps.pieces is not None:
             steps.pieces.add_transposed(gradient, sums)
         if steps.parts is not None:
             dr.eval(sums)
             steps.parts.add_transposed(type(sums)(sums), sums)
-        found = types.unpadded(sums, steps.refined_count)
-        return found if steps.refinement is None else steps.refinement.transposed(found)
+        points_gradient = types.unpadded(sums, steps.refined_count)
+        return points_gradient if steps.refinement is None else steps.refinement.transposed(points_gradient)
 
     @cached_property
     def _steps(self) -> _Steps:
@@ -87,106 +87,117 @@ class CoefficientMap:
 
 
 class _Steps:
-    """The stages of the map on a device: refinement, control points of parts, coefficients."""
+    """Stages of the map on the device: refinement, control points of parts, coefficients."""
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
         refinement = table.refinement
-        # Map to the control points of the cage refined once, and their number
+        # Number of control points of the patches, and the map to these if the patches are those of the refined cage
         self.refined_count = table.control_count if refinement is None else refinement.shape[0]
         self.refinement = None if refinement is None else WeightedValues.shared(refinement, types.float)
         controls = table.controls
         monomial_count = next((maps[0].pieces.shape[1] for maps in table.maps if maps), 1)
-        of_piece = table.packets_of_piece
+        packets_of_piece = table.packets_of_piece
         parts, pieces = _Blocks(1), _Blocks(monomial_count)
-        self.point_count = self.refined_count  # Together with the control points of parts
+        self.point_count = self.refined_count  # Including the control points of parts
         for maps, (first, count, control_count, first_piece, piece_count, _, _) in zip(
             table.maps, table.classes.tolist(), strict=True
         ):
             for begin, stencils, weights in maps:
-                own_first, own_count = first, control_count
+                part_first, part_size = first, control_count
                 if stencils is not None:
-                    # Control points of parts follow all others, and so do their indices.
-                    own_first, own_count = len(controls) + self.point_count - self.refined_count, len(stencils)
+                    # Control points of parts are stored after all others, and so are their indices.
+                    part_first, part_size = len(controls) + self.point_count - self.refined_count, len(stencils)
                     parts.add(stencils[:, None], first, count, control_count, self.point_count, count, 1)
-                    self.point_count += count * own_count
-                to, step = of_piece * (first_piece + begin), of_piece * piece_count
-                pieces.add(weights, own_first, count, own_count, to, of_piece, step)
-        listed = types.indices(controls, np.arange(self.refined_count, self.point_count))
-        self.parts, self.pieces = (each.rows(types, listed) if each.added else None for each in (parts, pieces))
-        # Control points that are packets of the coefficients: their indices, those of what they are relative to or
-        # `NOTHING`, and the packets.
+                    self.point_count += count * part_size
+                packet, step = packets_of_piece * (first_piece + begin), packets_of_piece * piece_count
+                pieces.add(weights, part_first, count, part_size, packet, packets_of_piece, step)
+        all_controls = types.indices(controls, np.arange(self.refined_count, self.point_count))
+        self.parts, self.pieces = (
+            blocks.rows(types, all_controls) if blocks.added else None for blocks in (parts, pieces)
+        )
+        # Control points stored among the coefficients: their indices; the indices of their origins, or `NOTHING`; and
+        # their packets.
         self.rings = None
         if table.classes[:, 6].any():
             rings = []
             for first, n, k, _, _, first_ring, ring in table.classes.tolist():
                 if ring:
-                    own = controls[first : first + n * k].reshape(k, n).T
-                    origin = np.where(np.arange(k) == 0, NOTHING, own[:, :1])
-                    rings.append(np.stack([own, origin, first_ring + np.arange(n * k).reshape(n, k)]))
-            self.rings = tuple(types.indices(*(each[i].ravel() for each in rings)) for i in range(3))
+                    ring_controls = controls[first : first + n * k].reshape(k, n).T
+                    origin = np.where(np.arange(k) == 0, NOTHING, ring_controls[:, :1])
+                    rings.append(np.stack([ring_controls, origin, first_ring + np.arange(n * k).reshape(n, k)]))
+            self.rings = tuple(types.indices(*(ring[i].ravel() for ring in rings)) for i in range(3))
 
 
 class _Blocks:
-    """Collects blocks: rows of weights shared by all patches of a class."""
+    """Builds blocks: rows of weights shared by all patches of a class."""
 
     def __init__(
         self,
-        width: int,  # Number of vectors that a row computes
+        width: int,  # Number of vectors that a row of weights computes
     ) -> None:
         self.width = width
-        # Of what was added: how many blocks; of each its number of patches; the index of its first control, and how
-        # many controls there are; its first row of weights; where it writes to, how far blocks are apart there, and
-        # patches
+        # For each call of `add`: numbers of blocks and of patches; index of the first control, and number of controls
+        # of a patch; first row of weights; first packet of the results, and its distance from one block to the next,
+        # and from one patch to the next
         self.added: list[tuple[int, ...]] = []
         self._weights: dict[int, tuple[np.ndarray, int]] = {}
         self._row_count = 0
 
     def add(
-        self, weights: np.ndarray, first: int, count: int, control_count: int, to: int, apart: int, step: int
+        self,
+        weights: np.ndarray,
+        first: int,
+        count: int,
+        control_count: int,
+        packet: int,
+        block_step: int,
+        patch_step: int,
     ) -> None:
-        """Add a block for each of some ``(b, width, K)`` weights."""
+        """Add blocks of weights, ``(b, width, K)``."""
         key = id(weights)
         if key not in self._weights:
             self._weights[key] = weights, self._row_count
             self._row_count += len(weights) * control_count
         row = self._weights[key][1]
-        self.added.append((len(weights), count, first, control_count, row, to, apart, step))
+        self.added.append((len(weights), count, first, control_count, row, packet, block_step, patch_step))
 
     def rows(self, types: ArrayTypes, controls: IndexBuffer) -> _Packets:
         """Upload the blocks."""
         weights = padded_rows([block for block, _ in self._weights.values()], types.numpy_float)
         added = np.array(self.added)
         index = ragged.index_in_row(added[:, 0])
-        _, count, first, control_count, row, to, apart, step = np.repeat(added, added[:, 0], axis=0).T
-        # Controls of a block's patches are as far apart as there are patches.
+        _, count, first, control_count, row, first_packet, block_step, patch_step = np.repeat(
+            added, added[:, 0], axis=0
+        ).T
+        # Successive controls of a patch are as far apart as the class has patches.
         columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
         block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
-        packet = (to + index * apart)[block] + patch * step[block]
+        packet = (first_packet + index * block_step)[block] + patch * patch_step[block]
         rows = WeightRows(types, self.width, columns, weights, controls, block, patch)
         return _Packets(rows, types, types.indices(packet))
 
 
 @dataclass(frozen=True, eq=False)
 class _Packets:
-    """Blocks of weights whose vectors are written to packets."""
+    """Blocks of weights, and the packets that their vectors are written to."""
 
     rows: WeightRows
     types: ArrayTypes
-    first: IndexBuffer  # Of each lane its first packet
+    first: IndexBuffer  # First packet of each lane
 
-    def write(self, padded: FloatBuffer, found: FloatBuffer) -> None:
-        """Scatter packets of all vectors, computed from the padded control points."""
+    def write(self, padded: FloatBuffer, coefficients: FloatBuffer) -> None:
+        """Compute all vectors from the padded control points, and scatter them as packets."""
         vectors, _, _ = self.rows.vectors(padded)
         numbers = [number for vector in vectors for number in vector]
         numbers += [self.types.float(0)] * (-len(numbers) % PACKET)
         for i in range(0, len(numbers), PACKET):
             packet = self.types.vector4(*numbers[i : i + PACKET])
-            dr.scatter(found, packet, self.first + i // PACKET, mode=NO_CONFLICTS)
+            dr.scatter(coefficients, packet, self.first + i // PACKET, mode=NO_CONFLICTS)
 
     def add_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
-        """Scatter-add the gradients of all vectors, times the weights, to the control points' packets."""
-        of_lane = piece_packets(self.rows.width)
-        numbers = self.types.row(gradient, PACKET * of_lane, self.first // of_lane)
+        """Scatter-add the gradients by all vectors, times the weights, to the control points' packets."""
+        packets_of_lane = piece_packets(self.rows.width)
+        numbers = self.types.row(gradient, PACKET * packets_of_lane, self.first // packets_of_lane)
         vectors = [self.types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self.rows.width)]
         self.rows.add_transposed(vectors, sums)
 
@@ -219,13 +230,14 @@ class WeightRows:
         self,
         types: ArrayTypes,
         width: int,  # Number of vectors that a row of weights computes
-        # (b, 4) int: of each block the index of its first control in `controls`, how far those of a patch are
-        # apart, and how many they are; its first row of weights
+        # (b, 4) int: for each block the index of its first control in ``controls``, the stride and the number of the
+        # controls of a patch, and its first row of weights
         columns: np.ndarray,
-        # (w, ..) float: a row for each control point of a block, with a number for each vector that it makes
+        # (w, ..) float: a row for each control point of a block, with a weight for each vector
         weights: np.ndarray,
         controls: IndexBuffer,  # Indices of control points
-        # (n,) int: of each lane. Lanes of a block come together, if not all, so that they read the same weights.
+        # (n,) int: block and patch of each lane. Lanes of a block are mostly consecutive, so that they read the same
+        # weights.
         block: np.ndarray,
         patch: np.ndarray,
     ) -> None:
@@ -237,7 +249,7 @@ class WeightRows:
     def vectors(self, padded: FloatBuffer) -> tuple[list[Vector3], Vector3, Vector3]:
         """Compute the vectors of each lane from the padded control points.
 
-        Also returns the first control point, which the others are relative to, and how far they are from it along each
+        Also returns the first control point of each lane, and the largest distance of the others from it along each
         axis.
         """
         types = self._types
@@ -271,36 +283,36 @@ class WeightRows:
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
     def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index]:
-        """Per lane: a function that finds its control points; their number, and its first row of weights."""
+        """A function that returns the k-th control point of each lane; their number; the first row of weights."""
         types = self._types
         lane: Index = dr.arange(types.index, self.count)
-        block, patch = (types.fetch(types.index, each, lane) for each in self._lane)
-        first_control, apart, control_count, row = types.fetch(types.index4, self._columns, block)
-        at = first_control + patch
+        block, patch = (types.fetch(types.index, indices, lane) for indices in self._lane)
+        first_control, stride, control_count, row = types.fetch(types.index4, self._columns, block)
+        patch_control = first_control + patch
 
         def control(k: Index) -> Index:
-            return types.fetch(types.index, self._controls, dr.fma(k, apart, at))
+            return types.fetch(types.index, self._controls, dr.fma(k, stride, patch_control))
 
         return control, control_count, row
 
     def _row(self, row: Index) -> list:
-        """A row of weights, one for each vector."""
+        """Fetch a row of weights, one for each vector."""
         return self._types.row(self._weights, self._row_size, row)[: self.width]
 
 
 def padded_rows(blocks: Sequence[np.ndarray], dtype: type) -> np.ndarray:
-    """Blocks ``(b, m, K)``, in which the first control point is the origin, as rows of `WeightRows`.
+    """Rows of `WeightRows` from blocks ``(b, m, K)``, whose first control point is the origin of the others.
 
-    Rows are those of all control points of a block, then of the next one. Weights of the origin are those of the
-    transposed map, which make sums one for constants and zero for other coefficients.
+    Rows are ordered by block, then by control point. Weights of the origin are those of the transposed map: the weights
+    of the constant coefficient sum to one, those of the others to zero.
     """
     size = -(-blocks[0].shape[1] // PACKET) * PACKET
-    found = np.zeros((sum(len(block) * block.shape[2] for block in blocks), size), dtype=dtype)
+    rows = np.zeros((sum(len(block) * block.shape[2] for block in blocks), size), dtype=dtype)
     end = 0
     for block in blocks:
         begin, end = end, end + len(block) * block.shape[2]
-        own = found[begin:end].reshape(len(block), block.shape[2], size)[:, :, : block.shape[1]]
-        own[:] = block.swapaxes(1, 2)
-        own[:, 0] = -block[:, :, 1:].sum(axis=2)
-        own[:, 0, 0] += 1
-    return found
+        block_rows = rows[begin:end].reshape(len(block), block.shape[2], size)[:, :, : block.shape[1]]
+        block_rows[:] = block.swapaxes(1, 2)
+        block_rows[:, 0] = -block[:, :, 1:].sum(axis=2)
+        block_rows[:, 0, 0] += 1
+    return rows

@@ -20,36 +20,36 @@ _MADE: Shared[LaterArray] = Shared()
 
 
 class WeightedValues:
-    """Weights times values; differentiable, forward and backward."""
+    """Product of sparse weights and values; differentiable, forward and backward."""
 
-    # Properties that upload arrays when they are first used; see `shapes.device_state`.
+    # Properties that upload arrays at their first use; see `shapes.device_state`.
     UPLOADED_LATER = ("product", "transposed")
 
     def __init__(
         self,
         weights: sparse.csr_array,  # (n, m) sparse array: rows sum to one
-        float_type: type,  # Flat Dr.Jit array of the values, whose precision weights get
+        float_type: type,  # Flat Dr.Jit array of the values; weights have its precision
     ) -> None:
         self._weights, self._float = weights, float_type
 
     @classmethod
     def shared(cls, weights: sparse.csr_array, float_type: type) -> WeightedValues:
-        """The same object for equal weights, while it is referenced."""
+        """The object of given weights; equal weights share it while it is referenced."""
         key = float_type, *map(Content, (weights.data, weights.indices, weights.indptr)), weights.shape
         return _WEIGHTED.get(key, lambda: cls(weights, float_type))
 
     def __call__(self, values: FloatBuffer, size: int) -> FloatBuffer:
-        """The weighted values, each of `size` components, flat."""
+        """Weighted values of ``size`` components, flat."""
         return dr.custom(_Product, self, values, size)
 
     @cached_property
     def product(self) -> SparseMatrix:
-        """The weights, without derivatives."""
+        """Product with the weights, not differentiable."""
         return SparseMatrix(self._weights, self._float, is_relative=True)
 
     @cached_property
     def transposed(self) -> SparseMatrix:
-        """The transposed weights, without derivatives."""
+        """Product with the transposed weights, not differentiable."""
         return SparseMatrix(self._weights.T.tocsr(), self._float, is_relative=False)
 
 
@@ -71,44 +71,44 @@ class _Product(dr.CustomOp):
 
 
 class ControlValues:
-    """Values that kernels gather by index, and that may change."""
+    """Mutable values that kernels gather by index."""
 
     def __init__(
         self,
-        values: NDArray[np.floating],  # (n, k) float64: of a cage
+        values: NDArray[np.floating],  # (n, k) float64: values of the cage
         types: ArrayTypes,
-        # Computes the gathered values, flat, from the cage's, flat. The default is the identity.
+        # Computes the values to gather from those of the cage, both flat. The default is the identity.
         make: Callable[[FloatBuffer], FloatBuffer] | None = None,
-        # Of what `make` does: with it, equal values share what is made of them until they are set
+        # Key of ``make``. Objects with equal keys and equal values share the result of ``make`` until `set` is called.
         key: Hashable = None,
     ) -> None:
         self._types, self.size, self._make = types, values.shape[1], make
-        # Always the same object, because others may hold a reference to it.
+        # Never replaced, because other objects may hold a reference to the array.
         self.flat: FloatBuffer = types.float()
-        # Kept, so that others that are equal share the memory.
+        # A reference that keeps the shared upload of equal values alive.
         self._given = types.shared_floats(values)
         shared = LaterArray() if key is None else _MADE.get((key, self._given), LaterArray)
         self._shared: LaterArray | None = shared
         self.flat[:] = shared.get(lambda: self._made(self._given.array))
 
     def set(self, values: FloatBuffer) -> None:
-        """Set new values of the cage, flat. Later lookups are attached to them."""
+        """Set values of the cage, flat. Later lookups are attached to them."""
         self.flat[:] = self._made(values)
         self._shared = None
 
     def _made(self, values: FloatBuffer) -> FloatBuffer:
-        found = values if self._make is None else self._make(values)
-        # Literals would be compiled into kernels.
-        dr.make_opaque(found)
-        return found
+        control_values = values if self._make is None else self._make(values)
+        # Dr.Jit compiles literals into kernels.
+        dr.make_opaque(control_values)
+        return control_values
 
     @property
     def are_moving(self) -> bool:
-        """Whether there are derivatives by the values."""
+        """Whether the values are differentiated."""
         return bool(dr.grad_enabled(self.flat))
 
     def fetch(self, index: Index, active: Mask = True) -> Value:
-        """Gather the value at an index, where a mask is set."""
+        """Gather the value at an index; zero in inactive lanes."""
         return self._types.fetch(self._types.vector(self.size), self.flat, index, active)
 
 
@@ -116,15 +116,15 @@ _WEIGHTED: Shared[WeightedValues] = Shared()
 
 
 class SparseMatrix:
-    """A sparse matrix on the device; not differentiable by itself."""
+    """Sparse matrix on the device; its product is not differentiable."""
 
     def __init__(
         self,
         matrix: sparse.csr_array,  # (n, m) sparse array
-        float_type: type,  # Flat Dr.Jit array of the vectors, such as `drjit.llvm.ad.Float`. Entries get its precision.
+        float_type: type,  # Flat Dr.Jit array of the vectors, such as `drjit.llvm.ad.Float`; entries have its precision
         *,
-        # Whether rows sum to one. Then sums are taken relative to the first vector of each row, and lose
-        # fewer digits.
+        # Whether rows sum to one. Sums are then relative to the first vector of each row, which reduces rounding
+        # errors.
         is_relative: bool,
     ) -> None:
         self._types = types = ArrayTypes.of(float_type)
@@ -138,7 +138,7 @@ class SparseMatrix:
         flat: FloatBuffer,
         size: int = 3,  # Number of components, at most 4
     ) -> FloatBuffer:
-        """The product as the flat components of ``n`` vectors, from those of ``m`` vectors."""
+        """Multiply ``m`` vectors by the matrix; returns ``n`` vectors, both flat."""
         types = self._types
         vector = types.vector(size)
         row: Index = dr.arange(types.index, self._row_count)
@@ -147,7 +147,7 @@ class SparseMatrix:
         zero: Value = dr.zeros(vector, self._row_count)
 
         def value(index: Index, active: Mask = True) -> Value:
-            """The vector that an entry is multiplied by."""
+            """The vector that an entry of the matrix is multiplied by."""
             column: Index = dr.gather(types.index, self._columns, index, active)
             return dr.gather(vector, flat, column, active)
 

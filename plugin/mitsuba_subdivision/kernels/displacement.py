@@ -1,10 +1,10 @@
-"""Displacement of a surface along its normals by varying heights.
+"""Displacement of a surface along its normals.
 
     D = S + h n,   D_u = S_u + h_u n + h n_u,   n_u = (c_u - n (n · c_u)) / |c|,   c = S_u x S_v.
 
-- `displaced` evaluates these formulas, for a kernel's arrays, for single points, and for whole host arrays.
-- `Displacement` holds the heights, a function of a channel's values, and their scale.
-- `DisplacedPiece` is a displaced `Piece` with the same interface: Newton's method runs on it.
+- `displaced` evaluates these formulas for arrays of a kernel, single points, and arrays on the host.
+- `Displacement` contains the heights, a function of a channel's values, and their scale.
+- `DisplacedPiece` is a displaced `Piece` with the same interface, for Newton's method.
 
 All quantities are in object space. At extraordinary points, where second derivatives do not exist, n_u is set to zero:
 the normal of the displaced surface follows from the limit normal and the slope of the heights. Where curvature
@@ -25,35 +25,37 @@ from .vectors import added, cross, dot, like, unit
 if TYPE_CHECKING:
     from .channel_kernel import AnyChannelPiece, ChannelKernel
 
-# Least cosine between the normal and the cross product of derivatives that span the tangent plane. Derivatives are
-# parallel at extraordinary points on borders, and have other normals at sharp tips.
+# Minimum cosine of the angle between the normal and the cross product of the derivatives at which these span the
+# tangent plane. Derivatives are parallel at extraordinary points on borders, and their cross product is not normal at
+# sharp tips.
 SPANNING = 0.5
 
 
 class Heights(Protocol):
-    """Heights that depend on the values of a channel."""
+    """Heights as a function of the values of a channel."""
 
     def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
-        """Heights and their derivatives by the parameters, from those of the channel's value."""
+        """Heights and their derivatives by the parameters, from the channel's values and their derivatives."""
         ...
 
     def height(self, value: Value) -> Float:
-        """The heights alone."""
+        """Heights without derivatives."""
         ...
 
     def variables(self) -> list:
-        """Arrays that derivatives reach."""
+        """Arrays that the heights are differentiable with respect to."""
         ...
 
 
 def displaced(
-    surface: PatchValues,  # With second derivatives; its vectors are 3-vectors of Dr.Jit, or lists of three arrays
+    surface: PatchValues,  # With second derivatives; vectors are 3-vectors of Dr.Jit, or lists of three arrays
     height: tuple[Float, Float, Float],  # The height, and its derivatives by the parameters
 ) -> PatchValues:
     """Displace points of a surface along its normals.
 
-    Returns PatchValues: of the displaced surface, without second derivatives. Its normal is the cross product of the
-    derivatives where these span the tangent plane, else that of the surface. A point without a normal does not move.
+    Returns PatchValues of the displaced surface, without second derivatives. The normal is the cross product of the
+    derivatives where these span the tangent plane, else the normal of the surface. A point without a normal is not
+    displaced.
     """
     uu, uv, vv = surface.second
     crossed = cross(surface.du, surface.dv)
@@ -78,11 +80,11 @@ class Displacement:
     """Heights and scale of a displacement."""
 
     channel: ChannelKernel  # Channel that heights depend on, such as texture coordinates
-    heights: Heights  # Of this channel's values
+    heights: Heights  # Function of the values of ``channel``
     scale: Float  # Factor of the heights
 
     def variables(self) -> list:
-        """Arrays that derivatives reach."""
+        """Arrays that the displacement is differentiable with respect to."""
         values = [self.channel.values.flat] if self.channel.values.are_moving else []
         return [self.scale, *values, *self.heights.variables()]
 
@@ -93,10 +95,10 @@ class Displacement:
 
 @dataclass(frozen=True, eq=False)
 class DisplacedPiece:
-    """A piece of the displaced surface, with the members of `Piece`."""
+    """A piece of the displaced surface, with the interface of `Piece`."""
 
     surface: Piece  # The undisplaced piece
-    channel: AnyChannelPiece  # Channel that heights depend on, at the same location
+    channel: AnyChannelPiece  # Piece of the channel that heights depend on, at the same location
     displacement: Displacement
     active: Mask
 
@@ -112,21 +114,21 @@ class DisplacedPiece:
         return self.surface.is_inside(du, dv, tolerance)
 
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
-        """See `Piece.values`; second derivatives are differences of the first, and have no derivatives of their own."""
+        """See `Piece.values`; second derivatives are detached finite differences of the first derivatives."""
         surface, channel = self.surface.values(du, dv, 2), self.channel.values(du, dv)
         height = self.displacement.heights(channel.value, channel.du, channel.dv, self.active)
-        h, h_u, h_v = (self.displacement.scale * each for each in height)
-        found = displaced(surface, (h, h_u, h_v))
+        h, h_u, h_v = (self.displacement.scale * component for component in height)
+        displaced_values = displaced(surface, (h, h_u, h_v))
         if derivatives == 1:
-            return found
+            return displaced_values
         step = DIFFERENCE * dr.rcp(self.magnification)
         with dr.suspend_grad():
             by_u, by_v = (
                 [self.values(du + x * sign, dv + y * sign) for sign in (1, -1)] for x, y in ((step, 0), (0, step))
             )
-        per = 0.5 * dr.rcp(step)
+        inverse = 0.5 * dr.rcp(step)
         uu, uv, vv = (
-            (getattr(after, name) - getattr(before, name)) * per
+            (getattr(after, name) - getattr(before, name)) * inverse
             for (after, before), name in ((by_u, "du"), (by_v, "du"), (by_v, "dv"))
         )
-        return replace(found, second=(uu, uv, vv))
+        return replace(displaced_values, second=(uu, uv, vv))

@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """Locations of samples: parameters, seen from a half-edge of their element."""
+    """Locations on a surface: parameters in an element, seen from one of its half-edges."""
 
     half_edge: Index
     u: Float
     v: Float
 
     def chosen(self, condition: Mask, other: Location) -> Location:
-        """Another location where a condition holds."""
+        """Select ``other`` where a condition holds, and this location elsewhere."""
         pairs = (other.half_edge, self.half_edge), (other.u, self.u), (other.v, self.v)
-        return Location(*(dr.select(condition, there, here) for there, here in pairs))
+        return Location(*(dr.select(condition, other_value, value) for other_value, value in pairs))
 
 
 class ElementWalk:
@@ -36,25 +36,25 @@ class ElementWalk:
 
     def __init__(self, table: PieceTable, types: ArrayTypes) -> None:
         self.types = types
-        self.domain: ParameterDomain = table.patches.scheme.domain  # Of the elements
+        self.domain: ParameterDomain = table.patches.scheme.domain
         self._half_edges = types.indices(table.half_edges)
         self._first = types.indices(table.patches.elements.face_offsets)
         self._all_whole = bool(table.patches.is_whole.all())
 
     def at(self, element: Index, u: Float, v: Float, corner: Index = 0, active: Mask = True) -> Location:
-        """The location in an element with parameters seen from one of its corners."""
+        """The location in an element, from parameters seen from one of its corners."""
         types = self.types
-        # Python's and NumPy's numbers, which loops of Dr.Jit refuse.
+        # Convert numbers of Python and NumPy, which loops of Dr.Jit reject.
         element, corner = (types.given(types.index, value) for value in (element, corner))
         u, v = (types.given(types.float, value) for value in (u, v))
         return Location(types.fetch(types.index, self._first, element, active) + corner, u, v)
 
     def row(self, half_edge: Index, active: Mask = True) -> Index4:
-        """The row of `PieceTable.half_edges`: the twin, the half-edge after and before in the element, and the code."""
+        """Fetch the row of `PieceTable.half_edges`: twin, following and preceding half-edge, and code."""
         return self.types.fetch(self.types.index4, self._half_edges, half_edge, active)
 
     def corner(self, half_edge: Index, active: Mask = True) -> Index:
-        """Corner of a whole element at which a half-edge begins; 0 in other elements."""
+        """The corner of a whole element where a half-edge begins; 0 in other elements."""
         return self.row(half_edge, active)[CODE] & CORNERS
 
     def from_first(self, location: Location, active: Mask = True) -> Location:
@@ -63,34 +63,34 @@ class ElementWalk:
         return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner))
 
     def is_whole(self, half_edge: Index, active: Mask = True) -> Mask:
-        """Whether elements fit the domain."""
+        """Whether the element of a half-edge fits the domain."""
         return (self.row(half_edge, active)[CODE] & WHOLE) != 0
 
     def carried(self, location: Location, active: Mask = True, row: Index4 | None = None) -> Location:
-        """Map locations whose parameters have left their element to the neighbouring element.
+        """Map locations whose parameters are outside of their element to the neighbouring element.
 
-        Parameters continue as if both elements lay in a plane. They are clamped to the sides where there is no
-        neighbour, on a border or a crease, and where they have left the neighbour as well. ``row`` is that of the
-        half-edges, if it is known.
+        Parameters are continued as if both elements lay in a plane. They are clamped to a side without a neighbour, on
+        a border or a crease, and to the neighbour's sides if they are outside of it, too. ``row`` is the row of the
+        half-edges, if known.
         """
         if row is None:
             row = self.row(location.half_edge, active)
         side, depth, t = self._nearest_side(location)
         has_left = active & (depth < 0)
-        found = location
+        carried = location
         edge = self._edge_on_side(location, row, side)
         if not self._all_whole:
             is_whole = (row[CODE] & WHOLE) != 0
             is_spoke = (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
             t = dr.select(is_whole, t, dr.select(side == 0, location.u, 2 - location.v) * 0.5)
             depth = dr.select(is_whole, depth, depth * 0.5)
-            found = found.chosen(has_left & is_spoke, self._across_spoke(location, row, side))
+            carried = carried.chosen(has_left & is_spoke, self._across_spoke(location, row, side))
             has_left &= is_spoke == False  # noqa: E712
         twin = self.row(edge, has_left)[TWIN]
         has_left &= twin != NOTHING
-        found = found.chosen(has_left, self._entered(twin, 1 - t, -depth, has_left))
-        u, v = clamped(self.domain, found.u, found.v)
-        return Location(found.half_edge, u, v)
+        carried = carried.chosen(has_left, self._entered(twin, 1 - t, -depth, has_left))
+        u, v = clamped(self.domain, carried.u, carried.v)
+        return Location(carried.half_edge, u, v)
 
     def is_border(self, location: Location, side: Index, active: Mask = True) -> Mask:
         """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
@@ -102,27 +102,27 @@ class ElementWalk:
         return active & (self.row(self._edge_on_side(location, row, side), active)[TWIN] == NOTHING)
 
     def _nearest_side(self, location: Location) -> tuple[Index, Float, Float]:
-        """The side nearest to locations, their distance from it, and their position along it."""
+        """The nearest side of the domain, the signed distance from it, and the position along it."""
         u, v = location.u, location.v
         (depth, *depths), (t, *ts) = distances(self.domain, u, v), along_sides(self.domain, u, v)
         side = self.types.index(0)
-        for k, (other, along) in enumerate(zip(depths, ts, strict=True), start=1):
-            is_less = other < depth
-            side, t = dr.select(is_less, self.types.index(k), side), dr.select(is_less, along, t)
-            depth = dr.minimum(depth, other)
+        for k, (side_depth, side_t) in enumerate(zip(depths, ts, strict=True), start=1):
+            is_nearer = side_depth < depth
+            side, t = dr.select(is_nearer, self.types.index(k), side), dr.select(is_nearer, side_t, t)
+            depth = dr.minimum(depth, side_depth)
         return side, depth, t
 
     def _edge_on_side(self, location: Location, row: Index4, side: Index) -> Index:
-        """The half-edge on a side of elements; of corners of other elements, that on the first or the last side."""
+        """The half-edge on a side of a whole element; else that on the first or the last side of a corner."""
         count = self.domain.corner_count
         corner = row[CODE] & CORNERS
         # Half-edges of an element are consecutive.
-        at = corner + side
-        edge = location.half_edge - corner + dr.select(at >= count, at - count, at)
+        end_corner = corner + side
+        edge = location.half_edge - corner + dr.select(end_corner >= count, end_corner - count, end_corner)
         if self._all_whole:
             return edge
-        of_corner = dr.select(side == 0, location.half_edge, row[PRECEDING])
-        return dr.select((row[CODE] & WHOLE) != 0, edge, of_corner)
+        corner_edge = dr.select(side == 0, location.half_edge, row[PRECEDING])
+        return dr.select((row[CODE] & WHOLE) != 0, edge, corner_edge)
 
     def _across_spoke(self, location: Location, row: Index4, side: Index) -> Location:
         """Locations in the next or the previous corner of the same element."""
@@ -134,7 +134,7 @@ class ElementWalk:
         )
 
     def _entered(self, edge: Index, t: Float, depth: Float, active: Mask) -> Location:
-        """Locations in an element at a distance along one of its half-edges and away from it."""
+        """The location at a position ``t`` along a half-edge and a distance ``depth`` from it."""
         whole = Location(edge, t, depth)
         if self._all_whole:
             return whole
@@ -149,7 +149,7 @@ class ElementWalk:
 
 
 def distances(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
-    """Distances of parameters from each side of a domain, positive inside."""
+    """Signed distances of parameters from each side of a domain, positive inside."""
     return (v, 1 - (u + v), u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
 
 
@@ -159,7 +159,7 @@ def along_sides(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...
 
 
 def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
-    """The nearest parameters in a domain, or nearly so."""
+    """Clamp parameters to a domain, approximately to the nearest point."""
     u, v = dr.clip(u, 0, 1), dr.clip(v, 0, 1)
     if domain.corner_count == 4:
         return u, v
@@ -168,22 +168,24 @@ def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
 
 
 def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> tuple[Index, Float, Float, Float]:
-    """The halved copy of a domain that parameters lie in; not the first where `ParameterDomain.extent` is 0.5 or more.
+    """Find the child domain that contains given parameters.
 
-    Returns its number, in the order of `ParameterDomain.children`; parameters in the copy; and their derivatives by the
-    parameters before: 2, or -2 in the copy that is turned by half a turn.
+    This is not the first child where `ParameterDomain.extent` is at least 0.5.
+
+    Returns its index in `ParameterDomain.children`; parameters in the child; and their derivatives by the given
+    parameters: 2, or -2 in the middle child of a triangle, which is rotated by 180 degrees.
     """
     right, upper = u >= 0.5, v >= 0.5
-    one, of_index = types.float(1), types.index
+    one, index_type = types.float(1), types.index
     is_middle = None
     if domain.corner_count == 3:
-        # Not both, in the middle of the third side.
+        # Not both at the midpoint of the third side.
         upper = upper & (right == False)  # noqa: E712 - an array
         is_middle = ((right | upper) == False) & (u + v >= 0.5)  # noqa: E712
-        first = dr.select(is_middle, of_index(3), of_index(0))
-        number = dr.select(right, of_index(1), dr.select(upper, of_index(2), first))
+        first_or_middle = dr.select(is_middle, index_type(3), index_type(0))
+        number = dr.select(right, index_type(1), dr.select(upper, index_type(2), first_or_middle))
     else:
-        number = dr.select(upper, dr.select(right, of_index(2), 3), dr.select(right, of_index(1), 0))
+        number = dr.select(upper, dr.select(right, index_type(2), 3), dr.select(right, index_type(1), 0))
     inner_u, inner_v, scale = 2 * u - dr.select(right, one, 0), 2 * v - dr.select(upper, one, 0), 2 * one
     if is_middle is not None:
         inner_u, inner_v = dr.select(is_middle, one - 2 * u, inner_u), dr.select(is_middle, one - 2 * v, inner_v)
@@ -193,12 +195,12 @@ def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> 
 
 def doublings(
     types: ArrayTypes,
-    x: Float,  # Has no derivatives here
-    most: Index,  # The number of times at most
+    x: Float,  # Detached here
+    most: Index,  # Upper bound of the result
 ) -> tuple[Index, Float]:
-    """How many times a positive number can be doubled before it is 1 or more, and two to the power of that.
+    """The number of times that a positive number can be doubled until it is at least 1, and two to this power.
 
-    Its exponent's bits are exact, and take a tenth of the operations of logarithms.
+    Read from the bits of the exponent, which is exact and takes a tenth of the operations of a logarithm.
     """
     integer, mantissa, bias = (types.index64, 52, 1023) if types.is_double else (types.index, 23, 127)
     bits: Index = dr.reinterpret_array(integer, dr.detach(x))
@@ -207,7 +209,7 @@ def doublings(
 
 
 def turned(domain: ParameterDomain, u: Float, v: Float, turn: Index) -> tuple[Float, Float]:
-    """Parameters seen from the first corner, from those seen from corner ``turn``."""
+    """Convert parameters seen from corner ``turn`` to those seen from the first corner."""
     by_one, by_two = turn == 1, turn == 2
     if domain.corner_count == 4:
         by_three, rest_u, rest_v = turn == 3, 1 - u, 1 - v
@@ -222,14 +224,14 @@ def turned(domain: ParameterDomain, u: Float, v: Float, turn: Index) -> tuple[Fl
 def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tuple[Float, Float, Float, Float]:
     """Derivatives of the parameters seen from the first corner by those seen from corner ``turn``.
 
-    Returns a, b, c, d, float arrays: of u by u and v; of v by u and v.
+    Returns float arrays a, b, c, d: derivatives of u by u and v, then of v by u and v.
     """
     is_turned = [turn == k for k in range(1, domain.corner_count)]
     entries = []
-    for first, *others in _turn_entries(domain):
+    for first, *later_entries in _turn_entries(domain):
         value = types.float(first)
-        for is_by, other in zip(is_turned, others, strict=True):
-            value = dr.select(is_by, types.float(other), value)
+        for is_this_turn, entry in zip(is_turned, later_entries, strict=True):
+            value = dr.select(is_this_turn, types.float(entry), value)
         entries.append(value)
     a, b, c, d = entries
     return a, b, c, d
@@ -237,5 +239,5 @@ def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tupl
 
 @lru_cache(maxsize=8)
 def _turn_entries(domain: ParameterDomain) -> list[tuple[float, ...]]:
-    """Entries of the matrices of all turns: a for each, then b, c and d."""
+    """Entries of the matrices of all turns: a of each turn, then b, c and d."""
     return list(zip(*(domain.rotation(k).matrix.ravel().tolist() for k in range(domain.corner_count)), strict=True))

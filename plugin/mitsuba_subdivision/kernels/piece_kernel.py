@@ -1,7 +1,7 @@
-"""Evaluation of patches at any parameters: of points, or of other values that are subdivided as points are.
+"""Evaluation of patches at any parameters: of points, or of other values that are subdivided like points.
 
-What a sample needs are the coefficients of the piece that it lies in, which a `CoefficientMap` has made. Only next to
-extraordinary points, beyond the levels that are pieces, equations (10) and (12) are summed over the one-ring.
+A sample is evaluated from the coefficients of the piece that contains it, which a `CoefficientMap` has computed. Close
+to an extraordinary point, at levels that have no pieces, equations (10) and (12) are summed over the one-ring instead.
 """
 
 from __future__ import annotations
@@ -38,35 +38,36 @@ from .vectors import added, combined, cross, like
 if TYPE_CHECKING:
     from ..patches import PieceTable
 
-# Zero has no exponent. Nothing as near to an extraordinary point has a level of its own.
+# Lower bound of the distance from an extraordinary point, in parameters of the tip, for computing its level: zero has
+# no exponent. No level is as deep as this.
 LEAST_EXTENT = 2.0**-64
-# Derivatives that no polynomial gives are differences over so much of a piece. Rounding leaves 2⁻¹³ of them in single
-# precision.
+# Step of finite differences, in parameters of a piece: for second derivatives of displaced surfaces, and for those of
+# unit normals. In single precision, their relative rounding error is 2⁻¹³.
 DIFFERENCE = 2.0**-10
-# Dr.Jit takes plain integers only.
+# Dr.Jit only accepts plain integers, not enumerations.
 _ONLY_CHILD, _REGULAR, _TIP = map(int, (PartKind.ONLY_CHILD, PartKind.REGULAR, PartKind.TIP))
 _UNEVEN = int(FrameKind.UNEVEN)
 
 
 @dataclass(frozen=True, eq=False)
 class PatchValues:
-    """What a patch is at some parameters."""
+    """Value and derivatives of a patch at given parameters."""
 
     value: Value
-    # Derivatives by the parameters, as seen from the half-edge that was given. At an extraordinary point, where they
-    # vanish or are infinite, tangents of arbitrary length.
+    # Derivatives by the parameters, seen from the given half-edge. At an extraordinary point, where they vanish or are
+    # infinite, tangents of arbitrary length instead.
     du: Value
     dv: Value
-    # Along the normal, of any length: the cross product of the derivatives, or where these do not serve, of a frame.
-    # Zeros for values other than points.
+    # Normal of arbitrary length: the cross product of the derivatives, or of a tangent frame where these do not span
+    # the tangent plane. Zero for values other than points.
     normal: Vector3
     second: tuple[Value, ...] = ()  # Derivatives by uu, uv and vv
 
     def shifted(self, du: Float, dv: Float) -> PatchValues:
-        """The value and its first derivatives, with first derivatives of parameters that move; needs second ones.
+        """Attach the value and its first derivatives to parameters that move by ``du`` and ``dv``.
 
-        Derivatives do not pass through the loop over a tip's control points, and two such loops in forward mode end in
-        an error of Dr.Jit's (1.5).
+        Requires second derivatives. Automatic differentiation cannot replace them: the loop over a tip's control points
+        is not differentiated by the parameters, and two such loops in forward mode raise an error in Dr.Jit 1.5.
         """
         uu, uv, vv = map(dr.detach, self.second)
         by_u, by_v = dr.detach(self.du), dr.detach(self.dv)
@@ -78,7 +79,7 @@ class PatchValues:
         )
 
     def at_values(self, known: PatchValues) -> PatchValues:
-        """Known values with these derivatives by the control points."""
+        """Attach known values to the control points, with the gradients of this object."""
         value, du, dv, normal = (
             dr.replace_grad(dr.detach(getattr(known, name)), getattr(self, name))  # type: ignore[func-returns-value]  # The stub is wrong.
             for name in ("value", "du", "dv", "normal")
@@ -86,7 +87,7 @@ class PatchValues:
         return PatchValues(value, du, dv, normal, self.second)
 
     def seen_from_first(self, walk: ElementWalk, corner: Index) -> PatchValues:
-        """First derivatives by parameters seen from the first corner, instead of from a later one."""
+        """Transform first derivatives from parameters seen from ``corner`` to those seen from the first corner."""
         a, b, c, d = turn_matrix(walk.domain, walk.types, corner)
         du, dv = combined(self.du, d, self.dv, -c), combined(self.dv, a, self.du, -b)
         return PatchValues(self.value, like(du, self.value), like(dv, self.value), self.normal)
@@ -94,75 +95,75 @@ class PatchValues:
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """What is summed at the deeper levels of a tip, see `TreeArrays.blocks`."""
+    """Terms to sum at the levels of a tip that have no pieces, see `TreeArrays.blocks`."""
 
-    control_count: Index  # Of the one-ring; 0 where a sample lies in no tip, or in a piece of it
+    control_count: Index  # Size of the one-ring; 0 where the sample lies in a piece
     ring: Index  # First packet of the control points
     row: Index  # First row of the block
-    frame: TipFrame | None  # Where derivatives do not serve as tangents; None where they always do
+    frame: TipFrame | None  # Tangent frame; None if derivatives span the tangent plane in all tips
 
 
 @dataclass(frozen=True, eq=False)
 class TipFrame:
-    """Tangents in place of the derivatives."""
+    """Tangents where derivatives do not span the tangent plane."""
 
-    row: Index  # First row of the block whose derivatives they are
-    # Lanes that need a tangent frame, and lanes that need that of `uneven_frame`
+    row: Index  # First row of the block whose derivatives are the tangents
+    # Lanes that need a tangent frame, and lanes that need `uneven_frame`
     is_needed: Mask
     is_uneven: Mask
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """The piece that some parameters lie in."""
+    """The piece that contains given parameters."""
 
     kernel: PieceKernel
     buffer: FloatBuffer  # The coefficients of all pieces
-    coefficients: list[list[Float]]  # Those of this piece, of each coordinate; zeros in the deeper levels of tips
-    # Parameters in the piece, from the middle of the domain
+    # Coefficients of this piece, a list for each coordinate; zeros at levels of tips that have no pieces
+    coefficients: list[list[Float]]
+    # Parameters in the piece, relative to the middle of the domain
     s: Float
     t: Float
-    jacobian: tuple[Float, Float, Float, Float]  # Derivatives of s by the parameters that were given, and of t
-    magnification: Float  # How many times as fast as these s and t run: a power of two
+    jacobian: tuple[Float, Float, Float, Float]  # ds/du, ds/dv, dt/du, dt/dv for the given parameters u, v
+    magnification: Float  # Absolute scale of s and t relative to u and v: a power of two
     tip: Tip | None
-    size: int = 3  # Of a value
+    size: int = 3  # Number of components of a value
 
     @property
     def is_deep(self) -> Mask | None:
-        """Whether parameters lie at the deeper levels of a tip; None if there are no tips."""
+        """Whether parameters lie at a level of a tip that has no pieces; None if there are no tips."""
         return None if self.tip is None else self.tip.control_count > 0
 
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
-        """Whether parameters so far on are in the piece, or no further outside than a tolerance."""
+        """Whether parameters offset by ``du`` and ``dv`` lie in the piece, or within a tolerance of it."""
         s, t = self._parameters(du, dv)
-        least, *others = distances(self.kernel.domain, s + self.kernel.centre[0], t + self.kernel.centre[1])
-        for other in others:
-            least = dr.minimum(least, other)
-        return least >= -tolerance
+        smallest, *other_distances = distances(self.kernel.domain, s + self.kernel.centre[0], t + self.kernel.centre[1])
+        for distance in other_distances:
+            smallest = dr.minimum(smallest, distance)
+        return smallest >= -tolerance
 
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
-        """Evaluate so far on from the parameters that were given, maybe outside of the piece.
+        """Evaluate at parameters offset by ``du`` and ``dv``, which may lie outside of the piece.
 
-        ``du`` and ``dv`` are without derivatives: see `PatchValues.shifted`.
+        ``du`` and ``dv`` must be detached, see `PatchValues.shifted`.
         """
         s, t = self._parameters(du, dv)
         kernel = self.kernel
-        # Of each coordinate.
-        found = [kernel.monomials.values(numbers, s, t, derivatives) for numbers in self.coefficients]
-        value, *by = ([*each] for each in zip(*found, strict=True))
+        components = [kernel.monomials.values(numbers, s, t, derivatives) for numbers in self.coefficients]
+        value, *partials = ([*vector] for vector in zip(*components, strict=True))
         frame = None
         if self.tip is not None:
-            value, by, frame = self._with_tip(self.tip, value, by, s, t, derivatives)
+            value, partials, frame = self._with_tip(self.tip, value, partials, s, t, derivatives)
         a, b, c, d = self.jacobian
-        by_s, by_t, *second = by
-        found_u, found_v = combined(by_s, a, by_t, c), combined(by_s, b, by_t, d)
-        tangents = [found_u, found_v]
+        by_s, by_t, *second = partials
+        tangent_u, tangent_v = combined(by_s, a, by_t, c), combined(by_s, b, by_t, d)
+        tangents = [tangent_u, tangent_v]
         if frame is not None:
-            is_needed, of_s, of_t = frame
-            of_frame = combined(of_s, a, of_t, c), combined(of_s, b, of_t, d)
+            is_needed, frame_s, frame_t = frame
+            frame_tangents = combined(frame_s, a, frame_t, c), combined(frame_s, b, frame_t, d)
             tangents = [
-                [dr.select(is_needed, x, y) for x, y in zip(*each, strict=True)]
-                for each in zip(of_frame, tangents, strict=True)
+                [dr.select(is_needed, x, y) for x, y in zip(*pair, strict=True)]
+                for pair in zip(frame_tangents, tangents, strict=True)
             ]
         normal = cross(*tangents) if self.size == 3 else [0] * self.size
         if second:
@@ -172,35 +173,35 @@ class Piece:
                 for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
             ]
         vector = kernel.types.vector(self.size)
-        value, found_u, found_v, normal = (vector(*each) for each in (value, found_u, found_v, normal))
-        return PatchValues(value, found_u, found_v, normal, tuple(vector(*each) for each in second))
+        value, tangent_u, tangent_v, normal = (vector(*each) for each in (value, tangent_u, tangent_v, normal))
+        return PatchValues(value, tangent_u, tangent_v, normal, tuple(vector(*each) for each in second))
 
     def _parameters(self, du: Float, dv: Float) -> tuple[Float, Float]:
         a, b, c, d = self.jacobian
         return self.s + (a * du + b * dv), self.t + (c * du + d * dv)
 
     def _with_tip(
-        self, tip: Tip, value: list, by: list[list], s: Float, t: Float, derivatives: int
+        self, tip: Tip, value: list, partials: list[list], s: Float, t: Float, derivatives: int
     ) -> tuple[list, list[list], tuple[Mask, list, list] | None]:
-        """Add the point and the derivatives at deeper levels to those of pieces.
+        """Add the sums over a tip's one-ring to the value and the derivatives.
 
-        Also gives where a frame is needed, and its tangents by s and t.
+        Returns both, and of the tangent frame the lanes that need it and its tangents by s and t.
         """
         kernel, types, size = self.kernel, self.kernel.types, self.size
         evaluate, frame = kernel.monomials.values, tip.frame
 
-        def add(k: Index, *sums: Float) -> tuple:
+        def add(k: Index, *totals: Float) -> tuple:
             weights = evaluate(kernel.weights(tip.row + k), s, t, derivatives)
             if frame is not None:
                 weights += evaluate(kernel.weights(frame.row + k, frame.is_needed), s, t)[1:]
-            terms = itertools.product(weights, kernel.control(self.buffer, tip.ring + k, size))
-            return k + 1, *(dr.fma(x, weight, total) for (weight, x), total in zip(terms, sums, strict=True))
+            products = itertools.product(weights, kernel.control(self.buffer, tip.ring + k, size))
+            return k + 1, *(dr.fma(x, weight, total) for (weight, x), total in zip(products, totals, strict=True))
 
-        sum_count = size * (1 + len(by) + (0 if frame is None else 2))
-        # It sums only, so that derivatives pass through it backwards without a record of its iterations.
+        sum_count = size * (1 + len(partials) + (0 if frame is None else 2))
+        # The loop only computes sums: ``max_iterations=-1`` lets reverse mode run without storing its iterations.
         keywords: dict[str, Any] = {"max_iterations": -1} if dr.grad_enabled(self.buffer) else {}
-        _, *sums = dr.while_loop(
-            # The other control points are relative to the first.
+        _, *totals = dr.while_loop(
+            # Start with the second control point, as the others are relative to the first.
             (types.index(1), *(types.float(0) for _ in range(sum_count))),
             lambda k, *_: k < tip.control_count,
             add,
@@ -208,21 +209,30 @@ class Piece:
             label="tip",
             **keywords,
         )
-        of_value, *of = (sums[i : i + size] for i in range(0, sum_count, size))
+        value_sum, *derivative_sums = (totals[i : i + size] for i in range(0, sum_count, size))
         is_deep = tip.control_count > 0
-        point = added(kernel.control(self.buffer, tip.ring, size, is_deep), of_value)
-        value, *by = (added(each, own) for each, own in zip((value, *by), (point, *of), strict=False))
+        point = added(kernel.control(self.buffer, tip.ring, size, is_deep), value_sum)
+        value, *partials = (
+            added(vector, change) for vector, change in zip((value, *partials), (point, *derivative_sums), strict=False)
+        )
         if kernel.first_term is not None:
-            one, of_s, of_t = kernel.first_term(s, t, is_deep)
-            value, by[0], by[1] = added(value, point, one), added(by[0], point, of_s), added(by[1], point, of_t)
+            value_error, s_error, t_error = kernel.first_term(s, t, is_deep)
+            value, partials[0], partials[1] = (
+                added(value, point, value_error),
+                added(partials[0], point, s_error),
+                added(partials[1], point, t_error),
+            )
         if frame is None:
-            return value, by, None
-        by_s, by_t, other_s, other_t = *by[:2], *of[-2:]
+            return value, partials, None
+        derivative_s, derivative_t, tangent_s, tangent_t = *partials[:2], *derivative_sums[-2:]
         _, slow_s, slow_t = evaluate(kernel.weights(tip.row, frame.is_uneven), s, t)
-        uneven_s, uneven_t = combined(by_s, slow_s, by_t, slow_t), combined(other_t, slow_s, other_s, -slow_t)
-        frame_s = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_s, other_s, strict=True)]
-        frame_t = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_t, other_t, strict=True)]
-        return value, by, (frame.is_needed, frame_s, frame_t)
+        uneven_s, uneven_t = (
+            combined(derivative_s, slow_s, derivative_t, slow_t),
+            combined(tangent_t, slow_s, tangent_s, -slow_t),
+        )
+        frame_s = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_s, tangent_s, strict=True)]
+        frame_t = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_t, tangent_t, strict=True)]
+        return value, partials, (frame.is_needed, frame_s, frame_t)
 
 
 class PieceKernel:
@@ -233,7 +243,7 @@ class PieceKernel:
         table: PieceTable,
         float_type: type,  # Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``
         *,
-        # Whether tips are evaluated by (9) and (11) instead of (10) and (12). They must have no levels that are pieces.
+        # Whether tips are evaluated by (9) and (11) instead of (10) and (12). Their levels must have no pieces.
         use_stam: bool = False,
     ) -> None:
         if use_stam and table.piece_levels:
@@ -261,24 +271,24 @@ class PieceKernel:
 
     @classmethod
     def shared(cls, table: PieceTable, float_type: type, *, use_stam: bool = False) -> PieceKernel:
-        """The kernel of a table, the same for all that ask for it."""
+        """The kernel of a table, shared by all callers."""
         return _KERNELS.get((table, float_type, use_stam), lambda: cls(table, float_type, use_stam=use_stam))
 
     def piece(
         self,
         buffer: FloatBuffer,  # Coefficients
-        half_edge: Index,  # Of an element
-        # Inside the domain, seen from the half-edge
+        half_edge: Index,
+        # In the domain, seen from the half-edge
         u: Float,
         v: Float,
         active: Mask = True,
-        row: Index4 | None = None,  # `ElementWalk.row` of the half-edges, if it is known
-        size: int = 3,  # How many of a coefficient's three numbers are wanted
+        row: Index4 | None = None,  # `ElementWalk.row` of the half-edges, if known
+        size: int = 3,  # Number of components of a coefficient to fetch
     ) -> Piece:
-        """The piece in which parameters lie."""
+        """The piece that contains given parameters."""
         types, domain = self.types, self.domain
-        # Dr.Jit evaluates this again for derivatives, and must find the same array then, whatever the object has been
-        # assigned since.
+        # A new reference to the array: Dr.Jit traces this code again for derivatives, when ``buffer`` may have been
+        # assigned other coefficients.
         buffer = type(buffer)(buffer)
         if row is None:
             row = self.walk.row(half_edge, active)
@@ -290,17 +300,17 @@ class PieceKernel:
         first_piece, node = types.fetch(types.index2, self._patch_starts, patch, active)
         if self._is_divided:
             node, turn, u, v, scale = self._leaf(node, turn, u, v, scale, active)
-        kind, first, block_row, ends = types.fetch(types.index4, self._nodes, node, active)
+        kind, piece_number, block_row, tip_code = types.fetch(types.index4, self._nodes, node, active)
         turn = (turn + kind // TURN) % domain.corner_count
         u, v = turned(domain, u, v, turn)
-        number, is_piece, tip = first_piece + first, active, None
+        number, is_piece, tip = first_piece + piece_number, active, None
         if self._has_tips:
             is_tip = (kind & KINDS) == _TIP
-            level, block, u, v, scale = self._at_level(is_tip, ends // LEVEL & LEVELS, u, v, scale)
-            number += block
+            level, child_number, u, v, scale = self._at_level(is_tip, tip_code // LEVEL & LEVELS, u, v, scale)
+            number += child_number
             is_deep = active & is_tip & (level >= self._piece_levels)
             is_piece = active & (is_deep == False)  # noqa: E712 - an array
-            tip = self._tip(patch, block_row, ends, level, block, is_deep)
+            tip = self._tip(patch, block_row, tip_code, level, child_number, is_deep)
         numbers = types.row(buffer, self._numbers, number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(
@@ -316,28 +326,30 @@ class PieceKernel:
         )
 
     def control(self, buffer: FloatBuffer, packet: Index, size: int, active: Mask = True) -> list[Float]:
-        """The control value in a packet of the coefficients."""
+        """Fetch the control value in a packet of the coefficients."""
         return [*self.types.fetch(self.types.vector4, buffer, packet, active)][:size]
 
     def weights(self, row: Index, active: Mask = True) -> list:
-        """A row of the blocks, one number for each monomial."""
+        """Fetch a row of the blocks, with one weight for each monomial."""
         return self.types.row(self._weights, self._row_size, row, active)[: self._count]
 
     def _split(
         self, half_edge: Index, row: Index4, u: Float, v: Float, active: Mask
     ) -> tuple[Index, Float, Float, Float, Index]:
-        """Of the corner of a whole element in whose quarter parameters lie.
+        """Find the quarter of a whole element that contains given parameters.
 
-        Returns the code of its half-edge; parameters in the quarter, seen from there; how fast they run; their turn.
+        Returns the code of the half-edge at its corner; parameters in the quarter, seen from this half-edge; their
+        derivative by the given parameters; and the corner from which the given half-edge is seen. Other elements keep
+        their half-edge and parameters.
         """
         types = self.types
         is_whole = (row[CODE] & WHOLE) != 0
         corner, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
-        # Half-edges of an element follow each other.
-        own = row[CODE] & CORNERS
-        at = (own + corner) & 3
-        code = self.walk.row(half_edge - own + dr.select(is_whole, at, own), active)[CODE]
-        # Seen from a later corner is turned the other way round.
+        # Half-edges of an element are consecutive.
+        given_corner = row[CODE] & CORNERS
+        later_corner = (given_corner + corner) & 3
+        code = self.walk.row(half_edge - given_corner + dr.select(is_whole, later_corner, given_corner), active)[CODE]
+        # The given half-edge seen from the quarter's: the inverse of the turn by ``corner``.
         turn = dr.select(is_whole, (4 - corner) & 3, types.index(0))
         quarter_u, quarter_v = turned(self.domain, inner_u, inner_v, turn)
         u, v = dr.select(is_whole, quarter_u, u), dr.select(is_whole, quarter_v, v)
@@ -346,10 +358,11 @@ class PieceKernel:
     def _leaf(
         self, node: Index, turn: Index, u: Float, v: Float, scale: Float, active: Mask
     ) -> tuple[Index, Index, Float, Float, Float]:
-        """The node in which parameters lie that is not divided, and parameters there before it is turned.
+        """Descend to the leaf that contains given parameters.
 
-        Parameters remain relative to the corner from which they were given, ``turn``: near it, turning them would
-        lose their last digits. It is the same corner in every copy of the domain.
+        Returns the leaf; the corner of its domain from which parameters are seen; parameters in the leaf; and their
+        derivative by the given parameters. Parameters stay relative to the corner from which they were given, which is
+        the same corner of each child's domain: turning them would cancel digits next to this corner.
         """
         types, count = self.types, self.domain.corner_count
 
@@ -363,7 +376,7 @@ class PieceKernel:
             kind, first, _, _ = node_at(node)
             turn = (turn + kind // TURN) % count
             number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
-            # Copies at corners are counted from the first one; that in the middle of a triangle comes after them.
+            # Children at corners are numbered from the first corner; the middle child of a triangle is the last.
             number = dr.select(number < count, (number + turn) % count, number)
             is_only = (kind & KINDS) == _ONLY_CHILD
             return (
@@ -379,67 +392,72 @@ class PieceKernel:
     def _at_level(
         self, is_tip: Mask, level_count: Index, u: Float, v: Float, scale: Float
     ) -> tuple[Index, Index, Float, Float, Float]:
-        """Where parameters lie in a tip.
+        """Find the regular piece of a tip that contains given parameters.
 
-        Returns the level, and the number of the regular child among those of all levels, zero in other leaves;
-        parameters in the regular child of that level, and how fast they run.
+        Returns the level; the number of the piece among those of all levels, zero in other leaves; parameters in the
+        piece; and their derivative by the given parameters.
         """
         types = self.types
         extent = u + v if self.domain.corner_count == 3 else dr.maximum(u, v)
-        most = dr.select(is_tip, level_count, types.index(0))
-        level, power = doublings(types, dr.maximum(extent, LEAST_EXTENT), most)
+        max_level = dr.select(is_tip, level_count, types.index(0))
+        level, power = doublings(types, dr.maximum(extent, LEAST_EXTENT), max_level)
         u, v, scale = u * power, v * power, scale * power
         number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
         is_child = is_tip & (level < level_count)
-        block = dr.select(is_child, dr.fma(level, LEVEL_PIECES, number - 1), level * LEVEL_PIECES)
+        child_number = dr.select(is_child, dr.fma(level, LEVEL_PIECES, number - 1), level * LEVEL_PIECES)
         return (
             level,
-            block,
+            child_number,
             dr.select(is_child, inner_u, u),
             dr.select(is_child, inner_v, v),
             dr.select(is_child, scale * inner_scale, scale),
         )
 
-    def _tip(self, patch: Index, block_row: Index, ends: Index, level: Index, block: Index, is_deep: Mask) -> Tip:
-        """What is summed at deeper levels; ``ends`` is the last column of `PieceTable.nodes`."""
+    def _tip(
+        self, patch: Index, block_row: Index, tip_code: Index, level: Index, child_number: Index, is_deep: Mask
+    ) -> Tip:
+        """Terms to sum in lanes without a piece; ``tip_code`` is the last column of `PieceTable.nodes`."""
         types = self.types
-        frame, level_count, control_count = ends & FRAMES, ends // LEVEL & LEVELS, ends // CONTROL
-        deeper = block - LEVEL_PIECES * self._piece_levels
+        frame, level_count, control_count = tip_code & FRAMES, tip_code // LEVEL & LEVELS, tip_code // CONTROL
+        block_number = child_number - LEVEL_PIECES * self._piece_levels
         ring = types.fetch(types.index, self._rings, patch, is_deep)
-        own = Tip(
-            dr.select(is_deep, control_count, types.index(0)), ring, dr.fma(deeper, control_count, block_row), None
+        tip = Tip(
+            dr.select(is_deep, control_count, types.index(0)),
+            ring,
+            dr.fma(block_number, control_count, block_row),
+            None,
         )
         if not self._has_frames:
-            return own
+            return tip
         is_rest = level == level_count
         is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & (is_rest == False)  # noqa: E712 - an array
         is_needed = is_uneven | (is_deep & is_rest & (frame != 0))
-        # After those of all levels and the rest, that of the frame at the point, then those of uneven levels.
+        # Order of blocks: those of the levels and of the rest, the frame at the point, the frames of uneven levels.
         rest = LEVEL_PIECES * (level_count - self._piece_levels)
-        frame_block = rest + 1 + dr.select(is_uneven, deeper + 1, types.index(0))
-        return replace(own, frame=TipFrame(dr.fma(frame_block, control_count, block_row), is_needed, is_uneven))
+        frame_block = rest + 1 + dr.select(is_uneven, block_number + 1, types.index(0))
+        return replace(tip, frame=TipFrame(dr.fma(frame_block, control_count, block_row), is_needed, is_uneven))
 
 
 @dataclass(frozen=True)
 class FirstTerm:
-    """What the first terms of (9) and (11) are more than those of (10) and (12), by rounding alone.
+    """Rounding errors of the first terms of (9) and (11), which (10) and (12) avoid.
 
-    The first eigenvector is one everywhere. So the term of the point is ``ĉ_1`` times the sum of the basis functions,
-    which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times sums of their derivatives, which are zero. In single
-    precision these sums are not quite.
+    All components of the first eigenvector are one. So the first term of the point is ``ĉ_1`` times the sum of the
+    basis functions, which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times the sums of the derivatives of the
+    basis functions, which are zero. In single precision, both sums have rounding errors.
     """
 
     functions: list[list[float]]  # Coefficients of each function of the scheme's basis
     monomials: Monomials
 
     def __call__(self, s: Float, t: Float, active: Mask) -> tuple[Float, Float, Float]:
-        """Factors of a point in what is added to it and to its two derivatives by the parameters of a child."""
-        total = (s * 0,) * 3
+        """Factors of the point ``ĉ_1`` in the errors of the point and of its derivatives by s and t."""
+        sums = (s * 0,) * 3
         for coefficients in self.functions:
-            function = self.monomials.values([s * 0 + each for each in coefficients], s, t)
-            total = tuple(a + b for a, b in zip(total, function, strict=True))  # type: ignore[assignment]
-        one, by_s, by_t = (dr.select(active, each, 0) for each in (total[0] - 1, total[1], total[2]))
-        return one, by_s, by_t
+            function = self.monomials.values([s * 0 + x for x in coefficients], s, t)
+            sums = tuple(a + b for a, b in zip(sums, function, strict=True))  # type: ignore[assignment]
+        value_error, s_error, t_error = (dr.select(active, x, 0) for x in (sums[0] - 1, sums[1], sums[2]))
+        return value_error, s_error, t_error
 
 
 _KERNELS: Shared[PieceKernel] = Shared()

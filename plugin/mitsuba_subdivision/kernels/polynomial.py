@@ -1,4 +1,4 @@
-"""Polynomials of two parameters, and their derivatives."""
+"""Evaluation of polynomials of two parameters and their derivatives."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from .array_types import Float, Value
 
 
 class Monomials:
-    """The monomials of some polynomials."""
+    """Monomials that polynomials are linear combinations of."""
 
     def __init__(
         self,
-        powers: Sequence[Sequence[int]],  # (m, 2) sequence of int: of s and of t
+        powers: Sequence[Sequence[int]],  # (m, 2) exponents of s and t
     ) -> None:
         self.powers = powers
         highest = max(b for _, b in powers)
-        # Of each power of t, the monomials by their powers of s.
+        # For each power of t, the index of the monomial with each power of s, or None.
         self._columns: list[list[int | None]] = []
         for power in range(highest + 1):
             column = {a: index for index, (a, b) in enumerate(powers) if b == power}
             self._columns.append([column.get(a) for a in range(max(column, default=0) + 1)])
 
     def values(self, coefficients: Sequence[Value], s: Float, t: Float, derivatives: int = 1) -> tuple[Value, ...]:
-        """Evaluate a polynomial from its m coefficients, numbers or vectors.
+        """Evaluate a polynomial from its m coefficients, which are numbers or vectors.
 
-        Returns the value; its derivatives by s and t; if 2 are requested, those by ss, st and tt.
+        Returns the value; derivatives by s and t; and if ``derivatives`` is 2, those by ss, st and tt.
         """
         along_s = [
             _horner([0 if k is None else coefficients[k] for k in column], s, derivatives) for column in self._columns
         ]
-        value, by_t, by_tt = _horner([each[0] for each in along_s], t, derivatives)
-        by_s, by_st, _ = _horner([each[1] for each in along_s if each[1] is not None], t, derivatives - 1)
-        found = [value, by_s, by_t]
+        value, by_t, by_tt = _horner([row[0] for row in along_s], t, derivatives)
+        by_s, by_st, _ = _horner([row[1] for row in along_s if row[1] is not None], t, derivatives - 1)
+        results = [value, by_s, by_t]
         if derivatives == 2:
-            by_ss, _, _ = _horner([each[2] for each in along_s if each[2] is not None] or [None], t, 0)
-            found += [by_ss, by_st, by_tt]
-        return tuple(value * 0 if each is None else each for each in found)
+            by_ss, _, _ = _horner([row[2] for row in along_s if row[2] is not None] or [None], t, 0)
+            results += [by_ss, by_st, by_tt]
+        return tuple(value * 0 if row is None else row for row in results)
 
     def each(self, s: Float, t: Float) -> list[tuple[Float, Float | None, Float | None]]:
-        """The value of each monomial and its derivatives by s and t; None for those that are zero."""
+        """The value of each monomial, and its derivatives by s and t; None for derivatives that are zero."""
         return [
             (
                 _power(s, a) * _power(t, b),
@@ -53,14 +53,14 @@ class Monomials:
 
 
 def _power(x: Float, exponent: int) -> Float:
-    found = 1.0
+    product = 1.0
     for _ in range(exponent):
-        found = found * x
-    return found
+        product = product * x
+    return product
 
 
 def _horner(coefficients: list[Value], x: Float, derivatives: int) -> tuple[Value, Value, Value]:
-    """A polynomial of one variable and so many of its first two derivatives; None for those that are zero."""
+    """Value and derivatives of a polynomial of one variable; None for derivatives that are zero."""
     value, first, half_second = coefficients[-1], None, None
     for coefficient in coefficients[-2::-1]:
         if derivatives == 2 and first is not None:

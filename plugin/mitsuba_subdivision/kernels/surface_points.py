@@ -1,4 +1,4 @@
-"""Points of the surface on the device, as `SurfaceKernel` evaluates and finds them."""
+"""Results of `SurfaceKernel`: points of the surface on the device."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ class SurfacePoints:
     Attributes
     ----------
     location : Location
-        Where they lie.
+        Element and parameters.
     p : 3-vector
         In the space of the control points.
     n : 3-vector
-        Unit normal along ``dp_du x dp_dv``. Where the surface has none, as on folds, it is zero, or what rounding
-        makes of it.
+        Unit normal along ``dp_du x dp_dv``. Where the surface has none, as on folds, zero or dominated by rounding.
     dp_du, dp_dv : 3-vectors
-        Derivatives by the location's parameters.
+        Derivatives by the parameters of the location.
     dn_du, dn_dv : 3-vectors, or None
-        If second derivatives were requested.
+        Derivatives of the normal, if they were requested.
     """
 
     location: Location
@@ -40,18 +39,18 @@ class SurfacePoints:
     dn_dv: Vector3 = None
 
     def placed(self, to_world: AffineMap) -> SurfacePoints:
-        """The same points in another space."""
+        """Transform the points to another space."""
         normal = to_world.normal(self.n)
         n = unit(normal)
-        found = SurfacePoints(
+        points = SurfacePoints(
             self.location, to_world.point(self.p), n, to_world.direction(self.dp_du), to_world.direction(self.dp_dv)
         )
         if self.dn_du is None:
-            return found
+            return points
         inverse = over(1, dr.norm(normal), 0)
-        turns = (to_world.normal(each) * inverse for each in (self.dn_du, self.dn_dv))
-        dn_du, dn_dv = (turn - n * dr.dot(n, turn) for turn in turns)
-        return replace(found, dn_du=dn_du, dn_dv=dn_dv)
+        changes = (to_world.normal(derivative) * inverse for derivative in (self.dn_du, self.dn_dv))
+        dn_du, dn_dv = (change - n * dr.dot(n, change) for change in changes)
+        return replace(points, dn_du=dn_du, dn_dv=dn_dv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ class SurfaceHits(SurfacePoints):
     Attributes
     ----------
     t : float array
-        Distance along the ray, in lengths of its direction; infinite where it does not intersect the surface nearby.
+        Ray parameter, in lengths of the direction; infinite where the ray does not intersect the surface nearby.
     """
 
     t: Float = None
@@ -69,11 +68,12 @@ class SurfaceHits(SurfacePoints):
 
 @dataclass(frozen=True, eq=False)
 class NearestSurfacePoints(SurfacePoints):
-    """Points of a surface that are nearest to others.
+    """Points of a surface that are nearest to given points.
 
     Attributes
     ----------
     distance : float array
+        Distance from the given points.
     """
 
     distance: Float = None
@@ -86,7 +86,7 @@ class RandomSurfacePoints(SurfacePoints):
     Attributes
     ----------
     pdf : float array
-        Their density by area.
+        Probability density by area.
     """
 
     pdf: Float = None

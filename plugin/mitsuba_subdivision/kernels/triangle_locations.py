@@ -1,4 +1,4 @@
-"""From a triangle of a tessellation to the element that it belongs to, and the parameters there."""
+"""Maps from triangles of a tessellation to elements and parameters."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class TriangleLocations(Protocol):
-    """Finds out where points of triangles lie."""
+    """Map from points of triangles to locations on the surface."""
 
     def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
-        """The location of a point of a triangle, where its parameters are interpolated.
+        """The location of a point of a triangle, by interpolating the parameters of its corners.
 
         ``b1`` and ``b2`` are barycentric coordinates of the triangle's second and third corner.
         """
@@ -31,17 +31,17 @@ class TriangleLocations(Protocol):
 
 def triangle_locations(
     table: VertexTable,
-    walk: ElementWalk,  # Over the same elements
+    walk: ElementWalk,  # Elements of the tessellated surface
     types: ArrayTypes,
 ) -> TriangleLocations:
-    """Parameters on the triangles of a tessellation."""
+    """Return the locations on the triangles of a tessellation."""
     if isinstance(table.grid, UniformGrid):
         return UniformLocations(table.grid, walk, types)
     return AdaptiveLocations(cast("AdaptiveGrid", table.grid), walk, types)
 
 
 class AdaptiveLocations:
-    """Parameters on the triangles of an adaptive tessellation, which are kept for each."""
+    """Locations on the triangles of an adaptive tessellation, stored for each triangle."""
 
     def __init__(self, grid: AdaptiveGrid, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk = types, walk
@@ -57,14 +57,14 @@ class AdaptiveLocations:
 
 
 class UniformLocations:
-    """Parameters on the triangles of a uniform tessellation, which are the same in all elements of a kind."""
+    """Locations on the triangles of a uniform tessellation, stored once for whole elements and once for corners."""
 
     def __init__(self, grid: UniformGrid, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk = types, walk
         whole, corner = grid.triangle_parameters()
         self._whole_count, self._corner_count = len(whole), len(corner)
         self._parameters = types.floats(np.concatenate([whole, corner]))
-        # Triangles of odd rates reach from one corner of a polygon into the next.
+        # At odd rates, triangles extend from one corner of a polygon into the next.
         self._leave_corners = bool((corner > 1).any())
         counts = grid.triangle_counts
         self._element = self._first = None
@@ -93,18 +93,18 @@ class UniformLocations:
 def _inside(
     types: ArrayTypes, parameters: FloatBuffer, triangle: Index, b1: Float, b2: Float, active: Mask
 ) -> list[Float]:
-    """Parameters of a point of a triangle, from those of its corners."""
+    """Parameters of a point of a triangle, interpolated from those of its corners."""
     corners = (types.fetch(types.vector2, parameters, 3 * triangle + i, active) for i in range(3))
     return [dr.fma(b1, b - a, dr.fma(b2, c - a, a)) for a, b, c in zip(*corners, strict=True)]
 
 
 class SomeTriangles:
-    """Parameters on some triangles of a tessellation."""
+    """Locations on a subset of the triangles of a tessellation."""
 
     def __init__(
         self,
-        locations: TriangleLocations,  # Of all
-        kept: IntArray,  # (n,) int64: their numbers
+        locations: TriangleLocations,  # Of all triangles
+        kept: IntArray,  # (n,) int64: indices of the subset among all triangles
         types: ArrayTypes,
     ) -> None:
         self._locations, self._kept, self._types = locations, types.indices(kept), types

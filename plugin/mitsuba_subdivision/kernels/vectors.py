@@ -1,7 +1,7 @@
-"""Operations on vectors of three components: 3-vectors of Dr.Jit, or lists of arrays, such as whole arrays on the host.
+"""Operations on vectors of three components: 3-vectors of Dr.Jit, or lists of three arrays of a device or the host.
 
-Those of Dr.Jit's own that are here as well take several times as long to trace. Beside them are the tolerances of
-Newton's steps.
+They take a fraction of the tracing time of Dr.Jit's functions of the same names. The module also has the tolerances of
+Newton's method.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import drjit as dr
 
 from .array_types import ArrayTypes, Float, Vector3
 
-# Longest step, in parameters of an element: outside its element, a polynomial may be far from the surface.
+# Longest Newton step, in parameters of an element: outside of its element, a polynomial may be far from the surface.
 LONGEST_STEP = 0.5
-# A step shorter than this, in parameters of a piece, is the last: the next would be about as short as its square. The
-# second is for nearest points in double precision, which derivatives start from.
+# Tolerance of a Newton step's length, in parameters of a piece: a next step would be about as long as the square of
+# this. The second one is for nearest points in double precision, which their derivatives depend on.
 STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE = 3e-4, 1e-7
-# Rounding error of the difference of two points, relative to their coordinates: some units in the last place.
+# Rounding error of the difference of two points, relative to their coordinates: some units in the last place (ulp).
 _ROUNDING_SINGLE, _ROUNDING_DOUBLE = 2.0**-21, 2.0**-50
 
 
@@ -36,8 +36,8 @@ def cross(a: Vector3, b: Vector3) -> Vector3:
 
 
 def unit(vector: Vector3) -> Vector3:
-    """The vector over its length; zero if that is zero, infinite, or so small that its inverse is."""
-    # Over the largest component first, so that squares neither overflow nor vanish.
+    """Normalize a vector; zero if its length is zero, infinite, or so small that its inverse is infinite."""
+    # Divide by the largest component first, so that squares neither overflow nor underflow.
     largest = dr.detach(reduce(dr.maximum, [dr.abs(x) for x in vector]))
     scale = 1 / dr.select(largest > 0, largest, 1)
     exists = (largest > 0) & (scale > 0) & dr.isfinite(scale)
@@ -47,17 +47,17 @@ def unit(vector: Vector3) -> Vector3:
 
 
 def added(a: Vector3, b: Vector3, factor: Float = 1) -> Vector3:
-    """A vector, and another times a factor."""
+    """Return ``a + factor * b``."""
     return like([dr.fma(y, factor, x) for x, y in zip(a, b, strict=True)], a)
 
 
 def combined(a: Sequence[Float], by_a: Float, b: Sequence[Float], by_b: Float) -> list[Float]:
-    """The sum of a vector times a factor and another times another, of any number of components."""
+    """Return ``by_a * a + by_b * b`` for vectors of any number of components."""
     return [dr.fma(x, by_a, y * by_b) for x, y in zip(a, b, strict=True)]
 
 
 def like(components: list, vector: Vector3) -> Vector3:
-    """A vector of three components, of the type of another one."""
+    """Make a vector of the same type as ``vector`` from three components."""
     return components if isinstance(vector, list) else type(vector)(*components)
 
 
@@ -67,7 +67,7 @@ def rounding(types: ArrayTypes) -> float:
 
 
 def step_along(r: Vector3, d: Vector3, du: Vector3, dv: Vector3) -> tuple[Float, Float]:
-    """Components of a vector ``r`` along two tangents, after removing its component along ``d``."""
+    """Coefficients of ``du`` and ``dv`` in ``r``, written as a combination of ``du``, ``dv`` and ``d``."""
     d, du, dv = [*d], [*du], [*dv]
     across_v, across_u = cross(dv, d), cross(d, du)
     inverse = over(1, dot(du, across_v))
@@ -75,6 +75,6 @@ def step_along(r: Vector3, d: Vector3, du: Vector3, dv: Vector3) -> tuple[Float,
 
 
 def over(value: Float, divisor: Float, otherwise: float = dr.inf) -> Float:
-    """A quotient; another number where the divisor is zero, which is an error for Python's numbers."""
+    """Divide two numbers, or return ``otherwise`` where the divisor is zero; never raises ZeroDivisionError."""
     exists = divisor != 0
     return dr.select(exists, value / dr.select(exists, divisor, 1), otherwise)

@@ -1,4 +1,4 @@
-"""Vertices of a tessellation on any backend: coefficients of polynomials, points and unit normals on these."""
+"""Vertices of a tessellation on any backend: points and unit normals of polynomials."""
 
 from __future__ import annotations
 
@@ -36,53 +36,53 @@ class VertexKernel:
             self._refined_count = table.refinement.shape[0]
             self._refinement = WeightedValues.shared(table.refinement, float_type)
         controls, are_rounded = types.indices(table.controls), table.refinement is not None
-        self._parts = [_Part(types, each, controls, are_rounded) for each in table.polynomials]
+        self._parts = [_Part(types, part, controls, are_rounded) for part in table.polynomials]
         self._weld_target = types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Points and unit normals, flat, from x, y, z of each control point; differentiable, forward and backward.
 
-        Normals are along the cross product of the tangents, zero where a patch is folded or collapsed. Raises
-        ValueError if the number of control points is not that of the table.
+        Normals have the direction of the cross product of the tangents, and are zero where a patch is folded or
+        collapsed. Raises ValueError if the number of control points is not that of the table.
         """
         return self.evaluated(dr.detach(control_points)).attached(control_points)
 
     def evaluated(self, control_points: FloatBuffer) -> EvaluatedVertices:
-        """Evaluate every vertex, from detached control points.
+        """Evaluate all vertices from detached control points.
 
         Raises ValueError if the number of control points is not that of the table.
         """
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
-        padded, found = self._padded(control_points), self._vectors()
+        padded, buffers = self._padded(control_points), self._vectors()
         for part in self._parts:
-            part.evaluate(padded, found)
-        return EvaluatedVertices(self, control_points, *found)
+            part.evaluate(padded, buffers)
+        return EvaluatedVertices(self, control_points, *buffers)
 
     def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Changes of points and normals, where control points change; flat, detached."""
-        padded, padded_change, found = self._padded(control_points), self._padded(change), self._vectors()
+        """Directional derivatives of points and normals for a change of the control points; flat, detached."""
+        padded, padded_change, buffers = self._padded(control_points), self._padded(change), self._vectors()
         for part in self._parts:
-            part.evaluate(padded, found, padded_change)
-        return found
+            part.evaluate(padded, buffers, padded_change)
+        return buffers
 
     def gradient(self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
-        """Gradient by the control points, from those by points and normals; flat, detached."""
+        """Gradient by the control points, from the gradients by points and normals; flat, detached."""
         dr.eval(positions, normals)
         padded = self._padded(control_points)
         sums: FloatBuffer = dr.zeros(self._types.float, PACKET * self._refined_count)
         for part in self._parts:
             part.add_transposed(padded, positions, normals, sums)
-        found = self._types.unpadded(sums, self._refined_count)
-        return found if self._refinement is None else self._refinement.transposed(found)
+        gradient = self._types.unpadded(sums, self._refined_count)
+        return gradient if self._refinement is None else self._refinement.transposed(gradient)
 
     def _padded(self, control_points: FloatBuffer) -> FloatBuffer:
-        """Padded control points, refined if need be."""
+        """Padded control points of the patches: refined if the table has a refinement."""
         points = control_points if self._refinement is None else self._refinement.product(control_points)
         return self._types.padded(points)
 
     def welded(self, positions: FloatBuffer) -> FloatBuffer:
-        """The positions, with both sides of a crease equal bit by bit; see `VertexTable.weld_target`."""
+        """Positions that are bitwise equal on both sides of a crease, see `VertexTable.weld_target`."""
         return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
 
     def _vectors(self) -> tuple[FloatBuffer, FloatBuffer]:
@@ -90,12 +90,13 @@ class VertexKernel:
 
 
 class _Part:
-    """Vertices on polynomials of the same monomials. A lane has a polynomial, and loops over its vertices."""
+    """Vertices on polynomials with the same monomials. Each lane loops over the vertices of one polynomial."""
 
     def __init__(self, types: ArrayTypes, part: VertexPolynomials, controls: IndexBuffer, are_rounded: bool) -> None:
         self._types, self._monomials = types, Monomials(part.powers.tolist())
         precision = dr.type_v(types.float)
-        # Where rounding is all that is left of tangents; in parts of the extent, and of the origin.
+        # Rounding error of the tangents, relative to the extent of the control points; and the least extent, relative
+        # to the first control point.
         self._rounding = types.floats((TANGENT_ROUNDING[precision] * part.tangent_weights)[part.block])
         self._least_extent = LEAST_EXTENT[precision] if are_rounded else 0
         self._rows = WeightRows(
@@ -111,13 +112,13 @@ class _Part:
             types.indices, (part.first_run, part.kind, part.first_vertex, part.first_entry, part.offset)
         )
         self._st = types.floats(part.st)
-        # Whether each polynomial has one vertex, as planes have: loops would take longer to trace than to run.
+        # Whether each polynomial has one vertex, as on planes: then a loop would take longer to trace than to run.
         self._are_single = len(part.kind) == len(part.block) and bool((np.diff(part.first_entry)[part.kind] == 1).all())
 
     def evaluate(
         self, padded: FloatBuffer, buffers: Sequence[FloatBuffer], padded_change: FloatBuffer | None = None
     ) -> None:
-        """Scatter points and normals, or how they change where control points do."""
+        """Scatter points and normals, or their directional derivatives for a change of the control points."""
         coefficients, bound = self._coefficients(padded)
         change = None if padded_change is None else self._rows.vectors(padded_change)[0]
 
@@ -137,7 +138,7 @@ class _Part:
     def add_transposed(
         self, padded: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer, sums: FloatBuffer
     ) -> None:
-        """Scatter-add gradients by padded control points, from those by points and normals."""
+        """Scatter-add gradients by padded control points, from the gradients by points and normals."""
         types = self._types
         coefficients, bound = self._coefficients(padded)
 
@@ -146,12 +147,12 @@ class _Part:
             p: Vector3 = dr.gather(types.vector3, positions, vertex)
             normal: Vector3 = dr.gather(types.vector3, normals, vertex)
             by_u, by_v = UnitNormal(du, dv, bound).backward(normal)
-            added = []
-            for (one, of_s, of_t), gradient in zip(self._monomials.each(s, t), gradients, strict=True):
-                own = dr.fma(p, one, gradient)
-                own = own if of_s is None else dr.fma(by_u, of_s, own)
-                added.append(own if of_t is None else dr.fma(by_v, of_t, own))
-            return tuple(added)
+            totals = []
+            for (monomial, monomial_s, monomial_t), gradient in zip(self._monomials.each(s, t), gradients, strict=True):
+                total = dr.fma(p, monomial, gradient)
+                total = total if monomial_s is None else dr.fma(by_u, monomial_s, total)
+                totals.append(total if monomial_t is None else dr.fma(by_v, monomial_t, total))
+            return tuple(totals)
 
         zero: Vector3 = dr.zeros(types.vector3, self._rows.count)
         gradients = self._loop(tuple(types.vector3(zero) for _ in self._monomials.powers), add, "vertex_gradients")
@@ -165,53 +166,53 @@ class _Part:
         return coefficients, RoundingBound(rounding, rounding, dr.maximum(extent, dr.abs(origin) * self._least_extent))
 
     def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
-        """Loop over the vertices of each lane's polynomial, of which the numbers and parameters are given."""
+        """Call ``add`` for each vertex of each lane's polynomial, with its index, its parameters and the state."""
         types = self._types
         lane: Index = dr.arange(types.index, self._rows.count)
 
-        def ends(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
+        def range_of(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
             return types.fetch(types.index, table, index), types.fetch(types.index, table, index + 1)
 
-        def at_entry(first_vertex: Index, entry: Index, *state) -> tuple:
+        def add_entry(first_vertex: Index, entry: Index, *state) -> tuple:
             vertex = first_vertex + types.fetch(types.index, self._offset, entry)
             s, t = types.fetch(types.vector2, self._st, entry)
             return add(vertex, s, t, *state)
 
-        def of_run(run: Index) -> tuple[Index, Index, Index]:
-            kind, first_vertex = (types.fetch(types.index, each, run) for each in (self._kind, self._first_vertex))
-            return first_vertex, *ends(self._first_entry, kind)
+        def vertices_of_run(run: Index) -> tuple[Index, Index, Index]:
+            kind, first_vertex = (types.fetch(types.index, column, run) for column in (self._kind, self._first_vertex))
+            return first_vertex, *range_of(self._first_entry, kind)
 
-        def over_runs(run: Index, *state) -> tuple:
-            first_vertex, first_entry, last_entry = of_run(run)
-            _, *found = dr.while_loop(
+        def add_run(run: Index, *state) -> tuple:
+            first_vertex, first_entry, last_entry = vertices_of_run(run)
+            _, *final_state = dr.while_loop(
                 (first_entry, *state),
                 lambda entry, *_: entry < last_entry,
-                lambda entry, *state: (entry + 1, *at_entry(first_vertex, entry, *state)),
+                lambda entry, *state: (entry + 1, *add_entry(first_vertex, entry, *state)),
                 label=f"{label}_of_run",
             )
-            return run + 1, *found
+            return run + 1, *final_state
 
         if self._are_single:
-            return at_entry(*of_run(lane)[:2], *start)
-        first_run, last_run = ends(self._first_run, lane)
-        _, *found = dr.while_loop((first_run, *start), lambda run, *_: run < last_run, over_runs, label=label)
-        return tuple(found)
+            return add_entry(*vertices_of_run(lane)[:2], *start)
+        first_run, last_run = range_of(self._first_run, lane)
+        _, *final_state = dr.while_loop((first_run, *start), lambda run, *_: run < last_run, add_run, label=label)
+        return tuple(final_state)
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedVertices:
-    """Vertices of a tessellation, with what their derivatives by the control points need."""
+    """Evaluated vertices of a tessellation, which can be attached to their control points."""
 
     kernel: VertexKernel
-    control_points: FloatBuffer  # That were evaluated, detached
+    control_points: FloatBuffer  # Control points at evaluation, detached
     # flat Dr.Jit float arrays, (3 vertex_count): points and unit normals; detached
     positions: FloatBuffer
     normals: FloatBuffer
 
     def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Positions and normals attached to control points if these have derivatives, without evaluating them.
+        """Attach positions and normals to control points if these are differentiated, without evaluating again.
 
-        Dr.Jit forgets a computation once gradients have passed through it, and the next gradient needs another.
+        Needed once for each gradient: Dr.Jit removes a computation from its graph once gradients have passed through.
 
         Returns positions, normals, flat Dr.Jit float arrays, (3 vertex_count).
         """
@@ -222,9 +223,9 @@ class EvaluatedVertices:
 
 
 class _Evaluation(dr.CustomOp):
-    """Control points to points and normals: linear maps to coefficients, points and tangents, and these' normals."""
+    """The map from control points to points and normals, for evaluated vertices."""
 
-    def eval(self, vertices, control_points):  # noqa: ARG002 - what derivatives are by
+    def eval(self, vertices, control_points):  # noqa: ARG002 - the argument of the derivatives
         self.vertices = vertices
         # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
         return type(vertices.positions)(vertices.positions), type(vertices.normals)(vertices.normals)
@@ -246,36 +247,37 @@ def coordinates_expected(count: int, control_count: int) -> str:
     return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"
 
 
-# Tangents are divided by their longest component before their cross product, which else could under- or overflow. A
-# component shorter than this means that the patch has collapsed to a point or a curve.
+# Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
+# nor overflows. A shorter tangent means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
+# Constants of `evaluation.normals`, by precision.
 TANGENT_ROUNDING = {dr.VarType.Float32: normals.TANGENT_ROUNDING[32], dr.VarType.Float64: normals.TANGENT_ROUNDING[64]}
 LEAST_EXTENT = {dr.VarType.Float32: normals.LEAST_EXTENT[32], dr.VarType.Float64: normals.LEAST_EXTENT[64]}
 
 
 @dataclass(frozen=True)
 class RoundingBound:
-    """What rounding may leave of two tangents, as sums of weighted points."""
+    """Rounding errors of two tangents, which are sums of weighted points."""
 
-    # Sum of the absolute weights in either tangent, times what rounding may leave of such a sum
+    # Sum of the absolute weights of each tangent, times the relative rounding error of such a sum
     weight_u: Float
     weight_v: Float
-    extent: Vector3  # Of the weighted points along each axis, from one of them
+    extent: Vector3  # Largest distance of the points from the first one, along each axis
 
 
 class UnitNormal:
-    """The normal along the cross product of two tangents: of unit length, or zero where these are parallel."""
+    """Unit normal along the cross product of two tangents; zero where these are parallel."""
 
     def __init__(
         self,
-        # Of any Dr.Jit type; not differentiated through: derivatives are `forward` and `backward`
+        # Tangents, of any Dr.Jit type, detached: derivatives are `forward` and `backward`
         du: Vector3,
         dv: Vector3,
-        # Of the tangents. Where rounding alone could have made the plane that the tangents span, the normal
-        # is zero, too, as in `evaluation.normals.unit_normals`.
+        # Rounding error of the tangents. The normal is also zero where tangents are parallel within this error, as in
+        # `evaluation.normals.unit_normals`.
         bound: RoundingBound | None = None,
     ) -> None:
-        # The tangents' lengths matter neither to the normal nor, but for these factors, to its derivative.
+        # The normal does not depend on the tangents' lengths; its derivative does by these factors.
         self._scale_u, self._scale_v = _scale(du), _scale(dv)
         self._du, self._dv = du * self._scale_u, dv * self._scale_v
         cross = dr.cross(self._du, self._dv)
@@ -285,10 +287,11 @@ class UnitNormal:
         self.value = cross * self._inverse_length
 
     def _rounding_of_cross(self, bound: RoundingBound) -> Float:
-        """Square of what rounding may leave of the cross product of parallel tangents."""
-        left_u, left_v = bound.weight_u * self._scale_u, bound.weight_v * self._scale_v
-        # For each product of two coordinates: those of one tangent times what rounding may leave of the other's.
-        a, b = dr.fma(dr.abs(self._du), left_v, dr.abs(self._dv) * left_u), bound.extent
+        """Squared rounding error of the cross product of parallel tangents."""
+        error_u, error_v = bound.weight_u * self._scale_u, bound.weight_v * self._scale_v
+        # Components of one tangent times the error of the other; products with the extent bound the error of each
+        # component.
+        a, b = dr.fma(dr.abs(self._du), error_v, dr.abs(self._dv) * error_u), bound.extent
         return (
             dr.square(dr.fma(a.y, b.z, a.z * b.y))
             + dr.square(dr.fma(a.z, b.x, a.x * b.z))
@@ -296,17 +299,17 @@ class UnitNormal:
         )
 
     def forward(self, change_u: Vector3, change_v: Vector3) -> Vector3:
-        """Change of the normal where the tangents change; zero where there is no normal."""
+        """Directional derivative of the normal for changes of the tangents; zero where there is no normal."""
         change = dr.cross(change_u * self._scale_u, self._dv) + dr.cross(self._du, change_v * self._scale_v)
         return self._across(change)
 
     def backward(self, gradient: Vector3) -> tuple[Vector3, Vector3]:
-        """Gradients by the tangents from that by the normal; zero where there is no normal."""
+        """Gradients by the tangents, from the gradient by the normal; zero where there is no normal."""
         across = self._across(gradient)
         return dr.cross(self._dv, across) * self._scale_u, dr.cross(across, self._du) * self._scale_v
 
     def _across(self, vector: Vector3) -> Vector3:
-        """The part of a vector across the normal, over the length of the cross product."""
+        """Component of a vector perpendicular to the normal, divided by the length of the cross product."""
         return (vector - self.value * dr.dot(self.value, vector)) * self._inverse_length
 
 

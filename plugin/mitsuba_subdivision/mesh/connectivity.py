@@ -12,44 +12,40 @@ from . import ragged
 from .ragged import first_indices, sorted_order
 from .sharpness import SemiSharpness
 
-# Integers of any width; docstrings name it where it matters.
+# Integers of any width; docstrings state the width where it matters.
 IntArray = NDArray[np.integer]
-# Numbers of half-edges, faces and edges: half the memory, and so, of large cages, half the time.
+# Indices of half-edges, faces and edges. int32 halves the memory, and on large cages the time.
 IndexArray = NDArray[np.int32]
-# Half-edges: many, or one.
+# An array of half-edges, or a single one.
 HalfEdges = NDArray[np.integer] | np.integer | int
 
 
 class VertexRule(IntEnum):
-    """The mask that moves a vertex when the mesh is refined, where the faces around it do not determine it.
+    """The mask of a vertex for refinement, where the faces around it do not determine it."""
 
-    AUTOMATIC: the smooth mask inside the mesh, the crease mask on a border. CORNER: none, the vertex stays. DART: the
-    smooth mask, though the crease that ends there is cut into two border edges.
-    """
-
-    AUTOMATIC = 0
-    CORNER = 1
-    DART = 2
+    AUTOMATIC = 0  # Smooth mask inside the mesh, crease mask on a border
+    CORNER = 1  # No mask: the vertex does not move
+    DART = 2  # Smooth mask, although the crease that ends at the vertex is cut into two border edges
 
 
 class Topology:
-    """Faces of a polygon mesh and the half-edges that join them.
+    """Half-edge connectivity of a polygon mesh.
 
     Half-edge ``h`` runs from ``face_vertices[h]`` to the next vertex of the same face, so that half-edges and face
-    corners (face-vertices) have the same numbers. Faces are counter-clockwise from outside. A half-edge has one twin at
-    most, which runs in the opposite direction; one without a twin lies on a border. The faces of a vertex are one fan:
-    they follow each other around it, from border to border or all around. Only the mesh that a control cage is made of
-    may have vertices of several fans, until it is cut.
+    corners (face-vertices) have the same numbers. Faces are counter-clockwise from outside. A half-edge has at most one
+    twin, which runs in the opposite direction; a half-edge without a twin lies on a border. The faces of a vertex form
+    one fan: they are consecutive around it, from border to border or all around. Only the uncut mesh of a control cage
+    may have vertices with several fans.
 
     Parameters
     ----------
     face_sizes : (n_f,) int64
         Number of corners of each face.
     face_vertices : (n_h,) int32
-        0-based vertices of all faces, one after the other.
+        0-based vertices of all faces, face by face.
     edge_names : (n_h,) int64, optional
-        A number for each half-edge that it shares with its twin alone. By default half-edges between the same two
-        vertices are twins. A dual mesh needs names, as two of its faces may share several edges.
+        A number for each half-edge, equal for twins only. By default half-edges between the same two vertices are
+        twins. A dual mesh needs names, as two of its faces may share several edges.
     rules : (n_v,) int8, optional
         A `VertexRule` for each vertex. By default all are automatic.
     semi_sharpness : SemiSharpness, optional
@@ -98,7 +94,7 @@ class Topology:
 
     @cached_property
     def next(self) -> IndexArray:
-        """``(n_h,)`` the half-edge that follows each one in its face."""
+        """``(n_h,)`` next half-edge of the face."""
         following = np.arange(1, self.half_edge_count + 1, dtype=np.int32)
         first, last = self._face_ends
         following[last] = following[first] - 1
@@ -106,7 +102,7 @@ class Topology:
 
     @cached_property
     def prev(self) -> IndexArray:
-        """``(n_h,)`` the half-edge that precedes each one in its face."""
+        """``(n_h,)`` previous half-edge of the face."""
         preceding = np.arange(-1, self.half_edge_count - 1, dtype=np.int32)
         first, last = self._face_ends
         preceding[first] = preceding[last] + 1
@@ -122,10 +118,10 @@ class Topology:
 
     @cached_property
     def _edges(self) -> tuple[IndexArray, IndexArray, int]:
-        """Edge and twin of each half-edge, and the number of edges."""
+        """Edge and twin of each half-edge, and the number of edges, as returned by `paired`."""
         if self.edge_names is not None:
             return paired(self.edge_names)
-        # Pairs of vertices are numbered as in a triangle with a row for each higher vertex: one bit less than a square.
+        # Pairs of vertices are numbered row by row in a lower triangle, which takes one bit less than in a square.
         end = self.face_vertices[self.next]
         high = np.maximum(self.face_vertices, end).astype(np.int64)
         return paired(high * (high + 1) // 2 + np.minimum(self.face_vertices, end))
@@ -151,17 +147,17 @@ class Topology:
 
     @cached_property
     def vertex_half_edge(self) -> IndexArray:
-        """``(n_v,)`` lowest outgoing half-edge of each vertex, -1 where no face uses it."""
+        """``(n_v,)`` lowest outgoing half-edge of each vertex, -1 if no face uses the vertex."""
         return first_indices(self.face_vertices, self.vertex_count)
 
     @cached_property
     def vertex_face_count(self) -> IndexArray:
-        """``(n_v,)`` faces at each vertex; in the interior this is the valence."""
+        """``(n_v,)`` number of faces at each vertex; for inner vertices this is the valence."""
         return np.bincount(self.face_vertices, minlength=self.vertex_count).astype(np.int32)
 
     @cached_property
     def open_fan_start(self) -> IndexArray:
-        """``(n_v,)`` outgoing half-edge on the border, the most clockwise one of each border vertex; -1 inside."""
+        """``(n_v,)`` outgoing border half-edge of each border vertex, its most clockwise one; -1 inside."""
         start = np.full(self.vertex_count, -1, dtype=np.int32)
         open_edges = np.flatnonzero(self.twin < 0)
         start[self.face_vertices[open_edges]] = open_edges
@@ -169,49 +165,49 @@ class Topology:
 
     @cached_property
     def open_fan_end(self) -> IndexArray:
-        """``(n_v,)`` half-edge on the border that ends at each border vertex; -1 inside."""
+        """``(n_v,)`` incoming border half-edge of each border vertex; -1 inside."""
         end = np.full(self.vertex_count, -1, dtype=np.int32)
         open_edges = np.flatnonzero(self.twin < 0)
         end[self.face_vertices[self.next[open_edges]]] = open_edges
         return end
 
     def border_neighbours(self, vertices: IntArray) -> tuple[IndexArray, IndexArray]:
-        """Neighbours along the border of vertices there: beside the most clockwise face, and beside the last one."""
+        """Return the border neighbours of border vertices: beside the most clockwise face, and beside the last."""
         first = self.next[self.open_fan_start[vertices]]
         return self.face_vertices[first], self.face_vertices[self.open_fan_end[vertices]]
 
     @cached_property
     def is_border_vertex(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether a border edge ends at the vertex."""
+        """``(n_v,)`` whether each vertex is on a border."""
         return self.ends_of(self.twin < 0)
 
     @property
     def is_semi_sharp_vertex(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether the vertex is semi-sharp, or an edge there, also one across a cut."""
+        """``(n_v,)`` whether each vertex, or an edge at it, is semi-sharp, including edges across a cut."""
         semi = self.semi_sharpness
         if semi is None:
             return np.zeros(self.vertex_count, dtype=bool)
-        found = self.ends_of(semi.edges > 0) | (semi.vertices > 0)
-        found[semi.across_vertex] = True
-        return found
+        is_semi_sharp = self.ends_of(semi.edges > 0) | (semi.vertices > 0)
+        is_semi_sharp[semi.across_vertex] = True
+        return is_semi_sharp
 
     def ends_of(self, is_chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether some half-edge begins or ends at the vertex; ``is_chosen`` selects half-edges."""
-        found = np.zeros(self.vertex_count, dtype=bool)
+        """Return ``(n_v,)``: whether one of the half-edges selected by ``is_chosen`` begins or ends at each vertex."""
+        is_end = np.zeros(self.vertex_count, dtype=bool)
         half_edges = np.flatnonzero(is_chosen)
-        found[self.face_vertices[half_edges]] = True
-        found[self.face_vertices[self.next[half_edges]]] = True
-        return found
+        is_end[self.face_vertices[half_edges]] = True
+        is_end[self.face_vertices[self.next[half_edges]]] = True
+        return is_end
 
     @cached_property
     def vertex_fans(self) -> tuple[IntArray, IndexArray]:
-        """Outgoing half-edges of every interior vertex, counter-clockwise from its lowest.
+        """Outgoing half-edges of every inner vertex, counter-clockwise from its lowest.
 
         Returns
         -------
         offsets : (n_v + 1,) int64
         half_edges : (n,) int32
-            Those of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; vertices on a border have none.
+            Entries of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; border vertices have none.
         """
         counts = np.where(self.is_border_vertex, 0, self.vertex_face_count)
         offsets = ragged.offsets(counts)
@@ -226,11 +222,11 @@ class Topology:
 
     @cached_property
     def vertex_rules(self) -> NDArray[np.int8]:
-        """``(n_v,)`` a `VertexRule` for each vertex."""
+        """``(n_v,)`` `VertexRule` of each vertex."""
         return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules
 
     def with_rules(self, rules: NDArray[np.int8] | None, semi_sharpness: SemiSharpness | None) -> Topology:
-        """The same mesh with other rules. It shares all that has been computed of the connectivity."""
+        """Return the same mesh with other rules. It shares the connectivity that is already computed."""
         same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules, semi_sharpness)
         for name, value in vars(self).items():
             if name not in ("rules", "vertex_rules", "semi_sharpness"):
@@ -238,32 +234,32 @@ class Topology:
         return same
 
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
-        """Half-edges of some faces in ascending order; ``is_chosen`` selects faces."""
+        """Return the half-edges of the faces selected by ``is_chosen``, in ascending order."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
 
     def turn(self, half_edge: HalfEdges) -> IndexArray:
-        """Outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
+        """Return the outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
         return self._turned[half_edge]
 
     @cached_property
     def _turned(self) -> IndexArray:
-        """``(n_h,)`` `turn` of each half-edge: looked up several times for each."""
+        """``(n_h,)`` `turn` of each half-edge; cached, as it is used several times."""
         return self.twin[self.prev]
 
     def turn_back(self, half_edge: HalfEdges) -> IndexArray:
-        """Outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
-        beyond = self.twin[half_edge]
-        # Indexing by () turns the zero-dimensional result for one half-edge into a number.
-        return np.where(beyond < 0, -1, self.next[beyond])[()]
+        """Return the outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
+        twin = self.twin[half_edge]
+        # Indexing by () converts the zero-dimensional result for one half-edge to a scalar.
+        return np.where(twin < 0, -1, self.next[twin])[()]
 
 
 def paired(
-    keys: IntArray,  # (n,) int: A number from 0 on that a half-edge shares with the others of its edge alone
+    keys: IntArray,  # (n,) int: number of each half-edge, from 0, equal for half-edges of the same edge only
 ) -> tuple[IndexArray, IndexArray, int]:
     """Join half-edges of equal keys into edges.
 
     Returns (n,) int32, the 0-based edge of each half-edge, in the order of the keys; (n,) int32, the other half-edge of
-    the edge, -1 if there is none, and where an edge has more than two, one of them; and the number of edges.
+    the edge, -1 if there is none, and one of them if the edge has more than two; and the number of edges.
     """
     order, begins = sorted_order(keys)
     edge, twin = np.empty_like(order), np.full_like(order, -1)

@@ -1,8 +1,8 @@
-"""Edges and vertices where a mesh is no oriented manifold, and their rules.
+"""Non-manifold edges and vertices of a mesh, and their rules.
 
-The rules are OpenSubdiv's (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
-`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). One step comes before them, which OpenSubdiv
-leaves to its users: faces that are wound against their neighbours are turned (`orientation`).
+The rules are those of OpenSubdiv (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
+`Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). Before they are applied, faces with a winding
+opposite to their neighbours' are reversed (`orientation`), which OpenSubdiv leaves to its users.
 """
 
 from __future__ import annotations
@@ -14,53 +14,53 @@ from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology
 
-# Faces with more corners than this are checked by sorting, vertices with more faces by pointer doubling.
+# Maximum number of corners of faces that are checked without sorting, and of faces of vertices that are checked without
+# pointer doubling.
 FEW_CORNERS = 8
 FEW_FACES = 200
 
 
 @dataclass(frozen=True, eq=False)
 class NonManifold:
-    """Edges and vertices that are no oriented manifold.
+    """Non-manifold edges and vertices.
 
-    An edge is non-manifold if it has more than two faces, if its two faces run along it in the same direction, if one
+    An edge is non-manifold if it has more than two faces, if its two faces traverse it in the same direction, if one
     face has it twice, or if it joins a vertex to itself. Non-manifold edges are infinitely sharp. A vertex is
-    non-manifold if it has such an edge or several fans. Then it is a corner, with one exception: a vertex of two
-    non-manifold edges and three fans or more, each of which runs from one of these edges to the other, lies on a crease
-    along the two.
+    non-manifold if it has a non-manifold edge or several fans. It is then a corner, with one exception: a vertex with
+    two non-manifold edges and three or more fans, each of which runs from one of these edges to the other, is on a
+    crease along these edges.
     """
 
-    # (n_h,) bool: whether each half-edge belongs to a non-manifold edge. None of these have twins.
+    # (n_h,) bool: whether the edge of each half-edge is non-manifold. These half-edges have no twins.
     is_edge: NDArray[np.bool_]
-    # (n_h,) bool: whether no other face shares the edge of each of these half-edges. An edge that joins a vertex to
-    # itself is the face's own, and so is an edge that the face has a second time.
+    # (n_h,) bool: whether the edge of each half-edge is non-manifold, but belongs to one face only. This includes edges
+    # that join a vertex to itself, and the second occurrence of an edge in a face.
     is_own_edge: NDArray[np.bool_]
-    # (n_h,) int32: A number for each half-edge that it shares with all half-edges between the same two vertices
-    edge: NDArray[np.int32]
+    edge: NDArray[np.int32]  # (n_h,) int32: edge of each half-edge, equal for all between the same two vertices
     is_vertex: NDArray[np.bool_]  # (n_v,) bool: whether each vertex is non-manifold
-    # (n_v,) bool: whether it lies on a crease of two non-manifold edges; the other non-manifold vertices are corners
+    # (n_v,) bool: whether each vertex is on a crease of two non-manifold edges; other non-manifold vertices are corners
     is_crease: NDArray[np.bool_]
-    closed_fans: IntArray  # (n,) int64: the lowest half-edge of every closed fan, at vertices of several fans
+    closed_fans: IntArray  # (n,) int64: lowest half-edge of every closed fan at vertices with several fans
 
     @property
     def is_corner(self) -> NDArray[np.bool_]:
-        """``(n_v,)`` whether each vertex is a corner because it is non-manifold."""
+        """``(n_v,)`` non-manifold vertices that are corners."""
         return self.is_vertex & ~self.is_crease
 
 
 def is_manifold(topology: Topology) -> bool:
-    """Whether a mesh is an oriented manifold, where no face has a vertex twice."""
+    """Return whether a mesh is an oriented manifold, and no face has a vertex twice."""
     t = topology
     if not _corners_differ(t):
         return False
-    # An edge with a twin counts for two half-edges, one without for one.
+    # An edge with twins accounts for two half-edges, an edge without for one.
     if 2 * t.edge_count - np.count_nonzero(t.twin < 0) != t.half_edge_count:
         return False
     return not runs_with_twin(t).any() and _has_single_fans(t)
 
 
 def _corners_differ(topology: Topology) -> bool:
-    """Whether no face has a vertex twice. Small faces that are all of one size are checked without sorting."""
+    """Return whether no face has a vertex twice. Small faces of a common size are checked without sorting."""
     size = topology.common_size
     if not 0 < size <= FEW_CORNERS:
         return not is_repeated(topology).any()
@@ -69,14 +69,14 @@ def _corners_differ(topology: Topology) -> bool:
 
 
 def is_repeated(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_h,)`` whether the vertex at each face corner is also at an earlier corner of the face."""
+    """Return ``(n_h,)``: whether the vertex at each face corner is also at an earlier corner of the face."""
     t = topology
-    # Equal vertices of a face become neighbours when (face, vertex) pairs are sorted.
+    # A (face, vertex) pair as one number.
     return _is_later(t.face.astype(np.int64) * t.vertex_count + t.face_vertices)
 
 
 def _is_later(keys: IntArray) -> NDArray[np.bool_]:
-    """Whether an equal key precedes each key."""
+    """Return whether an equal key precedes each key."""
     order = np.argsort(keys, kind="stable")
     later = np.zeros(len(keys), dtype=bool)
     later[order[1:]] = keys[order[1:]] == keys[order[:-1]]
@@ -84,15 +84,15 @@ def _is_later(keys: IntArray) -> NDArray[np.bool_]:
 
 
 def runs_with_twin(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_h,)`` whether each half-edge has a twin of the same direction."""
+    """Return ``(n_h,)``: whether each half-edge has a twin with the same direction."""
     t = topology
     return (t.twin >= 0) & (t.face_vertices == t.face_vertices[t.twin])
 
 
 def _has_single_fans(topology: Topology) -> bool:
-    """Whether the faces of each vertex are one fan.
+    """Return whether the faces of each vertex form one fan.
 
-    Turns about many vertices at once, by as many faces as each has. The fan must end then, and not before.
+    Walks around all vertices simultaneously. A fan must end after as many faces as its vertex has, and not before.
     """
     t = topology
     if t.vertex_face_count.max() > FEW_FACES:
@@ -111,12 +111,13 @@ def _has_single_fans(topology: Topology) -> bool:
 
 
 def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Number the fan of each face corner.
+    """Label the fan of each face corner.
 
-    Found by pointer doubling: after ``r`` rounds each corner knows of the next ``2**r`` corners counter-clockwise, so
-    that a vertex of many faces takes a few rounds more, and not a walk around it.
+    Uses pointer doubling: after ``r`` rounds each corner covers the next ``2**r`` corners counter-clockwise, so the
+    number of rounds is logarithmic in the number of faces of a vertex.
 
-    Returns (n_h,) int, equal for corners of one fan and different for others; and (n_h,) bool, true at one of each fan.
+    Returns (n_h,) int, a label that is equal for corners of one fan only, and (n_h,) bool, true at one corner of each
+    fan.
     """
     corners = np.arange(topology.half_edge_count)
     jump = topology.turn(corners)
@@ -132,22 +133,22 @@ def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
 
 
 def fan_counts(topology: Topology, is_first: NDArray[np.bool_]) -> IntArray:
-    """``(n_v,)`` number of fans at each vertex, given where one corner of each fan is."""
+    """Return ``(n_v,)`` number of fans at each vertex; ``is_first`` is true at one corner of each fan."""
     return np.bincount(topology.face_vertices[is_first], minlength=topology.vertex_count)
 
 
 def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
-    """The mesh with its non-manifold edges cut, and where it was no manifold; None if it was one."""
+    """Return the mesh with its non-manifold edges cut, and its `NonManifold`, None if the mesh is a manifold."""
     t = topology
     start, end = t.face_vertices, t.face_vertices[t.next]
     sides = np.bincount(t.edge, minlength=t.edge_count)
-    has_no_length = start == end
-    is_again = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)
-    is_odd = np.zeros(t.edge_count, dtype=bool)
-    is_odd[t.edge[has_no_length | is_again | runs_with_twin(t) | (sides[t.edge] > 2)]] = True
-    edges = is_odd[t.edge]
-    face_count = sides - np.bincount(t.edge[is_again], minlength=t.edge_count)
-    is_own_edge = edges & (has_no_length | is_again | (face_count[t.edge] == 1))
+    is_loop = start == end
+    is_second = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)
+    is_non_manifold = np.zeros(t.edge_count, dtype=bool)
+    is_non_manifold[t.edge[is_loop | is_second | runs_with_twin(t) | (sides[t.edge] > 2)]] = True
+    edges = is_non_manifold[t.edge]
+    face_count = sides - np.bincount(t.edge[is_second], minlength=t.edge_count)
+    is_own_edge = edges & (is_loop | is_second | (face_count[t.edge] == 1))
 
     separate = t
     if edges.any():
@@ -163,14 +164,14 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
         return separate, None
 
     def edges_at(half_edges: IntArray) -> IntArray:
-        """``(n_v,)`` number of some edges that end at each vertex, given one half-edge of each edge."""
+        """Return ``(n_v,)``: how many of some edges end at each vertex; ``half_edges`` has one of each edge."""
         return np.bincount(np.concatenate([start[half_edges], end[half_edges]]), minlength=t.vertex_count)
 
     edge_count = edges_at(t.edge_half_edge)
-    creases = vertices & (edges_at(t.edge_half_edge[is_odd]) == 2) & (t.vertex_face_count > edge_count)
+    creases = vertices & (edges_at(t.edge_half_edge[is_non_manifold]) == 2) & (t.vertex_face_count > edge_count)
     creases &= edges_at(np.flatnonzero(is_own_edge | (separate.twin < 0) & ~edges)) == 0
     begins = np.flatnonzero(edges)
-    comes_back = t.edge[begins] == t.edge[t.prev[fan[begins]]]
-    # A vertex with fans that do not run along the crease moves along it in OpenSubdiv; here it stays.
-    creases[start[begins[comes_back]]] = creases[start[closed]] = False
+    returns_to_edge = t.edge[begins] == t.edge[t.prev[fan[begins]]]
+    # Where some fans do not run along the crease, OpenSubdiv applies the crease mask; here the vertex is a corner.
+    creases[start[begins[returns_to_edge]]] = creases[start[closed]] = False
     return separate, NonManifold(edges, is_own_edge, t.edge, vertices, creases, closed)

@@ -1,16 +1,16 @@
-"""Ragged arrays: rows of different lengths, one after the other in one flat array.
+"""Ragged arrays: rows of different lengths, concatenated to one flat array.
 
-The faces of a polygon mesh are one, and the vertices at their corners its entries. Of the rows ``[a b c]``, ``[]`` and
-``[d e]``, with the lengths 3, 0 and 2:
+An example are the faces of a polygon mesh, whose entries are the vertices at their corners. For the rows ``[a b c]``,
+``[]`` and ``[d e]``, with lengths 3, 0 and 2:
 
 ============================  =============  ======================================
 ``starts(lengths)``           ``0 3 3``      where each row begins
-``offsets(lengths)``          ``0 3 3 5``    and, after them, where the last one ends
+``offsets(lengths)``          ``0 3 3 5``    the same, then where the last row ends
 ``index_in_row(lengths)``     ``0 1 2 0 1``  the index of each entry in its row
 ``ranges(first, lengths)``                   ``first, first + 1, ...`` in every row
 ============================  =============  ======================================
 
-A value for each row becomes one for each entry by ``np.repeat(values, lengths)``.
+``np.repeat(values, lengths)`` converts a value for each row to a value for each entry.
 """
 
 from __future__ import annotations
@@ -22,40 +22,40 @@ from numpy.typing import ArrayLike, NDArray
 
 IntArray = NDArray[np.integer]
 
-# Entries of a chunk.
+# Number of entries of a chunk of `chunks_of`.
 CHUNK_LENGTH = 1 << 14
 
 
 def starts(lengths: IntArray) -> NDArray[np.int64]:
-    """``(n,)`` flat index at which each row begins."""
+    """Return ``(n,)`` flat index at which each row begins."""
     return np.cumsum(lengths, dtype=np.int64) - lengths
 
 
 def offsets(lengths: ArrayLike, dtype: type[np.signedinteger] = np.int64) -> NDArray[np.signedinteger]:
-    """``(n + 1,)``: the entries of row ``i`` are ``offsets[i]`` up to ``offsets[i + 1]``."""
+    """Return ``(n + 1,)`` offsets: the entries of row ``i`` are ``offsets[i]`` up to ``offsets[i + 1]``."""
     lengths = np.asarray(lengths)
-    found = np.zeros(len(lengths) + 1, dtype=dtype)
-    np.cumsum(lengths, out=found[1:])
-    return found
+    row_offsets = np.zeros(len(lengths) + 1, dtype=dtype)
+    np.cumsum(lengths, out=row_offsets[1:])
+    return row_offsets
 
 
 def index_in_row(lengths: IntArray) -> NDArray[np.int64]:
-    """``(lengths.sum(),)`` the index of each entry in its row, from 0 on."""
-    found = np.repeat(starts(lengths), lengths)
-    return np.subtract(np.arange(len(found)), found, out=found)
+    """Return ``(lengths.sum(),)`` the 0-based index of each entry in its row."""
+    index = np.repeat(starts(lengths), lengths)
+    return np.subtract(np.arange(len(index)), index, out=index)
 
 
 def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
-    """``(lengths.sum(),)`` in every row the integers from ``first`` on, as many as the row is long."""
-    found = np.repeat(first - starts(lengths), lengths)
-    found += np.arange(len(found))
-    return found
+    """Return ``(lengths.sum(),)``: row ``i`` is ``first[i]`` up to ``first[i] + lengths[i]``."""
+    values = np.repeat(first - starts(lengths), lengths)
+    values += np.arange(len(values))
+    return values
 
 
 def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
-    """Successive slices of ``count`` entries, which bound temporary memory.
+    """Yield successive slices of ``count`` entries, to bound temporary memory.
 
-    Where each entry has some parts, so many times shorter.
+    Slices are ``parts`` times shorter, for entries of as many parts.
     """
     length = CHUNK_LENGTH // parts
     for begin in range(0, count, length):
@@ -63,26 +63,26 @@ def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
 
 
 def sorted_order(keys: IntArray) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Order ``(n,)`` that sorts integers from 0 on, equal ones by their place; and whether each, sorted, is new."""
+    """Return the stable sort order ``(n,)`` of non-negative keys, and whether each sorted key differs from the last."""
     bits = len(keys).bit_length()
     if int(keys.max(initial=0)) < 1 << (63 - bits):
-        # A key and its place fit into 63 bits. Numbers sort several times faster than indices into them.
-        in_order: IntArray = np.left_shift(keys, bits, dtype=np.int64)
-        in_order |= np.arange(len(keys))
-        in_order.sort()
-        order = (in_order & ((1 << bits) - 1)).astype(np.int32)
-        in_order >>= bits
+        # A key and its index fit into 63 bits. Sorting numbers is several times faster than `argsort`.
+        sorted_keys: IntArray = np.left_shift(keys, bits, dtype=np.int64)
+        sorted_keys |= np.arange(len(keys))
+        sorted_keys.sort()
+        order = (sorted_keys & ((1 << bits) - 1)).astype(np.int32)
+        sorted_keys >>= bits
     else:
         order = np.argsort(keys, kind="stable").astype(np.int32)
-        in_order = keys[order]
+        sorted_keys = keys[order]
     is_new = np.ones(len(keys), dtype=bool)
-    np.not_equal(in_order[1:], in_order[:-1], out=is_new[1:])
+    np.not_equal(sorted_keys[1:], sorted_keys[:-1], out=is_new[1:])
     return order, is_new
 
 
 def first_indices(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:
-    """``(count,)`` lowest index of each value from 0 on, -1 for a missing value."""
+    """Return ``(count,)``: the lowest index of each of the values ``0 .. count - 1``, -1 for a missing value."""
     first = np.full(count, -1, dtype=np.int32)
-    # Written backwards, as the last of several writes stays.
+    # Assigned backwards, as the last assignment to an entry is kept.
     first[values[::-1]] = np.arange(len(values) - 1, -1, -1, dtype=np.int32)
     return first

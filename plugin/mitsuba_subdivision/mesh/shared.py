@@ -1,4 +1,4 @@
-"""Values made once and shared: shapes of one topology share one set of tables."""
+"""Cache of shared values: shapes with the same topology share one set of tables."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Value = TypeVar("Value")
 
 
 class Content:
-    """An array as part of a key: equal to others with the same numbers, of the same type, in the same shape."""
+    """An array as part of a key. Arrays are equal if their values, types and shapes are equal."""
 
     __slots__ = ("_array", "_hash")
 
     def __init__(
         self,
-        array: NDArray | None,  # Not to be changed afterwards
+        array: NDArray | None,  # Must not be changed afterwards
     ) -> None:
         self._array = array
         self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array).data)))
@@ -41,56 +41,56 @@ class Content:
 
 @dataclass(frozen=True, eq=False)
 class SharedArray:
-    """An array as a value of `Shared`: on a device, or of NumPy."""
+    """An array as a value of `Shared`: on a device, or a NumPy array."""
 
     array: Any
 
 
 class LaterArray:
-    """An array as a value of `Shared` that is made when the value is there: what makes it may wait for Dr.Jit."""
+    """A value of `Shared` that creates its array later, for arrays whose creation may wait for Dr.Jit."""
 
-    # Without a dictionary, so that Dr.Jit does not take it for a shape's state.
+    # Without `__dict__`, so that Dr.Jit does not traverse it as a shape's state.
     __slots__ = ("__weakref__", "_array")
 
     def __init__(self) -> None:
         self._array: Any = None
 
     def get(self, make: Callable[[], Any]) -> Any:
-        """The array, made at the first call."""
+        """Return the array; the first call creates it."""
         if self._array is None:
             self._array = make()
         return self._array
 
 
 class Shared(Generic[Value]):
-    """Values by keys, each made at its first use and kept while it is referenced elsewhere."""
+    """Cache of values that are created at their first use and kept while they are referenced elsewhere."""
 
     def __init__(self) -> None:
         self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
-        # Of several threads that request a value, one makes it and others wait, those of other values do not. After an
-        # error, several may make it.
+        # A lock for each value in creation. If several threads request a value, one creates it and the others wait.
+        # Requests for other values are not blocked. After an error several threads may create the value.
         self._making: dict[Hashable, RLock] = {}
         self._lock = Lock()
 
     def get(
         self,
-        key: Hashable,  # Of what all of the value follows from. Held for as long as the value lives.
-        # Makes the value if there is none. It may request other values. It must not wait for Dr.Jit, which
-        # may begin other work meanwhile that asks for the same value.
+        key: Hashable,  # Determines the value. It is kept as long as the value.
+        # Creates the value. It may request other values. It must not wait for Dr.Jit, which may meanwhile start
+        # other work that requests the same value.
         make: Callable[[], Value],
     ) -> Value:
-        """The value of a key."""
+        """Return the value of a key; the first call creates it."""
         with self._lock:
-            found = self._values.get(key)
-            if found is not None:
-                return found
+            value = self._values.get(key)
+            if value is not None:
+                return value
             making = self._making.setdefault(key, RLock())
         with making:
-            found = self._values.get(key)
+            value = self._values.get(key)
             try:
-                if found is None:
-                    found = self._values[key] = make()
-                return found
+                if value is None:
+                    value = self._values[key] = make()
+                return value
             finally:
                 with self._lock:
                     self._making.pop(key, None)

@@ -1,15 +1,15 @@
-"""Sharpness of edges and vertices, infinite, or finite: below 10, which lasts for a number of refinements.
+"""Sharpness of edges and vertices. It is infinite from 10; below, it lasts for a number of refinements (semi-sharp).
 
-Three classes hold sharpness, each made from the one before:
+Three classes hold sharpness, each computed from the one before:
 
-`Sharpness` (`cuts`): of the control cage, from its tags.
-    One number for each edge and each vertex, infinite sharpness among them.
-`SemiSharpness`: of a mesh that is cut along its infinitely sharp edges.
-    Infinite sharpness is now in the mesh itself, as borders and corners. The rest is finite. Each refinement of the
-    mesh has its own (`SemiSharpness.refined`).
-`FanSharpness`: around one vertex, seen from one of its faces, as a part of a `Signature`.
-    The same numbers without those of vertices and edges: elements with equal ones share their limit stencils.
-    `one_ring` writes them onto its local mesh as a `SemiSharpness` again.
+`Sharpness` (`cuts`): sharpness of the control cage, from its tags.
+    One number for each edge and each vertex, including infinite sharpness.
+`SemiSharpness`: sharpness of a mesh that is cut along its infinitely sharp edges.
+    Infinite sharpness is represented by borders and corners of the mesh, so only finite sharpness remains. It is
+    computed for each refinement of the mesh (`SemiSharpness.refined`).
+`FanSharpness`: sharpness around one vertex, in order from one of its faces, as a part of a `Signature`.
+    It does not contain indices of vertices and edges, so that elements with equal signatures share limit stencils.
+    `one_ring` converts it to a `SemiSharpness` of the local mesh.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 IntArray = NDArray[np.integer]
 FloatArray = NDArray[np.float64]
 
-# From this sharpness on a feature is infinitely sharp, as in OpenSubdiv.
+# Least sharpness that is infinite, as in OpenSubdiv.
 INFINITE = 10.0
 
 CreaseMethod = Literal["uniform", "chaikin"]
@@ -33,21 +33,21 @@ CreaseMethod = Literal["uniform", "chaikin"]
 class SemiSharpness:
     """Semi-sharp edges and vertices of a mesh that is cut along its infinitely sharp edges.
 
-    Copies of a vertex on the two sides of a cut must move alike. So each also knows the semi-sharp edges *across* the
-    cut, which end at another copy of the vertex; it has a row for each of them.
+    Copies of a vertex on the two sides of a cut must have the same position. So each copy has a row for every
+    semi-sharp edge *across* the cut, which ends at another copy of the vertex.
     """
 
-    # (n_h,) float64: sharpness of the edge of each half-edge: both half-edges of an edge have the same. 0 for smooth
-    # edges and on borders.
+    # (n_h,) float64: sharpness of the edge of each half-edge, equal for both half-edges of an edge. 0 for smooth edges
+    # and on borders.
     edges: FloatArray
-    # (n_h,) float64: sharpness that the next refinement gives the half of the edge at which the half-edge begins
+    # (n_h,) float64: sharpness after the next refinement of the half of the edge at the origin of the half-edge
     edges_refined: FloatArray
     vertices: FloatArray  # (n_v,) float64: sharpness of each vertex
-    # (m,) int64: of semi-sharp edges across the cut, the vertex of the cut mesh that knows of the edge
-    across_vertex: IntArray
+    across_vertex: IntArray  # (m,) int64: vertex of the cut mesh, for each row of a semi-sharp edge across the cut
     across_sharpness: FloatArray  # (m,) float64: sharpness of the edge
-    across_refined: FloatArray  # (m,) float64: sharpness that the next refinement gives the half at the vertex
-    # (m,) bool: whether the edge makes the vertex sharp. If not, it only takes part in the averages of Chaikin's
+    # (m,) float64: sharpness after the next refinement of the half of the edge at the vertex
+    across_refined: FloatArray
+    # (m,) bool: whether the edge makes the vertex sharp. If not, it only contributes to the averages of Chaikin's
     # method.
     across_sharpens: NDArray[np.bool_]
 
@@ -55,7 +55,7 @@ class SemiSharpness:
     def decaying(
         cls,
         origin: IntArray,  # (n_h,) int: vertex at which each half-edge begins
-        # As `SemiSharpness` has them
+        # The following as in `SemiSharpness`
         edges: FloatArray,
         vertices: FloatArray,
         across_vertex: IntArray,
@@ -63,11 +63,10 @@ class SemiSharpness:
         across_sharpens: NDArray[np.bool_],
         method: CreaseMethod,
     ) -> SemiSharpness | None:
-        """Find the sharpness after the next refinement; None where nothing is sharp.
+        """Return the sharpness including that after the next refinement; None if nothing is sharp.
 
-        A refinement lowers each sharpness by one. Chaikin's method first replaces the sharpness of an edge by three
-        quarters of it and a quarter of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998], as
-        OpenSubdiv does.
+        A refinement lowers each sharpness by one. As in OpenSubdiv, Chaikin's method first replaces the sharpness of an
+        edge by 3/4 of it plus 1/4 of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998].
         """
         if not (edges.any() or vertices.any() or across_sharpness.any()):
             return None
@@ -75,9 +74,9 @@ class SemiSharpness:
         if method == "chaikin":
             vertex = np.concatenate([origin, across_vertex])
             total = np.bincount(vertex, sharpness, minlength=len(vertices))[vertex]
-            others = np.bincount(vertex, sharpness > 0, minlength=len(vertices))[vertex] - 1
-            mean = (total - sharpness) / np.maximum(others, 1)
-            averaged = np.where((sharpness > 0) & (others > 0), 0.75 * sharpness + 0.25 * mean, sharpness)
+            other_count = np.bincount(vertex, sharpness > 0, minlength=len(vertices))[vertex] - 1
+            mean = (total - sharpness) / np.maximum(other_count, 1)
+            averaged = np.where((sharpness > 0) & (other_count > 0), 0.75 * sharpness + 0.25 * mean, sharpness)
         edges_refined, across_refined = np.split(_lowered(averaged), [len(edges)])
         return cls(edges, edges_refined, vertices, across_vertex, across_sharpness, across_refined, across_sharpens)
 
@@ -88,33 +87,31 @@ class SemiSharpness:
 
     def refined(
         self,
-        # (n_h',): vertex at which each refined half-edge begins, and its sharpness: `edges_refined`, or 0 for
-        # new edges
-        origin: IntArray,
-        edges: FloatArray,
-        new_vertex_count: int,  # Number of vertices that are new
+        origin: IntArray,  # (n_h',) vertex at which each refined half-edge begins
+        edges: FloatArray,  # (n_h',) sharpness of each refined half-edge: `edges_refined`, or 0 for new edges
+        new_vertex_count: int,  # Number of vertices that the refinement adds after the present ones
         method: CreaseMethod,
     ) -> SemiSharpness | None:
-        """Sharpness of a refined mesh whose first vertices are those of this one."""
+        """Return the sharpness of the refined mesh."""
         vertices = np.concatenate([self.vertices_refined, np.zeros(new_vertex_count)])
-        # Edges that have become smooth are dropped: kept at 0, they would make signatures of equal surroundings differ.
+        # Edges that have become smooth are removed, so that signatures of equal surroundings are equal.
         kept = self.across_refined > 0
         across = self.across_vertex[kept], self.across_refined[kept], self.across_sharpens[kept]
         return SemiSharpness.decaying(origin, edges, vertices, *across, method)
 
 
-# Of a smooth edge in `FanSharpness`: one for all, as a fan may have very many.
+# Entry of a smooth edge in `FanSharpness.edges`. One shared tuple, as a fan may have very many smooth edges.
 SMOOTH_EDGE = 0.0, 0.0, 0.0
 
 
 class FanSharpness(NamedTuple):
-    """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on numbers of edges."""
+    """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on indices of edges."""
 
-    # (sharpness, sharpness of the refined half at the vertex, of the half at the other end) of the edges at which the
-    # faces of the fan begin, from the most clockwise face on
+    # (sharpness, refined sharpness of the half at the vertex, refined sharpness of the other half) of the first edge of
+    # each face of the fan, from the most clockwise face on
     edges: tuple[tuple[float, float, float], ...]
     vertex: float  # Sharpness of the vertex
-    # (sharpness, sharpness of the refined half at the vertex, whether the edge sharpens the vertex) of semi-sharp edges
+    # (sharpness, refined sharpness of the half at the vertex, whether the edge sharpens the vertex) of semi-sharp edges
     # across the cut, in increasing order
     across: tuple[tuple[float, float, bool], ...]
 

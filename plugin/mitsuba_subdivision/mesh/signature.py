@@ -1,9 +1,10 @@
 """Signatures: the shapes of one-rings, on which limit stencils depend.
 
-An element is what has a parameter domain of its own: a face, or under Doo-Sabin a vertex. A half-edge names it: the
-half-edge's face, whose parameters (0, 0) are where the half-edge begins; or the vertex where it begins, whose
-parameters (0, 0) are in the half-edge's face. The one-ring of a face is all faces that share a vertex with it; that of
-a vertex is all faces around it. The limit surface over an element depends on nothing else.
+An element is a part of the mesh with its own parameter domain: a face, or under Doo-Sabin a vertex. It is named by a
+half-edge, which also determines the corner with parameters (0, 0). A face element is the face of the half-edge, and
+(0, 0) is where the half-edge begins. A vertex element is the vertex where the half-edge begins, and (0, 0) is in the
+half-edge's face. The one-ring of a face is all faces that share a vertex with it. The one-ring of a vertex is all faces
+around it. The limit surface over an element depends on its one-ring only.
 """
 
 from __future__ import annotations
@@ -21,33 +22,33 @@ from .sharpness import SMOOTH_EDGE, FanSharpness, SemiSharpness
 ElementKind = Literal["face", "vertex"]
 Number = TypeVar("Number", int, IntArray)
 
-# Faces of a fan between two borders that matter to any one of them, see `TaggedFan.near`.
+# Maximum number of faces of an open fan in a one-ring, see `TaggedFan.near`.
 NEAR_FACES = 64
 
-# The half-edges at which the faces of a `TaggedFan` begin: those behind, then those ahead.
+# The half-edges at which the faces of a `TaggedFan` begin: `behind`, then `ahead`.
 FanHalfEdges = tuple[list[int], list[int]]
 
 
 class TaggedFan(NamedTuple):
-    """Faces around a vertex on a border, with its own rule or semi-sharp features, as one of them sees the others."""
+    """Faces around a vertex that is on a border, semi-sharp or has a rule, in order from one face, the first."""
 
-    ahead: tuple[int, ...]  # Sizes of the faces from this one on, counter-clockwise up to the border, or all around
-    behind: tuple[int, ...]  # Sizes of the faces on its other side, clockwise up to the border, without this one
+    ahead: tuple[int, ...]  # Sizes of the faces from the first on, counter-clockwise up to the border, or all around
+    behind: tuple[int, ...]  # Sizes of the other faces, clockwise from the first up to the border
     rule: VertexRule = VertexRule.AUTOMATIC
     is_closed: bool = False  # Whether the faces go all around
     sharpness: FanSharpness | None = None  # None where nothing is semi-sharp
 
     @property
     def is_open(self) -> bool:
-        """Whether the faces lie between two borders: those on both sides of the crease of a dart lie all around it."""
+        """Whether the faces lie between two borders. A dart is not open: faces on both sides of its crease interact."""
         return not self.is_closed and self.rule != VertexRule.DART
 
     def near(self) -> TaggedFan:
-        """The fan without the faces that are too far away to matter.
+        """Return the fan without faces whose influence on the first face is negligible.
 
-        The vertex of an open fan moves by its two neighbours on the borders, and what happens in one face reaches the
-        next ones with each refinement, by a small weight. So a large fan is cut down to a small one around the face,
-        whose last neighbours are still those on the borders (`OneRing.cut_fans`).
+        The vertex of an open fan depends on its two border neighbours only. A face influences only its neighbours at
+        each refinement, with a small weight. So a large fan is reduced to the `NEAR_FACES` around the first face; its
+        outermost neighbours remain those on the borders (`OneRing.cut_fans`).
         """
         if not self.is_open or self.sharpness is not None or fan_face_count(self) <= NEAR_FACES:
             return self
@@ -56,32 +57,31 @@ class TaggedFan(NamedTuple):
 
 
 def near_behind(ahead: Number, behind: Number) -> Number:
-    """How many of `NEAR_FACES` lie behind a face, in the middle of them but for borders: of numbers, or arrays."""
+    """Return how many of `NEAR_FACES` lie behind the first face, which is in their middle unless a border is near."""
     return np.minimum(behind, NEAR_FACES - np.minimum(ahead, NEAR_FACES // 2))
 
 
-# The faces around a vertex. Those of a smooth interior vertex are a tuple of their sizes, counter-clockwise from the
-# face that sees them.
+# The faces around a vertex. For a smooth inner vertex, the tuple of their sizes, counter-clockwise from the first face.
 Fan = tuple[int, ...] | TaggedFan
 
 
 def fan_is_closed(fan: Fan) -> bool:
-    """Whether the faces go all around the vertex."""
+    """Return whether the faces go all around the vertex."""
     return fan.is_closed if isinstance(fan, TaggedFan) else True
 
 
 def fan_face_count(fan: Fan) -> int:
-    """Number of faces."""
+    """Return the number of faces."""
     return len(fan.ahead) + len(fan.behind) if isinstance(fan, TaggedFan) else len(fan)
 
 
 def fan_turns(fan: Fan) -> range:
-    """Numbers of turns about a vertex that lead to the faces of its fan, one for each; positive counter-clockwise."""
+    """Return the number of turns about the vertex from the first face to each face; positive counter-clockwise."""
     return range(-len(fan.behind), len(fan.ahead)) if isinstance(fan, TaggedFan) else range(len(fan))
 
 
 def fan_size(fan: Fan, turns: int) -> int:
-    """Size of the face that a number of turns leads to."""
+    """Return the size of the face at a number of turns from the first face."""
     if isinstance(fan, TaggedFan):
         return fan.ahead[turns] if turns >= 0 else fan.behind[-1 - turns]
     return fan[turns]
@@ -89,13 +89,14 @@ def fan_size(fan: Fan, turns: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """Shape of a one-ring, as the half-edge that names the element sees it.
+    """Shape of a one-ring, in the order that the half-edge of the element determines.
 
-    Elements of equal signature have the same limit stencils over their one-rings.
+    Elements with equal signatures have the same limit stencils over their one-rings.
     """
 
     kind: ElementKind
-    # At each corner of the element, counter-clockwise, as the element sees it; of a vertex element, the faces around it
+    # For a face, the fans at its corners, counter-clockwise, each with the element as the first face. For a vertex, its
+    # one fan.
     fans: tuple[Fan, ...]
 
     def __eq__(self, other: object) -> bool:
@@ -108,7 +109,7 @@ class Signature:
 
     @cached_property
     def _hash(self) -> int:
-        # Fans may have very many faces.
+        # Cached, as fans may have very many faces.
         return hash((self.kind, self.fans))
 
     @property
@@ -118,22 +119,22 @@ class Signature:
 
     @property
     def sharpness(self) -> float:
-        """The greatest sharpness of all semi-sharp features; 0 if there are none."""
+        """Largest sharpness of all semi-sharp features; 0 if there are none."""
         tags = [fan.sharpness for fan in self.fans if isinstance(fan, TaggedFan) and fan.sharpness is not None]
         return max((max([tag.vertex, *(row[0] for row in tag.edges + tag.across)]) for tag in tags), default=0.0)
 
     def near(self) -> Signature:
-        """The same without faces that are too far away to matter, see `TaggedFan.near`."""
+        """Return the signature without faces whose influence is negligible, see `TaggedFan.near`."""
         return Signature(self.kind, tuple(fan.near() if isinstance(fan, TaggedFan) else fan for fan in self.fans))
 
     @cached_property
     def is_semi_sharp(self) -> bool:
-        """Whether it has semi-sharp features."""
+        """Whether there are semi-sharp features."""
         return any(isinstance(fan, TaggedFan) and fan.sharpness is not None for fan in self.fans)
 
     @property
     def smoothed(self) -> Signature:
-        """The same without semi-sharp features."""
+        """The signature without semi-sharp features."""
         return self._smoothed if self.is_semi_sharp else self
 
     @cached_property
@@ -141,7 +142,7 @@ class Signature:
         return Signature(self.kind, tuple(_fan_with(fan, None) for fan in self.fans))
 
     def rotated(self, corner: int) -> Signature:
-        """Return the signature of the same element, named by a later one of its corners, or of its vertex's faces."""
+        """Return the signature of the same element, named by a later corner, or face of its vertex."""
         if self.kind == "face":
             return Signature("face", self.fans[corner:] + self.fans[:corner])
         fan = self.fans[0]
@@ -156,13 +157,13 @@ class Signature:
 
 
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
-    """Read off the signature of one element."""
+    """Return the signature of one element."""
     fans = fan_half_edges(topology, half_edge, kind)
     return with_sharpness(smooth_signature(topology, fans, kind), topology, half_edges_around(fans))
 
 
 def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
-    """Half-edges of the fan at each corner of the element that a half-edge names."""
+    """Return the half-edges of the fan at each corner of the element named by ``half_edge``."""
     corners = [half_edge]
     if kind == "face":
         while (corner := int(topology.next[corners[-1]])) != half_edge:
@@ -171,17 +172,17 @@ def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> lis
 
 
 def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
-    """Half-edges of all fans, one fan after the other, each from its most clockwise half-edge on."""
+    """Return the half-edges of all fans, fan by fan, each from its most clockwise half-edge on."""
     return np.concatenate([np.array(behind[::-1] + ahead, dtype=np.int32) for behind, ahead in fans])
 
 
 def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
     def half_edges(current: int, step: Callable[[int], HalfEdges]) -> list[int]:
-        found: list[int] = []
-        while current >= 0 and not (found and current == half_edge):
-            found.append(current)
+        walked: list[int] = []
+        while current >= 0 and not (walked and current == half_edge):
+            walked.append(current)
             current = int(step(current))
-        return found
+        return walked
 
     ahead = half_edges(half_edge, topology.turn)
     is_closed = int(topology.turn(ahead[-1])) >= 0
@@ -189,12 +190,12 @@ def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
-    """Signature of an element without its semi-sharp features, given the half-edges of the fans at its corners."""
+    """Return the signature without semi-sharp features, given the half-edges of the fans at the element's corners."""
     return Signature(kind, tuple(_smooth_fan(topology, *fan) for fan in fans))
 
 
 def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
-    """The fan of some half-edges, without semi-sharp features."""
+    """Return the fan of these half-edges, without semi-sharp features."""
 
     def sizes(half_edges: list[int]) -> tuple[int, ...]:
         if topology.common_size:
@@ -209,7 +210,7 @@ def _smooth_fan(topology: Topology, behind: list[int], ahead: list[int]) -> Fan:
 
 
 def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
-    """The same fan with other semi-sharp features."""
+    """Return the fan with its semi-sharp features replaced."""
     if not isinstance(fan, TaggedFan):
         return fan if sharpness is None else TaggedFan(fan, (), is_closed=True, sharpness=sharpness)
     if sharpness is None and fan.is_closed and fan.rule == VertexRule.AUTOMATIC:
@@ -218,17 +219,17 @@ def _fan_with(fan: Fan, sharpness: FanSharpness | None) -> Fan:
 
 
 def with_sharpness(
-    smooth: Signature,  # Without them
+    smooth: Signature,  # Signature without semi-sharp features
     topology: Topology,
     around: IndexArray,  # (n,) int32: the result of `half_edges_around`
 ) -> Signature:
-    """Signature of an element with its semi-sharp features."""
+    """Return the signature of an element with its semi-sharp features."""
     semi = topology.semi_sharpness
     if semi is None:
         return smooth
     twins = topology.twin[around]
-    there = np.where(twins < 0, 0, semi.edges_refined[twins])
-    edges = list(zip(semi.edges[around].tolist(), semi.edges_refined[around].tolist(), there.tolist(), strict=True))
+    far_half = np.where(twins < 0, 0, semi.edges_refined[twins])
+    edges = list(zip(semi.edges[around].tolist(), semi.edges_refined[around].tolist(), far_half.tolist(), strict=True))
     vertices, fans, begin = topology.face_vertices[around].tolist(), [], 0
     for fan in smooth.fans:
         vertex, end = vertices[begin], begin + fan_face_count(fan)
@@ -237,14 +238,14 @@ def with_sharpness(
         is_sharp = sharpness.vertex or across or any(edge != SMOOTH_EDGE for edge in sharpness.edges)
         fans.append(_fan_with(fan, sharpness) if is_sharp else fan)
         begin = end
-    found = Signature(smooth.kind, tuple(fans))
-    # Caches the result of `smoothed`.
-    vars(found)["_smoothed"] = smooth
-    return found
+    signature = Signature(smooth.kind, tuple(fans))
+    # Cache the result of `smoothed`.
+    vars(signature)["_smoothed"] = smooth
+    return signature
 
 
 def _across(semi: SemiSharpness, vertex: int) -> tuple[tuple[float, float, bool], ...]:
-    """Semi-sharp edges across the cut at a vertex, as `FanSharpness` has them."""
-    at = semi.across_vertex == vertex
+    """Return `FanSharpness.across` of a vertex."""
+    is_at_vertex = semi.across_vertex == vertex
     columns = semi.across_sharpness, semi.across_refined, semi.across_sharpens
-    return tuple(sorted(zip(*(values[at].tolist() for values in columns), strict=True)))
+    return tuple(sorted(zip(*(values[is_at_vertex].tolist() for values in columns), strict=True)))

@@ -19,39 +19,39 @@ from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Ti
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-# Pieces are divided until they are as flat as this, thickness over length, but at most this many times.
+# Pieces are halved until the thickness of their boxes over the length is at most FLAT, but at most MOST_HALVINGS times.
 FLAT, MOST_HALVINGS = 0.05, 4
-# Pieces around extraordinary points are kept up to this many, about a kilobyte each. Those of further levels are made
-# whenever they are needed.
+# Most pieces that are kept in memory for levels around extraordinary points, at about a kilobyte per piece. Pieces of
+# deeper levels are computed whenever a query needs them.
 MOST_KEPT = 200_000
-# A piece in which the distance to a point may have several minima is divided, but at most this many times.
+# Most times that a piece in which the distance to a point may have several minima is halved.
 MOST_CONVEX_HALVINGS = 3
-# Where the distance falls no faster than this along the surface, it has a minimum.
+# A location is a minimum where the distance falls no faster than this along the surface, see `slopes`.
 FLAT_SLOPE = 1e-10
-# Around extraordinary points pieces of further levels are tried, while they may be nearer, until they are as small as
-# this, in sizes of the patch. The point itself stands for the rest.
+# Size, relative to the patch, down to which levels around an extraordinary point are searched. The point itself stands
+# for the smaller ones.
 SMALLEST = 2.0**-44
-# A search begins at a known point whose distance exceeds that of the nearest by at most this ratio. Far from the
-# surface the nearest itself takes much longer to find.
+# Relative excess over the least distance of the known point at which a search begins. Far from the surface, finding
+# the nearest known point takes much longer.
 NEARLY = 0.02
-# Points are processed in runs of this many, which bounds temporary memory to some hundred megabytes.
+# Points per run of a query, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
-# Undivided parts are tried for this many pairs of a point and a part at once.
+# Most pairs of a point and an undivided part that are searched at once.
 MOST_TRIALS = 1 << 11
 
 _Boxed = TypeVar("_Boxed", PolynomialPieces, ElementParts)
 
-# Children of a node.
+# Children of a node of `BoxTree`.
 WIDTH = 8
-# Bits of each coordinate along the curve that boxes are sorted along.
+# Bits per coordinate of the Morton codes by which boxes are sorted.
 CURVE_BITS = 20
-# Pairs of a point and a box are tested together up to this many, so that arrays stay in a processor's cache.
+# Most pairs of a point and a box that are tested together, so that arrays stay in a processor's cache.
 MOST_PAIRS = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
 class ClosestPoints:
-    """Points of a surface that are nearest to others.
+    """The points of a surface that are nearest to the points of a query.
 
     Attributes
     ----------
@@ -74,9 +74,9 @@ class ClosestPoints:
 class ClosestPointSearch:
     """Finds nearest points of a surface.
 
-    The surface is divided into flat polynomial pieces, each in a turned box. A first distance is that to the piece with
-    the nearest middle. All pieces whose boxes are no further away than that are tried, by Newton's method within them;
-    around an extraordinary point, pieces of one level after the other.
+    The surface is divided into nearly flat polynomial pieces, each in an oriented box. The nearest middle of a piece
+    gives a first distance. Newton's method then finds the least distance within every piece whose box is no further
+    away; around an extraordinary point, level by level.
     """
 
     def __init__(self, pieces: SurfacePieces) -> None:
@@ -91,24 +91,24 @@ class ClosestPointSearch:
         self._size = float(pieces.sizes.max())
         self._pieces, self._boxes = _flat_pieces(PolynomialPieces.joined(parts), ROUNDED * self._size)
         boxes = [self._pieces.box()]
-        # Points of the surface and their locations; those in the middle of the pieces first.
+        # Points of the surface and their locations: first the middles of `_pieces`, then points of the tips.
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             boxes.append(_boxes_around(tips, first_level))
             known += [(tips.points, tips.half_edge, tips.offsets), tips.level(first_level).middles()]
         boxes += [parts.box() for parts in self._undivided]
-        self._tree = BoxTree.build(*(np.concatenate(each) for each in zip(*boxes, strict=True)))
-        points, self._start, self._uv = (np.concatenate(each) for each in zip(*known, strict=True))
+        self._tree = BoxTree.build(*map(np.concatenate, zip(*boxes, strict=True)))
+        points, self._start, self._uv = map(np.concatenate, zip(*known, strict=True))
         self._known: cKDTree = cKDTree(points)
 
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """Locations of the points nearest to some points ``(s, 3)``.
+        """Locate the nearest points of the surface to ``(s, 3)`` points.
 
-        Returns ``half_edge``, (s,) int64: the corner of an element where parameters begin, a half-edge of
+        Returns ``half_edge``, (s,) int64: the corner of an element at which parameters start, a half-edge of
         `PatchTable.elements`; and ``uv``, (s, 2) float64.
         """
-        found = [self._nearest(part) for part in np.split(points, range(CHUNK, len(points), CHUNK))]
-        half_edge, uv = zip(*found, strict=True)
+        locations = [self._nearest(run) for run in np.split(points, range(CHUNK, len(points), CHUNK))]
+        half_edge, uv = zip(*locations, strict=True)
         return np.concatenate(half_edge), np.concatenate(uv)
 
     def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
@@ -123,8 +123,8 @@ class ClosestPointSearch:
         best.try_pieces(point[is_piece], self._pieces, leaf[is_piece], self._boxes)
         point, leaf = point[~is_piece], leaf[~is_piece] - len(self._pieces)
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
-            own = (leaf >= 0) & (leaf < len(tips))
-            best.try_tips(point[own], tips, leaf[own], first_level)
+            is_tip = (leaf >= 0) & (leaf < len(tips))
+            best.try_tips(point[is_tip], tips, leaf[is_tip], first_level)
             leaf = leaf - len(tips)
         if self._undivided:
             is_undivided = leaf >= 0
@@ -132,33 +132,36 @@ class ClosestPointSearch:
         return best.half_edge, best.uv
 
     def _try_undivided(self, best: _Best, points: FloatArray, point: IntArray, part: IntArray) -> None:
-        """Find the least distance in undivided parts, each for a point, the nearest ones first."""
+        """Find the least distance in undivided parts, given as pairs of a point and a part, nearest boxes first."""
         lower, upper = (np.concatenate(side) for side in zip(*(parts.box() for parts in self._undivided), strict=True))
         gaps = squared_gaps(points[point], lower[part], upper[part])
         order = np.lexsort((gaps, point))
         is_first = np.diff(point[order], prepend=-1) != 0
-        others = order[~is_first]
-        others = others[np.argsort(gaps[others])]
-        counts = np.cumsum([len(parts) for parts in self._undivided])
-        for chosen in (order[is_first], *np.split(others, range(MOST_TRIALS, len(others), MOST_TRIALS))):
-            near = chosen[gaps[chosen] <= best.reach[point[chosen]]]
-            group = np.searchsorted(counts, part[near], side="right")
+        later = order[~is_first]
+        later = later[np.argsort(gaps[later])]
+        ends = np.cumsum([len(parts) for parts in self._undivided])
+        for pairs in (order[is_first], *np.split(later, range(MOST_TRIALS, len(later), MOST_TRIALS))):
+            near = pairs[gaps[pairs] <= best.reach[point[pairs]]]
+            group = np.searchsorted(ends, part[near], side="right")
             best.try_undivided(
                 [
-                    (point[near[group == number]], parts, part[near[group == number]] - end + len(parts))
-                    for number, (parts, end) in enumerate(zip(self._undivided, counts.tolist(), strict=True))
+                    (point[near[group == index]], parts, part[near[group == index]] - end + len(parts))
+                    for index, (parts, end) in enumerate(zip(self._undivided, ends.tolist(), strict=True))
                 ]
             )
 
 
 class _Best:
-    """The nearest locations so far of some points."""
+    """The nearest locations found so far for the points of a query.
+
+    The methods take pairs of a point and a piece (tip, part) as two index arrays, ``point`` and ``which``.
+    """
 
     def __init__(
         self,
         points: FloatArray,  # (s, 3) float64
-        size: float,  # Of the coordinates
-        # Of known locations, see `ClosestPointSearch.nearest`
+        size: float,  # Largest absolute coordinate, for the rounding error
+        # Initial locations, see `ClosestPointSearch.nearest`
         squared_distance: FloatArray,
         half_edge: NDArray[np.int64],
         uv: FloatArray,
@@ -169,7 +172,7 @@ class _Best:
 
     @property
     def reach(self) -> FloatArray:
-        """``(s,)`` squared distances within which a point as near may be, with their rounding error."""
+        """``(s,)`` squared distances so far plus their rounding error: boxes further away hold no nearer point."""
         return self._squared_distance + self._rounded(self._squared_distance)
 
     def _rounded(self, squared_distance: FloatArray) -> FloatArray:
@@ -177,7 +180,7 @@ class _Best:
         return rounded * (2 * np.sqrt(squared_distance) + rounded)
 
     def descend(self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes) -> None:
-        """Descend to the least distance in pieces, each for a point, as if there were only one minimum in each."""
+        """Descend to a minimum of the distance in pieces, as if each piece had only one."""
         if not len(point):
             return
         points = self._points[point]
@@ -188,7 +191,7 @@ class _Best:
     def try_pieces(
         self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes | None = None
     ) -> None:
-        """Find the least distance in pieces, each for a point; boxes around them are made where they are not given."""
+        """Find the least distance in pieces; without ``boxes``, compute those around the pieces."""
         for halving in range(MOST_CONVEX_HALVINGS + 1):
             if boxes is None:
                 point, pieces, which = self._near(point, pieces, which)
@@ -199,35 +202,35 @@ class _Best:
             is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[which]
             is_convex = boxes.are_convex(away, which) | is_tiny | (halving == MOST_CONVEX_HALVINGS)
             is_last = is_convex.copy()
-            # Where the nearest location so far lies in such a piece, and is a minimum, it is that of the piece.
+            # If the nearest location so far lies in a convex piece and is a minimum, the piece has no other.
             is_last[is_last] = ~self._are_minima(point[is_last], pieces, which[is_last])
             self.descend(point[is_last], pieces, which[is_last], boxes)
             left = ~is_convex & (squared_distance <= self.reach[point])
             if not left.any():
                 return
-            used, own = _numbered(which[left], len(pieces))
+            used, which_used = _numbered(which[left], len(pieces))
             pieces, boxes = pieces.chosen(used).halved(), None
-            point, which = np.tile(point[left], 4), (own + len(used) * np.arange(4)[:, None]).ravel()
+            point, which = np.tile(point[left], 4), (which_used + len(used) * np.arange(4)[:, None]).ravel()
 
     def _near(self, point: IntArray, parts: _Boxed, which: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
-        """Those pairs of a point and a part whose box along the axes may hold a point as near, and their parts."""
+        """Pairs whose axis-aligned box is within reach. Returns points, the parts in use, and indices into these."""
         lower, upper = parts.box()
         gaps = squared_gaps(self._points.take(point, axis=0), lower.take(which, axis=0), upper.take(which, axis=0))
         is_near = gaps <= self.reach.take(point)
-        used, own = _numbered(which[is_near], len(parts))
-        return point[is_near], parts.chosen(used), own
+        used, which_used = _numbered(which[is_near], len(parts))
+        return point[is_near], parts.chosen(used), which_used
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
-        """Whether the nearest locations so far are minima in the interior of the surface and lie in given pieces."""
+        """Whether the nearest locations so far lie in their pieces and are minima along the surface."""
         away = self.uv[point] - pieces.offsets[which]
         (a, b), (c, d) = pieces.matrices[which].transpose(1, 2, 0)
-        own = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
-        own /= (a * d - b * c)[:, None]
-        is_inside = (self.half_edge[point] == pieces.half_edge[which]) & (pieces.basis.domain.inside(own) >= 0)
+        uv_in_piece = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
+        uv_in_piece /= (a * d - b * c)[:, None]
+        is_inside = (self.half_edge[point] == pieces.half_edge[which]) & (pieces.basis.domain.inside(uv_in_piece) >= 0)
         return is_inside & (self._slope[point] <= FLAT_SLOPE * np.sqrt(self._squared_distance[point]))
 
     def try_tips(self, point: IntArray, tips: Tips, which: IntArray, first_level: int) -> None:
-        """Find the least distance in tips, each for a point, from a level on."""
+        """Find the least distance in tips, from level ``first_level`` on."""
         if not len(point):
             return
         difference = self._points[point] - tips.points[which]
@@ -238,7 +241,7 @@ class _Best:
         tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
             reach = tips.reach(level)
-            lower, upper = (each.take(which, axis=0) for each in (tips.points - reach, tips.points + reach))
+            lower, upper = (side.take(which, axis=0) for side in (tips.points - reach, tips.points + reach))
             is_near = squared_gaps(self._points[point], lower, upper) <= self.reach[point]
             point, which = point[is_near], which[is_near]
             if not len(point):
@@ -247,71 +250,74 @@ class _Best:
             tips = tips.chosen(used)
             pieces = tips.level(level)
             count = len(pieces) // len(tips)
-            of_child = (which + len(tips) * np.arange(count)[:, None]).ravel()
-            self.try_pieces(np.tile(point, count), pieces, of_child)
+            which_piece = (which + len(tips) * np.arange(count)[:, None]).ravel()
+            self.try_pieces(np.tile(point, count), pieces, which_piece)
 
     def try_undivided(self, pairs: list[tuple[IntArray, ElementParts, IntArray]]) -> None:
-        """Find the least distance in parts, each for a point: divide those that may be near enough, all together."""
+        """Find the least distance in undivided parts: divide those within reach, all together, until none is left."""
         while pairs:
-            found: list[tuple[IntArray, Any, IntArray]] = []
+            child_pairs: list[tuple[IntArray, Any, IntArray]] = []
             for point, parts, which in pairs:
-                own_point, near, own = self._near(point, parts, which)
-                if len(own_point):
-                    found += [(own_point, child, own) for child in near.children()]
-            pieces = _joined_pairs([each for each in found if isinstance(each[1], PolynomialPieces)])
-            for point, own, which in pieces:
-                self.try_pieces(point, own, which)
-            for point, own, which in _joined_pairs([each for each in found if isinstance(each[1], Tips)], "patch"):
-                self.try_tips(point, own, which, 0)
-            pairs = _joined_pairs([each for each in found if isinstance(each[1], ElementParts)], "element")
+                near_point, near_parts, which_near = self._near(point, parts, which)
+                if len(near_point):
+                    child_pairs += [(near_point, child, which_near) for child in near_parts.children()]
+            for point, pieces, which in _joined_pairs(
+                [pair for pair in child_pairs if isinstance(pair[1], PolynomialPieces)]
+            ):
+                self.try_pieces(point, pieces, which)
+            for point, tips, which in _joined_pairs(
+                [pair for pair in child_pairs if isinstance(pair[1], Tips)], "patch"
+            ):
+                self.try_tips(point, tips, which, 0)
+            pairs = _joined_pairs([pair for pair in child_pairs if isinstance(pair[1], ElementParts)], "element")
 
     def _take(
         self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
     ) -> None:
-        """Take over nearer locations; of equally near ones, that whose difference is more along the normal.
+        """Take over nearer locations; among equally near ones, the one with the least slope.
 
-        Adjacent pieces share points. Where the nearest point is beside their edge by a little, a point on the edge may
-        be as near but for rounding.
+        Adjacent pieces share the points of their edge. If the nearest point is just beside the edge, a point on the
+        edge may be equally near up to rounding.
         """
         least = self._squared_distance.copy()
         np.minimum.at(least, point, squared)
         limit = least + self._rounded(least)
         self._slope[self._squared_distance > limit] = np.inf
-        which = np.flatnonzero(squared <= limit[point])
-        # The best of each point first.
-        which = which[np.lexsort((slope[which], point[which]))]
-        which = which[np.flatnonzero(np.diff(point[which], prepend=-1))]
-        which = which[slope[which] < self._slope[point[which]]]
-        at = point[which]
-        self._squared_distance[at], self._slope[at] = squared[which], slope[which]
-        self.half_edge[at], self.uv[at] = half_edge[which], uv[which]
+        candidates = np.flatnonzero(squared <= limit[point])
+        # Keep the candidate of least slope of each point.
+        candidates = candidates[np.lexsort((slope[candidates], point[candidates]))]
+        candidates = candidates[np.flatnonzero(np.diff(point[candidates], prepend=-1))]
+        candidates = candidates[slope[candidates] < self._slope[point[candidates]]]
+        updated = point[candidates]
+        self._squared_distance[updated], self._slope[updated] = squared[candidates], slope[candidates]
+        self.half_edge[updated], self.uv[updated] = half_edge[candidates], uv[candidates]
 
 
 def _joined_pairs(
     pairs: list[tuple[IntArray, Any, IntArray]], name: str | None = None
 ) -> list[tuple[IntArray, Any, IntArray]]:
-    """Points and parts in pairs, those of the same attribute of some name together."""
-    found = []
+    """Join the pairs of a point and a part; with ``name``, only those whose parts have equal attributes ``name``."""
+    joined = []
     for group in alike(pairs, lambda pair: None if name is None else getattr(pair[1], name)):
         points, parts, which = zip(*group, strict=True)
-        first = ragged.starts(np.array([len(each) for each in parts]))
-        numbers = [own + begin for own, begin in zip(which, first.tolist(), strict=True)]
-        found.append((np.concatenate(points), type(parts[0]).joined(parts), np.concatenate(numbers)))
-    return found
+        first = ragged.starts(np.array([len(part) for part in parts]))
+        which_joined = [index + begin for index, begin in zip(which, first.tolist(), strict=True)]
+        joined.append((np.concatenate(points), type(parts[0]).joined(parts), np.concatenate(which_joined)))
+    return joined
 
 
 def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:
-    """Distinct ones of some numbers below a count, and the index of each number among these."""
+    """`numpy.unique` with `return_inverse`, of indices below ``count``, in linear time."""
     is_used = np.zeros(count, dtype=bool)
     is_used[which] = True
     used = np.flatnonzero(is_used)
-    place = np.empty(count, dtype=np.int64)
-    place[used] = np.arange(len(used))
-    return used, place[which]
+    position = np.empty(count, dtype=np.int64)
+    position[used] = np.arange(len(used))
+    return used, position[which]
 
 
 def _first_levels(pieces: SurfacePieces) -> list[int]:
-    """For each of the tips, the first level whose pieces are made when they are needed."""
+    """For each of the tips, the first level whose pieces are not kept, but computed when a query needs them."""
     most = max((tips.bounded_levels for tips in pieces.tips), default=0)
     per_level = sum(3 * len(tips) for tips in pieces.tips)
     kept = min(most, max(MOST_KEPT - len(pieces.regular), 0) // max(per_level, 1))
@@ -319,7 +325,7 @@ def _first_levels(pieces: SurfacePieces) -> list[int]:
 
 
 def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]:
-    """Corners ``(t, 3)`` of boxes around tips from a level on."""
+    """Corners ``(t, 3)`` of boxes around tips, from level ``first_level`` on."""
     reach = tips.reach(tips.bounded_levels)
     lower, upper = tips.points - reach, tips.points + reach
     for level in range(first_level, tips.bounded_levels):
@@ -330,7 +336,7 @@ def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]
 
 
 def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPieces, TurnedBoxes]:
-    """Pieces divided until they are flat but for rounding, and boxes around them."""
+    """Halve pieces until they are flat up to rounding. Returns them and boxes around them."""
     done: list[tuple[PolynomialPieces, TurnedBoxes]] = []
     for halving in range(MOST_HALVINGS + 1):
         boxes = TurnedBoxes.around(pieces)
@@ -339,20 +345,20 @@ def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPi
             is_flat[:] = True
         done.append((pieces.chosen(is_flat), boxes.chosen(is_flat)))
         pieces = pieces.chosen(~is_flat).halved()
-    return PolynomialPieces.joined(each for each, _ in done), TurnedBoxes.joined(each for _, each in done)
+    return PolynomialPieces.joined(flat for flat, _ in done), TurnedBoxes.joined(boxes for _, boxes in done)
 
 
 @dataclass(frozen=True, eq=False)
 class BoxTree:
-    """Boxes with sides along the axes, sorted along a curve; ``WIDTH`` consecutive ones share a parent."""
+    """A hierarchy of axis-aligned boxes, sorted by Morton codes; ``WIDTH`` consecutive boxes share a parent."""
 
-    order: IntArray  # (n,) int64: the boxes in the order of the leaves
-    # tuple of ((m, 3), (m, 3)) float64: corners of the boxes of all nodes, the leaves first
+    order: IntArray  # (n,) int64: indices of the boxes in the order of the leaves
+    # tuple of ((m, 3), (m, 3)) float64: lower and upper corners of the boxes of each level, the leaves first
     levels: tuple[tuple[FloatArray, FloatArray], ...]
 
     @classmethod
     def build(cls, lower: FloatArray, upper: FloatArray) -> BoxTree:
-        """Sort boxes ``(n, 3)``, at least one."""
+        """Build the hierarchy of boxes with corners ``(n, 3)``, at least one."""
         order = np.argsort(_along_curve((lower + upper) / 2), kind="stable")
         levels = [(lower[order], upper[order])]
         while len(levels[-1][0]) > WIDTH:
@@ -366,10 +372,7 @@ class BoxTree:
         points: FloatArray,  # (s, 3) float64
         squared_distance: FloatArray,  # (s,) float64
     ) -> tuple[IntArray, IntArray]:
-        """Pairs of a point and a box that is no further from it than a distance of its own.
-
-        Returns point, box, (n,) int64.
-        """
+        """Find all pairs of a point and a box within the point's distance. Returns point, box, (n,) int64."""
         point = np.repeat(np.arange(len(points)), len(self.levels[-1][0]))
         node = np.tile(np.arange(len(self.levels[-1][0])), len(points))
         return self._below(points, squared_distance, point, node, len(self.levels) - 1)
@@ -377,28 +380,28 @@ class BoxTree:
     def _below(
         self, points: FloatArray, squared_distance: FloatArray, point: IntArray, node: IntArray, level: int
     ) -> tuple[IntArray, IntArray]:
-        """Pairs at the leaves below some nodes of a level."""
-        for at in range(level, -1, -1):
+        """Pairs of a point and a leaf below the given pairs of a point and a node of ``level``."""
+        for depth in range(level, -1, -1):
             if len(point) > MOST_PAIRS:
                 half = len(point) // 2
                 parts = [
-                    self._below(points, squared_distance, point[side], node[side], at)
+                    self._below(points, squared_distance, point[side], node[side], depth)
                     for side in (slice(half), slice(half, None))
                 ]
                 return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-            low, high = self.levels[at]
+            low, high = self.levels[depth]
             gaps = squared_gaps(points.take(point, axis=0), low.take(node, axis=0), high.take(node, axis=0))
             keep = gaps <= squared_distance.take(point)
             point, node = point[keep], node[keep]
-            if at:
+            if depth:
                 point, node = np.repeat(point, WIDTH), (WIDTH * node[:, None] + np.arange(WIDTH)).ravel()
-                exists = node < len(self.levels[at - 1][0])
+                exists = node < len(self.levels[depth - 1][0])
                 point, node = point[exists], node[exists]
         return point, self.order[node]
 
 
 def squared_gaps(points: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """``(s,)`` squared distances of points ``(s, 3)`` from a box each; zero inside."""
+    """``(s,)`` squared distances of points ``(s, 3)`` to their boxes; zero inside."""
     gap = np.maximum(lower - points, points - upper)
     np.maximum(gap, 0, out=gap)
     return np.einsum("sx,sx->s", gap, gap)
@@ -409,8 +412,8 @@ def _along_curve(points: FloatArray) -> NDArray[np.uint64]:
     low = points.min(axis=0)
     size = max(float((points - low).max()), sys.float_info.min)
     cell = np.minimum((points - low) / size * 2**CURVE_BITS, 2**CURVE_BITS - 1).astype(np.uint64)
-    found = np.zeros(len(points), dtype=np.uint64)
+    codes = np.zeros(len(points), dtype=np.uint64)
     for bit in range(CURVE_BITS):
         for axis in range(3):
-            found |= (cell[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return found
+            codes |= (cell[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return codes

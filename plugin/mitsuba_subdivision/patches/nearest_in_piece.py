@@ -1,6 +1,6 @@
-"""The point of a polynomial piece that is nearest to a given point: Newton's method within the piece's domain.
+"""The point of a polynomial piece that is nearest to a given point, by Newton's method within the piece's domain.
 
-Boxes that are turned to lie along the pieces tell which may have it, and whether the distance has one minimum there.
+Oriented boxes around the pieces tell which pieces may hold it, and whether the distance has one minimum in a piece.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PartArrays, PolynomialPieces
 
-# Most steps; five to seven are usual, more where a point is about as far away as the surface's centre of curvature.
+# Most steps. Five to seven are usual, more where a point is about as far away as the surface's centre of curvature.
 STEPS = 60
-# After a step this short, in parameters of a piece, the next would be lost in rounding.
+# Length of a step, in parameters of a piece, after which the next would be lost in rounding.
 STEP_TOLERANCE = 1e-11
-# A step of Newton's this short is the last as well: the rest is about its square.
+# Length of a Newton step after which the remaining error, about its square, needs no further step.
 LAST_NEWTON_STEP = 1e-7
-# No further from an edge of the domain than this is on the edge: rounding of a sum of parameters.
+# Distance from an edge of the domain, in parameters, up to which a point is on the edge: rounding of a sum.
 ON_EDGE = 4e-16
-# Where the determinant of a Hessian is below this part of that of the tangents, the distance is nearly a saddle, and
-# the tangents alone are used, as by Gauss and Newton.
+# Least determinant of the Hessian, relative to that of the first fundamental form, for a Newton step. Below, the
+# distance is nearly a saddle, and a Gauss-Newton step is taken.
 CONVEX = 1e-6
 # Regularization where tangents are parallel, relative to their squared lengths.
 PARALLEL = 1e-12
-# And where they vanish.
+# Regularization where tangents vanish, absolute.
 VANISHING = 1e-100
-# A step that leads further away is shortened to this part.
+# Factor by which a step that increases the distance is shortened.
 SHORTER = 0.25
-# Points are processed in runs of this many, whose arrays stay in a processor's cache.
+# Points per run, whose arrays stay in a processor's cache.
 CHUNK = 4096
 # Rounding error of a distance, relative to the size of the coordinates: some units of double precision.
 ROUNDED = 2.0**-50
@@ -41,50 +41,50 @@ ROUNDED = 2.0**-50
 
 def nearest_in_pieces(
     pieces: PolynomialPieces,
-    which: IntArray,  # (s,) int64: the piece for each point
+    which: IntArray,  # (s,) int64: index of the piece for each point
     points: FloatArray,  # (s, 3) float64
-    uv: FloatArray,  # (s, 2) float64: parameters to begin with, in the domain of the piece
-    size: float,  # Of the coordinates, for the rounding error
+    uv: FloatArray,  # (s, 2) float64: initial parameters, in the domain of the piece
+    size: float,  # Largest absolute coordinate, for the rounding error
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Find a local minimum of the distance to a point in each piece.
+    """Find a local minimum of the distance from each point to its piece.
 
-    Returns parameters in the piece, (s, 2) float64; the squared distances; and how fast the distance still falls along
-    the tangents, beyond the piece's edges too; see `slopes`.
+    Returns parameters in the piece, (s, 2) float64; the squared distances; and the `slopes` of the distance, which are
+    not zero where the minimum lies on an edge of the piece.
     """
     runs = np.split(np.arange(len(points)), range(CHUNK, len(points), CHUNK))
-    parts = [_nearest(_Descent.begun(pieces, which[at], points[at], uv[at], size)) for at in runs]
-    uv, squared_distance, slope = map(np.concatenate, zip(*parts, strict=True))
+    minima = [_nearest(_Descent.begun(pieces, which[run], points[run], uv[run], size)) for run in runs]
+    uv, squared_distance, slope = map(np.concatenate, zip(*minima, strict=True))
     return uv, squared_distance, slope
 
 
-def _nearest(found: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`nearest_in_pieces` of some points."""
-    descent, left = found, np.arange(len(found.uv))
+def _nearest(minima: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`nearest_in_pieces` for one run of points."""
+    descent, left = minima, np.arange(len(minima.uv))
     for _ in range(STEPS):
-        ends = descent.step()
-        if ends.any():
-            found.put(left[ends], descent.chosen(ends))
-            descent, left = descent.chosen(~ends), left[~ends]
+        converged = descent.step()
+        if converged.any():
+            minima.put(left[converged], descent.chosen(converged))
+            descent, left = descent.chosen(~converged), left[~converged]
         if not len(left):
             break
     else:
-        found.put(left, descent)
-    return found.uv, found.squared_distance, slopes(found.tangents, found.difference)
+        minima.put(left, descent)
+    return minima.uv, minima.squared_distance, slopes(minima.tangents, minima.difference)
 
 
 @dataclass(eq=False)
 class _Descent:
-    """The descent of some points to the least distance."""
+    """State of Newton's method for several points."""
 
     pieces: PolynomialPieces
-    which: IntArray  # (s,) int64
+    which: IntArray  # (s,) int64: index of each point's piece
     points: FloatArray  # (s, 3) float64
     uv: FloatArray  # (s, 2) float64
-    part: FloatArray  # (s,) float64: of Newton's step that is taken
+    part: FloatArray  # (s,) float64: fraction of the step that is taken
     difference: FloatArray  # (s, 3) float64: from the point to the surface
     tangents: FloatArray  # (s, 2, 3) float64
-    second: FloatArray  # (s, 3) float64: the difference's parts along the second derivatives by uu, uv and vv
-    size: float
+    second: FloatArray  # (s, 3) float64: products of the difference with the second derivatives by uu, uv and vv
+    size: float  # Largest absolute coordinate, for the rounding error
 
     @classmethod
     def begun(
@@ -98,20 +98,20 @@ class _Descent:
         return self.which, self.points, self.uv, self.part, self.difference, self.tangents, self.second
 
     def chosen(self, mask: NDArray[np.bool_]) -> _Descent:
-        which, points, uv, part, difference, tangents, second = (each[mask] for each in self._arrays)
+        which, points, uv, part, difference, tangents, second = (array[mask] for array in self._arrays)
         return _Descent(self.pieces, which, points, uv, part, difference, tangents, second, self.size)
 
-    def put(self, at: NDArray, other: _Descent) -> None:
-        """Copy another's state for some of the points."""
-        for own, new in zip(self._arrays, other._arrays, strict=True):
-            own[at] = new
+    def put(self, indices: NDArray, other: _Descent) -> None:
+        """Set the state of the points at ``indices`` to that of ``other``."""
+        for array, new in zip(self._arrays, other._arrays, strict=True):
+            array[indices] = new
 
     @property
     def squared_distance(self) -> FloatArray:
         return np.einsum("sx,sx->s", self.difference, self.difference)
 
     def step(self) -> NDArray[np.bool_]:
-        """Take a step, or a shorter one the next time; return which have converged."""
+        """Take a step; where it would increase the distance, shorten the next instead. Returns which have converged."""
         step, is_newton = self._direction()
         step *= self.part[:, None]
         uv = self.uv + step
@@ -123,18 +123,18 @@ class _Descent:
             self.uv, self.difference, self.tangents, self.second = uv, difference, tangents, second
             self.part[:] = 1
         else:
-            for own, new in zip(
+            for array, new in zip(
                 (self.uv, self.difference, self.tangents, self.second), (uv, difference, tangents, second), strict=True
             ):
-                own[improves] = new[improves]
+                array[improves] = new[improves]
             self.part = np.where(improves, 1, self.part * SHORTER)
         length = np.abs(step).max(axis=1, initial=0)
         return (length < STEP_TOLERANCE) | (is_newton & improves & (length < LAST_NEWTON_STEP))
 
     def _direction(self) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Newton's step, along the edges of the domain where it would leave it, and no further than to the next.
+        """Compute the step: Newton's, along an edge where it would leave the domain, and cut at the next edge.
 
-        Returns the step, (s, 2) float64, and whether it is the full step of Newton's method.
+        Returns the step, (s, 2) float64, and whether it is a full Newton step.
         """
         domain = self.pieces.basis.domain
         normals = domain.edge_normals
@@ -154,16 +154,17 @@ class _Descent:
         on_edge = inside <= ON_EDGE
         held = on_edge & (gradient @ normals.T > 0)
         count = held.sum(axis=1)
-        # Also where the step leads out although the distance falls inwards.
+        # A step may leave the domain although the distance falls inwards.
         leaves = on_edge & (step @ normals.T < 0)
         slides = np.flatnonzero((count == 1) | ((count == 0) & leaves.any(axis=1)))
         if len(slides):
             edge = np.argmax(np.where(count[slides, None] == 1, held[slides], leaves[slides]), axis=1)
             along = normals[edge] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
             square, product = along**2, along[:, 0] * along[:, 1]
+            # Hessian and first fundamental form along the edge.
             bend, flat = (
-                square[:, 0] * each[0] + 2 * product * each[1] + square[:, 1] * each[2]
-                for each in (hessian[slides].T, (a[slides], b[slides], c[slides]))
+                square[:, 0] * form[0] + 2 * product * form[1] + square[:, 1] * form[2]
+                for form in (hessian[slides].T, (a[slides], b[slides], c[slides]))
             )
             is_newton[slides] = bend > CONVEX * flat
             bend = np.where(is_newton[slides], bend, flat + damped[slides])
@@ -178,9 +179,9 @@ class _Descent:
 def _values(
     pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Differences, tangents, and the differences' parts along second derivatives; see `_Descent`."""
+    """`_Descent.difference`, `_Descent.tangents` and `_Descent.second` at parameters."""
     powers, degree = pieces.basis.indices, pieces.basis.degree
-    # Powers of both parameters, and their derivatives.
+    # Powers of both parameters, and their first and second derivatives.
     value = np.ones((2, len(uv), degree + 1))
     for k in range(1, degree + 1):
         np.multiply(value[:, :, k - 1], uv.T, out=value[:, :, k])
@@ -189,65 +190,68 @@ def _values(
     np.multiply(value[:, :, :-1], factor[1:], out=first[:, :, 1:])
     np.multiply(value[:, :, :-2], (factor * (factor - 1))[2:], out=second[:, :, 2:])
     (u, v), (du, dv), (duu, dvv) = (
-        (each[0][:, powers[:, 0]], each[1][:, powers[:, 1]]) for each in (value, first, second)
+        (table[0][:, powers[:, 0]], table[1][:, powers[:, 1]]) for table in (value, first, second)
     )
     rows = np.empty((len(uv), 6, len(powers)))
     for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
         np.multiply(along_u, along_v, out=rows[:, number])
-    found = rows @ pieces.monomials[which]
-    difference = found[:, 0] + (pieces.origins[which] - points)
-    return difference, found[:, 1:3], np.einsum("sdx,sx->sd", found[:, 3:], difference)
+    jet = rows @ pieces.monomials[which]
+    difference = jet[:, 0] + (pieces.origins[which] - points)
+    return difference, jet[:, 1:3], np.einsum("sdx,sx->sd", jet[:, 3:], difference)
 
 
 def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
-    """How fast the distance falls along a surface, of tangents ``(s, 2, 3)`` and differences from points ``(s, 3)``.
+    """``(s,)`` rates at which the distance falls along a surface, for tangents ``(s, 2, 3)``, differences ``(s, 3)``.
 
-    The larger of the difference's parts along the two tangents: zero but for rounding where it is along the normal.
+    The larger of the difference's components along the two unit tangents; zero, up to rounding, if the difference is
+    along the normal.
     """
     along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
     lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
     return (along / np.maximum(lengths, sys.float_info.min)).max(axis=1)
 
 
-# Rounding error of a frame of unit vectors at right angles.
+# Tolerance of the products of an orthonormal frame's vectors.
 SQUARE = 1e-12
-# Boxes are made, and points are tested, in runs of this many, whose arrays stay in a processor's cache.
+# Boxes or points per run, whose arrays stay in a processor's cache.
 RUN = 1024
-# Shorter tangents count as of this length. Its square can still be divided by.
+# Least length of a tangent, to which shorter ones are clamped so that divisions by its square do not overflow.
 SHORTEST = 1e-100
 
 
 @dataclass(frozen=True, eq=False)
 class TurnedBoxes(PartArrays):
-    """Boxes around pieces, turned to lie along them."""
+    """Oriented boxes around pieces.
+
+    ``bends``, ``curvatures`` and ``stretch`` are for parameters in which the tangents at the middle of the piece's
+    domain are orthonormal.
+    """
 
     basis: BernsteinBasis  # Of the pieces
-    frames: FloatArray  # (n, 3, 3) float64: unit vectors along the sides, the last one across the piece
-    # (n, 3) float64: of the boxes, along these; distances of their sides from the middle
-    middles: FloatArray
-    halves: FloatArray
-    points: FloatArray  # (n, 3) float64: of the pieces, at the middle of their domains
-    back: FloatArray  # (n, 2, 3) float64: makes parameters of a displacement along the tangents there
-    # (n, 3) float64: norms of the second derivatives along each side, at most; across the piece, of what they differ
-    # from those in the middle. By parameters by which the tangents in the middle are unit vectors at right angles, as
-    # all that follows.
+    frames: FloatArray  # (n, 3, 3) float64: unit vectors along the sides, the last one along the piece's normal
+    middles: FloatArray  # (n, 3) float64: centres of the boxes in the coordinates of `frames`
+    halves: FloatArray  # (n, 3) float64: half the lengths of the sides
+    points: FloatArray  # (n, 3) float64: points of the pieces at the middle of their domains
+    back: FloatArray  # (n, 2, 3) float64: maps a displacement along the tangents at `points` to parameters
+    # (n, 3) float64: upper bounds of the norms of the second derivatives along each side; along the normal, of their
+    # difference from those at the middle
     bends: FloatArray
-    # (n, 2) float64: the least and the largest eigenvalue of the second derivatives across the piece in the middle
+    # (n, 2) float64: least and largest eigenvalue of the second derivatives along the normal at the middle
     curvatures: FloatArray
-    stretch: FloatArray  # (n,) float64: A lower bound of the squared length of unit displacements anywhere in the piece
+    stretch: FloatArray  # (n,) float64: lower bound of the squared length of a unit displacement, over the whole piece
 
     @classmethod
     def around(cls, pieces: PolynomialPieces) -> TurnedBoxes:
-        """Boxes around pieces."""
-        # Where tangents vanish, bends are infinite, and nothing is known to be convex.
+        """Compute boxes around pieces."""
+        # Where tangents vanish, bends are infinite, and no piece passes as convex.
         with np.errstate(over="ignore", invalid="ignore"):
             return cls.joined(
-                [cls._around(pieces.basis, columns, pieces.origins[at]) for at, columns in pieces.runs(RUN)]
+                [cls._around(pieces.basis, columns, pieces.origins[run]) for run, columns in pieces.runs(RUN)]
             )
 
     @classmethod
     def _around(cls, basis: BernsteinBasis, coefficients: FloatArray, origins: FloatArray) -> TurnedBoxes:
-        """Boxes around a run of pieces, which arrays have along their last axis until the end."""
+        """Compute boxes around a run of pieces. Intermediate arrays have the pieces along their last axis."""
         of_u, of_v = basis.derivatives
         middle = basis.values(basis.domain.centre[None])[0]
         points, du, dv = times(np.stack([middle, middle @ of_u, middle @ of_v]), coefficients)
@@ -257,11 +261,11 @@ class TurnedBoxes(PartArrays):
         for x in (1, 2):
             along += axes[:, x] * coefficients[:, None, x]
         low, high = along.min(axis=0), along.max(axis=0)
-        # The least squares of a displacement along the tangents.
+        # `back` is the pseudo-inverse of the tangents.
         a, b, c = (np.einsum("xn,xn->n", *pair) for pair in ((du, du), (du, dv), (dv, dv)))
         determinant = np.maximum(a * c - b * b, SHORTEST)
         back = np.stack([c * du - b * dv, a * dv - b * du]) / determinant
-        # Parameters by which the tangents in the middle are unit vectors at right angles: derivatives by them.
+        # Derivatives by parameters in which the tangents at the middle are orthonormal, as by Gram and Schmidt.
         first = 1 / np.maximum(np.sqrt(a), SHORTEST)
         second = 1 / np.maximum(np.sqrt(determinant) * first, SHORTEST)
         shear = -b * first**2
@@ -273,13 +277,13 @@ class TurnedBoxes(PartArrays):
             second * (first * sheared),
             second * (second * (shear * sheared + shear * uv + vv)),
         )
-        across = [middle @ each[:, 2] for each in bends]
+        across = [middle @ bend[:, 2] for bend in bends]
         mean, radius = (across[0] + across[2]) / 2, np.hypot((across[0] - across[2]) / 2, across[1])
         square = np.zeros_like(low)
-        for weight, each, own in zip((1, 2, 1), bends, across, strict=True):
-            each[:, 2] -= own
-            square += weight * np.abs(each).max(axis=0) ** 2
-        # Bound of the change of the tangents.
+        for weight, bend, across_at_middle in zip((1, 2, 1), bends, across, strict=True):
+            bend[:, 2] -= across_at_middle
+            square += weight * np.abs(bend).max(axis=0) ** 2
+        # Bound of the squared change of the tangents over the piece.
         change = np.zeros_like(mean)
         for tangent in tangents:
             off = tangent - times(middle[None], tangent)
@@ -299,53 +303,53 @@ class TurnedBoxes(PartArrays):
     def near(
         self,
         points: FloatArray,  # (s, 3) float64
-        which: IntArray,  # (s,) int64: the box for each
-        squared_reach: FloatArray,  # (s,) float64
+        which: IntArray,  # (s,) int64: index of each point's box
+        squared_reach: FloatArray,  # (s,) float64: largest squared distance of each point from its box
     ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Which points are no further from their box than a distance of their own.
+        """Find the points that are within reach of their boxes.
 
-        Returns numbers of these points, (n,) int64; their squared distances; and the way from them to the middles of
-        their boxes, along the sides of these, (n, 3) float64.
+        Returns the indices of these points, (n,) int64; their squared distances from the boxes; and the vectors from
+        them to the centres of the boxes in the coordinates of `frames`, (n, 3) float64.
         """
-        found = [(np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3)))]
+        near_of_runs = [(np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3)))]
         for begin in range(0, len(which), RUN):
-            at = slice(begin, begin + RUN)
-            own = which[at]
-            away = (self.frames.take(own, axis=0) @ points[at, :, None])[:, :, 0]
-            np.subtract(self.middles.take(own, axis=0), away, out=away)
-            gap = np.maximum(np.abs(away) - self.halves.take(own, axis=0), 0)
+            run = slice(begin, begin + RUN)
+            box = which[run]
+            away = (self.frames.take(box, axis=0) @ points[run, :, None])[:, :, 0]
+            np.subtract(self.middles.take(box, axis=0), away, out=away)
+            gap = np.maximum(np.abs(away) - self.halves.take(box, axis=0), 0)
             squared_distance = np.einsum("sx,sx->s", gap, gap)
-            near = np.flatnonzero(squared_distance <= squared_reach[at])
-            found.append((near + begin, squared_distance[near], away[near]))
-        near, squared_distance, away = map(np.concatenate, zip(*found, strict=True))
+            near = np.flatnonzero(squared_distance <= squared_reach[run])
+            near_of_runs.append((near + begin, squared_distance[near], away[near]))
+        near, squared_distance, away = map(np.concatenate, zip(*near_of_runs, strict=True))
         return near, squared_distance, away
 
     def are_convex(
         self,
-        away: FloatArray,  # (n, 3) float64: as `near` gives it
-        which: IntArray,  # (n,) int64
+        away: FloatArray,  # (n, 3) float64: as returned by `near`
+        which: IntArray,  # (n,) int64: index of each point's box
     ) -> NDArray[np.bool_]:
-        """``(n,)`` whether squared distances from points have one minimum in each piece.
+        """``(n,)`` whether the squared distance from a point has one minimum in its piece.
 
-        They have where they are convex functions of the piece's parameters: half the second derivatives are those of
-        the surface times the difference, plus products of tangents.
+        True if a bound shows that it is a convex function of the piece's parameters. Half its Hessian is the first
+        fundamental form plus the products of the difference with the second derivatives of the surface.
         """
         halves = self.halves[which]
         across, half, curvatures = away[:, 2:], halves[:, 2:], self.curvatures[which]
         # Infinite where tangents vanish.
         with np.errstate(invalid="ignore"):
             least = np.minimum((across - half) * curvatures, (across + half) * curvatures).min(axis=1)
-            others = np.einsum("sx,sx->s", np.abs(away) + halves, self.bends[which])
-            return others - least < self.stretch[which]
+            change = np.einsum("sx,sx->s", np.abs(away) + halves, self.bends[which])
+            return change - least < self.stretch[which]
 
     def starts(self, points: FloatArray, which: IntArray) -> FloatArray:
-        """``(s, 2)`` parameters of pieces near given points, as if the pieces were flat; in the domain."""
+        """``(s, 2)`` parameters near points, from the tangent plane of each piece, clamped to the domain."""
         away = (self.back[which] @ (points - self.points[which])[:, :, None])[:, :, 0]
         return self.basis.domain.clamped(self.basis.domain.centre + away)
 
 
 def _frames(du: FloatArray, dv: FloatArray) -> FloatArray:
-    """Unit vectors ``(n, 3, 3)`` along and across tangents; along the axes where these are parallel."""
+    """Orthonormal frames ``(n, 3, 3)``: along ``du``, in the tangent plane, normal. Axes if tangents are parallel."""
     with np.errstate(divide="ignore", invalid="ignore"):
         normal = np.cross(du, dv)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

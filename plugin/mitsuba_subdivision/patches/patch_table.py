@@ -1,4 +1,4 @@
-"""The patch table: every element of a cage, grouped by the signature of its one-ring."""
+"""The patch table: the elements of a cage, grouped by the signatures of their one-rings."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from .one_ring_codes import fan_codes, row_codes
 if TYPE_CHECKING:
     from scipy import sparse
 
-# A cage with more classes than this, and fewer patches in each, is refined once if that leaves fewer classes by a
-# factor: a class costs some milliseconds, refining a patch some microseconds.
+# A cage with more than MANY_CLASSES classes, and on average fewer than FEW_PATCHES patches in each, is refined once if
+# that divides the number of classes by FEWER: a class costs milliseconds, refining a patch microseconds.
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
 
-# Tessellations and exact shading refine the same control values.
+# Refinement matrices, shared by tessellations and exact shading.
 _REFINEMENTS: Shared[sparse.csr_array] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
 class PatchClass:
-    """The patches whose one-rings have the same signature: their stencils are the same."""
+    """The patches whose one-rings have the same signature, and so the same stencils."""
 
     signature: Signature
-    # (p,) int32: the corner of its element that each patch begins at, a half-edge of `PatchTable.elements`
+    # (p,) int32: the corner of the element at which each patch begins, a half-edge of `PatchTable.elements`
     corners: IndexArray
     controls: IndexArray  # (p, K) int32: 0-based mesh vertices of each patch's one-ring
-    # Index of the first of these in `PatchTable.controls`, where the others follow, column by column
+    # Index of the first entry of `controls` in `PatchTable.controls`, where the rest follows, column by column
     first_control: int
 
 
 class PatchTable:
-    """All patches of a cage. An element that fits the scheme's domain is one patch, another has one at every corner."""
+    """All patches of a cage: one for each element that fits the scheme's domain, one at every corner of any other."""
 
     def __init__(
         self,
@@ -52,18 +52,18 @@ class PatchTable:
         scheme: Scheme,
         is_hole: NDArray[np.bool_] | None = None,  # (n_f,) bool: faces that are no elements
         *,
-        # Whether a patch may begin at any corner of its element, so that elements whose one-rings are turned
-        # copies of each other share a class. If not, each begins at its element's first corner.
+        # Whether a patch may begin at any corner of its element, so that elements whose one-rings are equal up to
+        # rotation share a class. If not, a patch begins at its element's first corner.
         may_turn: bool = True,
     ) -> None:
         self.topology, self.scheme, self.is_hole, self.may_turn = topology, scheme, is_hole, may_turn
 
     @cached_property
     def elements(self) -> Topology:
-        """The mesh whose faces are the elements: the cage's, or its dual, whose vertices are the cage's faces.
+        """The mesh whose faces are the elements: the cage's mesh, or its dual, whose vertices are the cage's faces.
 
-        A face of the dual begins at the lowest half-edge of its vertex. Holes and vertices on the border, which are no
-        elements, are faces without corners.
+        A face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
+        elements, become faces without corners.
         """
         t = self.topology
         if self.scheme.element == "face":
@@ -78,7 +78,7 @@ class PatchTable:
 
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:
-        """``(n_h,)`` the mesh's half-edge that names the element, for each half-edge of `elements`."""
+        """``(n_h,)`` the half-edge of the mesh that corresponds to each half-edge of `elements`."""
         if self.scheme.element == "face":
             if self._is_kept is not None:
                 return self.topology.half_edges_of(self._is_kept).astype(np.int32)
@@ -86,19 +86,19 @@ class PatchTable:
         return self.topology.vertex_fans[1]
 
     def half_edges(self, corners: IndexArray) -> IndexArray:
-        """`half_edge_of_corner` of some corners."""
+        """`half_edge_of_corner` of the given corners."""
         if self.elements is self.topology:
             return corners
         return self.half_edge_of_corner[corners]
 
     @cached_property
     def _is_kept(self) -> NDArray[np.bool_] | None:
-        """``(n_f,)`` whether each face is an element; None where all are."""
+        """``(n_f,)`` whether each face is an element; None if all are."""
         return None if self.is_hole is None or not self.is_hole.any() else ~self.is_hole
 
     @cached_property
     def is_whole(self) -> NDArray[np.bool_]:
-        """``(n_e,)`` whether each element has as many corners as the scheme's domain, and so is one patch."""
+        """``(n_e,)`` whether each element is a single patch: it has as many corners as the scheme's domain."""
         return self.elements.face_sizes == self.scheme.domain.corner_count
 
     @property
@@ -113,29 +113,30 @@ class PatchTable:
 
     @cached_property
     def control_counts(self) -> IntArray:
-        """``(c,)`` K of each class."""
-        return np.array([each.controls.shape[1] for each in self.classes], dtype=np.int64)
+        """``(c,)`` K, the number of control points of a patch, of each class."""
+        return np.array([patch_class.controls.shape[1] for patch_class in self.classes], dtype=np.int64)
 
     @cached_property
     def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
         order, bounds = self._order
-        members = np.split(self._patch_codes[0][order], bounds)
+        corners_of_class = np.split(self._patch_codes[0][order], bounds)
         signatures = [
             signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
-            for corners in counted(members, "Classes of patches")
+            for corners in counted(corners_of_class, "Classes of patches")
         ]
         if self.scheme.has_local_borders:
             signatures = [signature.near() for signature in signatures]
         # Semi-sharpness changes no one-ring.
         rings = [one_ring(signature.smoothed) for signature in signatures]
         counts = [ring.vertex_count for ring in rings]
-        begins = ragged.offsets([count * len(corners) for count, corners in zip(counts, members, strict=True)]).tolist()
+        entry_counts = [count * len(corners) for count, corners in zip(counts, corners_of_class, strict=True)]
+        begins = ragged.offsets(entry_counts).tolist()
         controls = np.empty(begins[-1], dtype=np.int32)
         classes = []
-        for signature, ring, corners, begin in zip(signatures, rings, members, begins[:-1], strict=True):
+        for signature, ring, corners, begin in zip(signatures, rings, corners_of_class, begins[:-1], strict=True):
             columns = controls[begin : begin + ring.vertex_count * len(corners)].reshape(ring.vertex_count, -1)
-            own = ring.gather(self.topology, self.half_edges(corners), columns)
-            classes.append(PatchClass(signature, corners, own, begin))
+            class_controls = ring.gather(self.topology, self.half_edges(corners), columns)
+            classes.append(PatchClass(signature, corners, class_controls, begin))
         return tuple(classes), controls
 
     @property
@@ -148,17 +149,17 @@ class PatchTable:
 
     @cached_property
     def _order(self) -> tuple[IntArray, IntArray]:
-        """Patches sorted by their codes, and where the classes but for the first one begin."""
+        """Patches sorted by their codes, and the indices at which all classes but the first begin."""
         codes = self._patch_codes[1]
-        # Few codes sort faster in few bits.
+        # Integers of few bits sort faster.
         codes = codes.astype(np.min_scalar_type(codes.max()), copy=False)
         order = np.argsort(codes, kind="stable")
-        in_order = codes[order]
-        return order, np.flatnonzero(in_order[1:] != in_order[:-1]) + 1
+        sorted_codes = codes[order]
+        return order, np.flatnonzero(sorted_codes[1:] != sorted_codes[:-1]) + 1
 
     @cached_property
     def refined(self) -> RefinedPatches | None:
-        """Patches of the cage refined once, if that saves many classes, see `RefinedPatches`; else None."""
+        """Patches of the cage refined once, if that leaves far fewer classes, see `RefinedPatches`; else None."""
         if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
             return None
         if self._is_kept is not None or not self.scheme.splits_corners:
@@ -174,13 +175,13 @@ class PatchTable:
         control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
         control_count: int,
     ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-        """`controls`, as rows of control values; of refined patches also the matrix that makes these of the cage's."""
+        """`controls` as rows of control values; for refined patches, also the matrix that refines the cage's values."""
         refined = self.refined
         if refined is not None:
             from scipy import sparse
 
             def make() -> sparse.csr_array:
-                # Copies of a control point share a column, where their weights add up. This is done in place.
+                # Mesh vertices with the same control point share a column, where their weights add up, in place.
                 weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
                 columns = control_of_vertex.astype(weights.indices.dtype)[weights.indices]
                 matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
@@ -195,27 +196,27 @@ class PatchTable:
         return controls.view(np.uint32), None
 
     def patch_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """The class, the patch in it, and which of the patch's corners it is, for some half-edges of `elements`."""
-        index, patch, patch_corner = (found[corners].astype(np.int64) for found in self._patch_of_corner)
-        return index, patch, patch_corner
+        """Look up half-edges of `elements`. Returns the class, the patch in it, and the corner of the patch."""
+        class_index, patch, patch_corner = (column[corners].astype(np.int64) for column in self._patch_of_corner)
+        return class_index, patch, patch_corner
 
     @cached_property
     def _patch_of_corner(self) -> tuple[IntArray, IndexArray, NDArray[np.int8]]:
-        """`patch_at` all half-edges, each in few bytes: a cage has some millions of them."""
+        """`patch_at` for all half-edges, in small integer types, as a cage may have millions of them."""
         t = self.elements
-        types = np.min_scalar_type(-self.class_count), np.int32, np.int8
-        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=each) for each in types)
+        dtypes = np.min_scalar_type(-self.class_count), np.int32, np.int8
+        class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=dtype) for dtype in dtypes)
         for index, patch_class in enumerate(self.classes):
             corners = patch_class.corners
-            whole = self.is_whole[t.face[corners[0]]]
-            for turn in range(self.scheme.domain.corner_count if whole else 1):
+            is_whole = self.is_whole[t.face[corners[0]]]
+            for turn in range(self.scheme.domain.corner_count if is_whole else 1):
                 class_index[corners], patch[corners], patch_corner[corners] = index, np.arange(len(corners)), turn
                 corners = t.next[corners]
         return class_index, patch, patch_corner
 
     @cached_property
     def _patch_codes(self) -> tuple[IndexArray, IntArray]:
-        """The corner that each patch begins at, and its code: patches have equal ones where their signatures are."""
+        """The corner at which each patch begins, and the patch's code, which is equal for equal signatures."""
         t, fans = self.elements, self._fan_codes()
         whole = t.face_offsets[:-1][self.is_whole]
         if self.may_turn:
@@ -230,17 +231,17 @@ class PatchTable:
         sizes = t.face_sizes[t.face[partial]]
         for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
-            unused = 1 + max(int(found.max(initial=0)) for found in codes)
-            codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + unused)
+            first_unused = 1 + max(int(codes_of_size.max(initial=0)) for codes_of_size in codes)
+            codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + first_unused)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
 
     def _fan_codes(self) -> IntArray:
-        """``(n_h,)`` code of the fan around the mesh's vertex at each corner of `elements`, see `one_ring_codes`."""
+        """``(n_h,)`` code of the fan around the mesh vertex at each corner of `elements`, see `one_ring_codes`."""
         codes = fan_codes(self.topology, near=self.scheme.has_local_borders)
         return codes if self.elements is self.topology else codes[self.half_edge_of_corner]
 
     def _keys(self, fans: IntArray, corners: IntArray, corner_count: int) -> list[IntArray]:
-        """Columns that distinguish the signatures of patches: the fans' codes at all corners, from given ones on."""
+        """Columns that distinguish the signatures of patches: codes of the fans at all corners, from `corners` on."""
         if self.scheme.element == "vertex":
             return [fans[corners]]
         columns = []
@@ -251,20 +252,23 @@ class PatchTable:
 
     def _turned_to_least(
         self,
-        fans: IntArray,  # (n_h,) int: as made by `_fan_codes`
+        fans: IntArray,  # (n_h,) int: `_fan_codes`
         corners: IndexArray,  # (n,) int32: first corners of the elements
     ) -> tuple[IndexArray, IntArray]:
-        """Begin each whole element at the corner from which its code is least: turned copies get the same code."""
+        """Begin each whole element at the corner from which its code is least, so that rotated copies get equal codes.
+
+        Returns these corners and the codes.
+        """
         count = self.scheme.domain.corner_count
         if fans.size == count * len(corners):
-            # All elements are whole, and their corners follow each other.
+            # All elements are whole, and their corners are consecutive.
             at_corners = np.ascontiguousarray(fans.reshape(-1, count).T)
         else:
             at_corners = fans[corners + np.arange(count)[:, None]]
         if self.scheme.element == "vertex":
             codes = row_codes([at_corners.ravel()])
         else:
-            # As seen from each of the corners in turn, the columns are those of all corners from another one on.
+            # Seen from another first corner, an element's columns are rotated.
             around = np.concatenate([at_corners, at_corners], axis=None)
             codes = row_codes([around[corner * len(corners) :][: at_corners.size] for corner in range(count)])
         codes = codes.reshape(at_corners.shape)
@@ -280,23 +284,22 @@ class PatchTable:
 class RefinedPatches:
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
-    They are for cages of many classes: where polygons of many sizes and vertices of many valences meet, nearly every
-    patch may be a class of its own, and the stencils of a class take milliseconds. In the refined cage, each old vertex
-    has new neighbours only, of few kinds, so that few classes are left.
+    They serve cages of many classes: where polygons of many sizes meet vertices of many valences, nearly every patch
+    may be the only one of its class, and the stencils of a class take milliseconds. In the refined cage, an old vertex
+    has only new neighbours, which are of few kinds, so that few classes are left.
 
     Measured at 8 segments per edge on two cores, the time to make a sampling table and the most memory at once,
     refined and not: 0.16 s and 35 MB, or 52 s and 521 MB, for 2,000 polygons of a Voronoi diagram (9,713 classes);
     0.12 s and 11 MB, or 5.9 s and 165 MB, for 1,110 quadrilaterals and triangles (1,215 classes); 0.33 s and 108 MB, or
-    2.8 s and 129 MB, for 10,000 quadrilaterals with valences from 3 to 9 (336 classes). To evaluate the table again
-    takes from half to 1.2 times as long. Normals in float32 are 2 to 5 times less exact, as the refined cage's vertices
-    are rounded.
+    2.8 s and 129 MB, for 10,000 quadrilaterals with valences from 3 to 9 (336 classes). Evaluating the table again
+    takes 0.5 to 1.2 times as long. Normals in float32 are 2 to 5 times less exact, as the refined cage's vertices are
+    rounded.
     """
 
     table: PatchTable  # Of the refined cage, whose faces are all elements, and whole
-    matrix: sparse.csr_array  # (n, n_v) sparse array: the refined cage's vertices as weights over the mesh's
+    matrix: sparse.csr_array  # (n, n_v) weights of the mesh's vertices at the refined cage's vertices
 
     def corners(self, patch_class: PatchClass) -> IndexArray:
-        """``(p,)`` the corner of an element of the cage that each patch covers, a half-edge of its `elements`."""
-        # By `splits_corners` of the scheme, face h of the refined cage lies at half-edge h of the cage, and
-        # begins there.
+        """``(p,)`` the corner of the cage's element that each patch covers, a half-edge of the cage's `elements`."""
+        # As the scheme `splits_corners`, face h of the refined cage lies at half-edge h of the cage, and begins there.
         return self.table.topology.face[patch_class.corners]

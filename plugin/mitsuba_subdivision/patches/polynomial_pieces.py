@@ -1,4 +1,4 @@
-"""The surface over all elements as polynomials in Bernstein form: for bounds, integrals and searches over all of it."""
+"""The whole surface as polynomials in Bernstein form, for bounds, integrals and searches."""
 
 from __future__ import annotations
 
@@ -20,46 +20,46 @@ from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
 
-# Levels around extraordinary points are bounded by their coefficients until the second eigenvalue has shrunk them to
-# this, in sizes of the patch. The bound of the rest allows weights of any sign, which is then small beside the element.
+# Size, relative to the patch, down to which levels around extraordinary points are bounded by Bernstein coefficients,
+# as they shrink by the second eigenvalue. The looser bound of the remaining levels is then small beside the element.
 TIP_SIZE = 1 / 64
-# Boxes are found in runs of this many pieces, whose arrays stay in a processor's cache.
+# Pieces per run when computing boxes, whose arrays stay in a processor's cache.
 RUN = 1024
-# Elements of more pieces, which are those along semi-sharp creases, are at first divided only so often.
+# Elements of more than MOST_PIECES pieces, along semi-sharp creases, are at first divided only DIVISIONS times.
 MOST_PIECES, DIVISIONS = 64, 3
 
 _Any = TypeVar("_Any")
 _Parts = TypeVar("_Parts", bound="PartArrays")
 
-# Every element is divided this often, so into 8 by 8 parts, before the coefficients of the parts bound it. A box is
-# then larger than the tight one by some percent of the bend of a part, which is a 64th of the element's.
+# Halvings of an element, here into 8 by 8 parts, before the coefficients of the parts bound it. A box then exceeds the
+# tight one by some percent of the deviation of a part from a plane, a 64th of that of the element.
 HALVINGS = 3
-# Single precision rounds control points, and sums relative to one of them: so many units of the last place of the
-# largest coordinate. The most that was measured are seven, around a face of 50 corners.
+# Error of evaluation in single precision, in units of the last place of the largest coordinate, and that unit. The
+# largest measured error is seven units, around a face of 50 corners.
 UNITS, UNIT = 16, 2.0**-24
-# Pieces are divided in runs of this many, which bounds temporary memory to some megabytes.
+# Pieces that are divided at once, which bounds temporary memory to some megabytes.
 CHUNK = 128
 
 
 class PartArrays:
-    """Parts of a surface as a dataclass: first what they have in common, then arrays with a row for each."""
+    """Parts of a surface as a struct of arrays. The first field is common to all parts; arrays have a row per part."""
 
     @property
     def _fields(self) -> tuple[Any, ...]:
-        return tuple(getattr(self, each.name) for each in fields(self))  # type: ignore[arg-type]
+        return tuple(getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
 
     def __len__(self) -> int:
         return len(self._fields[1])
 
     def chosen(self: _Parts, which: NDArray) -> _Parts:
-        """Some of the parts, by their numbers or a mask."""
+        """The parts selected by indices or a mask."""
         make: Callable[..., _Parts] = type(self)
         common, *arrays = self._fields
-        return make(common, *(each[which] for each in arrays))
+        return make(common, *(array[which] for array in arrays))
 
     @classmethod
     def joined(cls: type[_Parts], parts: Iterable[_Parts]) -> _Parts:
-        """Parts that have the same in common, one after the other; at least one."""
+        """Concatenate parts, at least one, whose first field is the same."""
         make: Callable[..., _Parts] = cls
         (common, *_), *columns = zip(*(part._fields for part in parts), strict=True)
         return make(common, *map(np.concatenate, columns))
@@ -70,69 +70,69 @@ class PolynomialPieces(PartArrays):
     """Parts of a surface that are polynomials."""
 
     basis: BernsteinBasis
-    # (n,) int64: the corner of an element where parameters begin, a half-edge of `PatchTable.elements`
+    # (n,) int64: the corner of the element at which its parameters start, a half-edge of `PatchTable.elements`
     half_edge: IntArray
-    # (n, 2, 2), (n, 2) float64: from a piece's own parameters, over the whole domain, to those of the element
+    # (n, 2, 2), (n, 2) float64: affine maps from a piece's parameters, over the whole domain, to those of the element
     matrices: FloatArray
     offsets: FloatArray
-    origins: FloatArray  # (n, 3) float64: points near the pieces, so that small ones lose no digits
-    coefficients: FloatArray  # (n, b, 3) float64: relative to these
+    origins: FloatArray  # (n, 3) float64: points near the pieces, so that small pieces lose no digits
+    coefficients: FloatArray  # (n, b, 3) float64: Bernstein coefficients relative to `origins`
 
     @cached_property
     def monomials(self) -> FloatArray:
-        """``(n, b, 3)`` coefficients of products of powers of u and v; the powers are the basis's `indices`."""
+        """``(n, b, 3)`` coefficients of monomials in u and v, whose exponents are `BernsteinBasis.indices`."""
         return self.basis.monomials @ self.coefficients
 
     def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
-        """Runs of pieces, at least one, and their coefficients ``(b, 3, n)``.
+        """Iterate over runs of at most ``length`` pieces, at least one run, with their coefficients ``(b, 3, n)``.
 
-        With the pieces along the last axis, products and extremes take a fraction of the time.
+        With the pieces along the last axis, products and extrema take a fraction of the time.
         """
         for begin in range(0, max(len(self), 1), length):
-            at = slice(begin, begin + length)
-            yield at, np.ascontiguousarray(self.coefficients[at].transpose(1, 2, 0))
+            run = slice(begin, begin + length)
+            yield run, np.ascontiguousarray(self.coefficients[run].transpose(1, 2, 0))
 
     def box(self) -> tuple[FloatArray, FloatArray]:
-        """``(n, 3)`` opposite corners of boxes around the coefficients, and so around the pieces."""
+        """``(n, 3)`` opposite corners of axis-aligned boxes around the coefficients, and so around the pieces."""
         lower, upper = self.origins.copy(), self.origins.copy()
-        for at, columns in self.runs(RUN):
-            lower[at] += columns.min(axis=0).T
-            upper[at] += columns.max(axis=0).T
+        for run, columns in self.runs(RUN):
+            lower[run] += columns.min(axis=0).T
+            upper[run] += columns.max(axis=0).T
         return lower, upper
 
     def halved(self) -> PolynomialPieces:
-        """The four copies of each piece at half the size, all first ones before all second ones and so on."""
+        """The four quarters of each piece: the first quarters of all pieces, then the second ones, and so on."""
         maps = [child.inverse() for child in self.basis.domain.children]
         return PolynomialPieces(
             self.basis,
             np.tile(self.half_edge, 4),
-            np.concatenate([self.matrices @ each.matrix for each in maps]),
-            np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
+            np.concatenate([self.matrices @ from_child.matrix for from_child in maps]),
+            np.concatenate([self.matrices @ from_child.offset + self.offsets for from_child in maps]),
             np.tile(self.origins, (4, 1)),
             np.concatenate([half @ self.coefficients for half in self.basis.halves]),
         )
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
-        """``(n, 3)`` points in the middle of each piece's domain, and their locations: `half_edge` and parameters."""
+        """``(n, 3)`` points at the middle of the pieces' domains, and their locations: `half_edge` and parameters."""
         middle = self.basis.domain.centre
         points = self.origins + (self.basis.values(middle[None]) @ self.coefficients)[:, 0]
         return points, self.half_edge, self.matrices @ middle + self.offsets
 
     def parameters(self, uv: FloatArray) -> FloatArray:
-        """``(n, 2)`` parameters of elements at one location in each piece, in the domain."""
+        """``(n, 2)`` parameters in the elements, for one location in each piece, clamped to the domain."""
         return self.basis.domain.clamped((self.matrices @ uv[:, :, None])[:, :, 0] + self.offsets)
 
 
 @dataclass(frozen=True, eq=False)
 class Tips(PartArrays):
-    """The surface around extraordinary points of the same patch: at every level, three polynomials."""
+    """The surface around extraordinary points with the same irregular patch: three polynomials at every level."""
 
     patch: IrregularPatch
-    # As in `PolynomialPieces`, from the tip's parameters
+    # As in `PolynomialPieces`, but from the parameters of the tip
     half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
-    coordinates: FloatArray  # (t, K, 3) float64: eigen-coordinates; the first is the extraordinary point
+    coordinates: FloatArray  # (t, K, 3) float64: eigen-coefficients; the first is the extraordinary point
 
     @property
     def points(self) -> FloatArray:
@@ -141,81 +141,80 @@ class Tips(PartArrays):
 
     @property
     def bounded_levels(self) -> int:
-        """Number of levels that are bounded by their coefficients."""
+        """Number of levels that are bounded by Bernstein coefficients, see `TIP_SIZE`."""
         return level_at_size(self.patch, TIP_SIZE)
 
     @property
     def tangents(self) -> FloatArray:
-        """``(t, 2, 3)`` two tangents at the points, whose cross product is along the normal."""
+        """``(t, 2, 3)`` two tangents at the extraordinary points, whose cross product is along the normal."""
         return self.patch.limit_frame @ self.coordinates
 
     def level(self, level: int) -> PolynomialPieces:
-        """The regular pieces of a level: first those of all first children, and so on."""
+        """The regular pieces of a level: the first children of all tips, then the second ones, and so on."""
         rows, maps = level_rows(self.patch, level)[:, :, 1:], level_domains(self.patch, level)
         coefficients = rows.reshape(-1, rows.shape[2]) @ self.coordinates[:, 1:]
-        of_children = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
+        by_child = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
         return PolynomialPieces(
             regular_bernstein(self.patch.scheme).basis,
             np.tile(self.half_edge, len(rows)),
-            np.concatenate([self.matrices @ each.matrix for each in maps]),
-            np.concatenate([self.matrices @ each.offset + self.offsets for each in maps]),
+            np.concatenate([self.matrices @ from_child.matrix for from_child in maps]),
+            np.concatenate([self.matrices @ from_child.offset + self.offsets for from_child in maps]),
             np.tile(self.points, (len(rows), 1)),
-            of_children.reshape(-1, *of_children.shape[2:]),
+            by_child.reshape(-1, *by_child.shape[2:]),
         )
 
     def reach(self, level: int) -> FloatArray:
-        """``(t, 3)`` bound of the distance from the point to the surface at a level and all later ones."""
+        """``(t, 3)`` bounds along the axes of the distance from the point to the surface at this and deeper levels."""
         coordinates = np.ascontiguousarray(self.coordinates.transpose(1, 2, 0))
         return times(rest_rows(self.patch), np.abs(times(transition(self.patch, level), coordinates))).max(axis=0).T
 
 
 @dataclass(frozen=True, eq=False)
 class ElementParts(PartArrays):
-    """Parts of a surface that are divided alike, not yet divided."""
+    """Parts of a surface with the same patch tree, not yet divided."""
 
     element: PatchTree
-    # As in `PolynomialPieces`, from the part's parameters
+    # As in `PolynomialPieces`, but from the parameters of the part
     half_edge: IntArray
     matrices: FloatArray
     offsets: FloatArray
-    # (n, K, 3) float64: control points of their one-rings. Where rules are convex, the parts lie within the hull of
-    # these.
+    # (n, K, 3) float64: control points of the one-rings. Under convex rules, a part lies within their convex hull.
     controls: FloatArray
 
     def box(self) -> tuple[FloatArray, FloatArray]:
-        """``(n, 3)`` opposite corners of boxes around the control points."""
+        """``(n, 3)`` opposite corners of axis-aligned boxes around the control points."""
         return self.controls.min(axis=1), self.controls.max(axis=1)
 
     def children(self) -> list[PolynomialPieces | Tips | ElementParts]:
-        """Children of the parts: one child of all of them, the next of all, and so on."""
-        found: list[PolynomialPieces | Tips | ElementParts] = []
+        """Children of the parts: an entry for the first children of all parts, one for the second, and so on."""
+        children: list[PolynomialPieces | Tips | ElementParts] = []
         for domain, (child, stencils) in zip(self.element.domains, self.element.children, strict=True):
             outward, controls = domain.inverse(), stencils @ self.controls
             if child.piece is not None:
                 outward = outward @ child.piece.domain.inverse()
             place = self.half_edge, self.matrices @ outward.matrix, self.matrices @ outward.offset + self.offsets
             if child.piece is None:
-                found.append(ElementParts(child, *place, controls))
+                children.append(ElementParts(child, *place, controls))
             elif child.piece.patch is not None:
-                found.append(Tips(child.piece.patch, *place, child.piece.coordinates @ controls))
+                children.append(Tips(child.piece.patch, *place, child.piece.coordinates @ controls))
             else:
                 form = regular_bernstein(child.scheme)
                 origins, rows = controls[:, 0], form.of_controls @ child.piece.stencils
                 relative = controls - origins[:, None]
-                found.append(PolynomialPieces(form.basis, *place, origins, rows @ relative))
-        return found
+                children.append(PolynomialPieces(form.basis, *place, origins, rows @ relative))
+        return children
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePieces:
-    """A whole surface."""
+    """A whole surface: polynomial pieces, tips and undivided parts."""
 
     scheme: Scheme
     regular: PolynomialPieces
     tips: tuple[Tips, ...]
-    undivided: tuple[ElementParts, ...]  # The rest: parts along semi-sharp creases that have very many pieces
-    # (n_e, 3) float64: largest absolute coordinates of the control points of each element's patches; zero where there
-    # is no element
+    undivided: tuple[ElementParts, ...]  # Parts along semi-sharp creases that would have very many pieces
+    # (n_e, 3) float64: largest absolute coordinates of the control points of each element's patches; zero for holes
+    # and other faces of `PatchTable.elements` without corners
     sizes: FloatArray
 
     @classmethod
@@ -224,7 +223,7 @@ class SurfacePieces:
         patches: PatchTable,
         control_points: FloatArray,  # (n_v, 3) float64: at each mesh vertex
     ) -> SurfacePieces:
-        """Divide all elements; those of very many pieces a few times only."""
+        """Divide all elements into pieces; elements of more than `MOST_PIECES` pieces only `DIVISIONS` times."""
         refined = patches.refined
         table = patches if refined is None else refined.table
         if refined is not None:
@@ -240,12 +239,13 @@ class SurfacePieces:
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
             np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
-            seen = partial(_seen, patches, corners)
+            place_of = partial(_seen, patches, corners)
             waiting = [(whole, IDENTITY, controls, 0)]
             while waiting:
                 element, outward, controls, depth = waiting.pop()
                 if element.regular_count > MOST_PIECES and depth == DIVISIONS:
-                    undivided.append(ElementParts(element, *seen(outward, outward(form.basis.domain.centre)), controls))
+                    place = place_of(outward, outward(form.basis.domain.centre))
+                    undivided.append(ElementParts(element, *place, controls))
                     continue
                 if element.regular_count > MOST_PIECES:
                     for domain, (child, stencils) in zip(element.domains, element.children, strict=True):
@@ -254,13 +254,13 @@ class SurfacePieces:
                 origins = controls[:, 0]
                 relative = controls - origins[:, None]
                 rows = element.coefficients(form.of_controls, known=known)
-                for own_rows, *inner in zip(rows, *element.regular_domains, strict=True):
-                    domain = outward @ AffineMap(*inner)
-                    place = seen(domain, domain(form.basis.domain.centre))
-                    regular.append(PolynomialPieces(form.basis, *place, origins, own_rows @ relative))
+                for piece_rows, *piece_domain in zip(rows, *element.regular_domains, strict=True):
+                    domain = outward @ AffineMap(*piece_domain)
+                    place = place_of(domain, domain(form.basis.domain.centre))
+                    regular.append(PolynomialPieces(form.basis, *place, origins, piece_rows @ relative))
                 for tip in element.tips:
                     domain = outward @ tip.domain.inverse()
-                    place = seen(domain, domain.offset)
+                    place = place_of(domain, domain.offset)
                     tips.append(Tips(tip.irregular_patch, *place, tip.coordinates @ controls))
         return cls(
             table.scheme,
@@ -271,37 +271,37 @@ class SurfacePieces:
         )
 
     def divided(self) -> SurfacePieces:
-        """The same surface without anything undivided."""
+        """The same surface without undivided parts."""
         if not self.undivided:
             return self
         regular, tips, undivided = [self.regular], [*self.tips], [*self.undivided]
         while undivided:
             children = [child for parts in undivided for child in parts.children()]
-            regular += [each for each in children if isinstance(each, PolynomialPieces)]
-            tips += [each for each in children if isinstance(each, Tips)]
-            of_elements = [each for each in children if isinstance(each, ElementParts)]
-            undivided = [ElementParts.joined(each) for each in alike(of_elements, attrgetter("element"))]
+            regular += [child for child in children if isinstance(child, PolynomialPieces)]
+            tips += [child for child in children if isinstance(child, Tips)]
+            element_parts = [child for child in children if isinstance(child, ElementParts)]
+            undivided = [ElementParts.joined(parts) for parts in alike(element_parts, attrgetter("element"))]
         all_tips = tuple(map(Tips.joined, alike(tips, attrgetter("patch"))))
         return SurfacePieces(self.scheme, PolynomialPieces.joined(regular), all_tips, (), self.sizes)
 
 
 def alike(parts: Iterable[_Any], key: Callable[[_Any], object]) -> list[list[_Any]]:
-    """Lists of parts that have equal keys, in the order of the first ones."""
-    found: dict[object, list[_Any]] = {}
-    for each in parts:
-        found.setdefault(key(each), []).append(each)
-    return list(found.values())
+    """Group parts by their keys, in the order in which the keys first appear."""
+    groups: dict[object, list[_Any]] = {}
+    for part in parts:
+        groups.setdefault(key(part), []).append(part)
+    return list(groups.values())
 
 
 def _seen(
     patches: PatchTable,
-    corners: IntArray,  # (p,) int: corners of elements where the patches begin
+    corners: IntArray,  # (p,) int: corners of elements at which the patches begin
     domain: AffineMap,  # From the part's parameters to the patch's
-    near: FloatArray,  # (2,) float64: parameters of the patch to which the corner shall be near
+    near: FloatArray,  # (2,) float64: parameters in the patch of a point whose nearest corner is chosen
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Of a part of each patch of a class, `half_edge`, `matrices` and `offsets` in its element.
+    """`half_edge`, `matrices` and `offsets` of the same part of all patches of a class.
 
-    A part of a whole element is seen from the corner that is nearest, so that parameters lose no digits there.
+    In a whole element, parameters start at the nearest corner, so that they lose no digits there.
     """
     half_edge, shape = corners, patches.scheme.domain
     is_whole = patches.is_whole[patches.elements.face[corners]]
@@ -318,7 +318,7 @@ def _seen(
 
 @dataclass(frozen=True, eq=False)
 class ElementBounds:
-    """Boxes with sides along the axes, each around the surface over one element.
+    """Axis-aligned bounding boxes of the surface over single elements.
 
     Attributes
     ----------
@@ -337,7 +337,7 @@ def element_bounds(
     pieces: SurfacePieces,
     elements: Topology,  # `PatchTable.elements`
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite where there is no element."""
+    """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite for faces that are no elements."""
     lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
 
     def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:
@@ -346,15 +346,14 @@ def element_bounds(
         np.maximum.at(upper, element, high)
 
     def widen_by(part: PolynomialPieces) -> None:
-        # Less the halvings of the element that have made each piece.
+        # HALVINGS of the element, minus those that led to the piece.
         size = np.sqrt(np.abs(np.linalg.det(part.matrices)))
         halvings = np.maximum(HALVINGS - np.rint(-np.log2(size)).astype(np.int64), 0)
         for count in np.unique(halvings).tolist():
-            which = np.flatnonzero(halvings == count)
-            divide, chosen = _divided(part.basis, count), part.chosen(which)
-            for at, columns in chosen.runs(CHUNK):
-                divided, origins = times(divide, columns), chosen.origins[at]
-                widen(chosen.half_edge[at], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
+            matrix, pieces_of_size = _divided(part.basis, count), part.chosen(np.flatnonzero(halvings == count))
+            for run, columns in pieces_of_size.runs(CHUNK):
+                divided, origins = times(matrix, columns), pieces_of_size.origins[run]
+                widen(pieces_of_size.half_edge[run], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
 
     widen_by(pieces.regular)
     for tips in pieces.tips:
@@ -368,9 +367,9 @@ def element_bounds(
 
 @lru_cache(maxsize=64)
 def _divided(basis: BernsteinBasis, count: int) -> FloatArray:
-    """``(c, b)`` map from coefficients to all different ones of the parts after so many halvings."""
-    found: FloatArray = np.eye(len(basis.indices))[None]
+    """``(c, b)`` matrix from a piece's coefficients to the distinct ones of its parts after ``count`` halvings."""
+    matrices: FloatArray = np.eye(len(basis.indices))[None]
     for _ in range(count):
-        found = np.concatenate([half @ found for half in basis.halves])
+        matrices = np.concatenate([half @ matrices for half in basis.halves])
     # Neighbouring parts share coefficients.
-    return np.unique(found.reshape(-1, found.shape[2]).round(14), axis=0)
+    return np.unique(matrices.reshape(-1, matrices.shape[2]).round(14), axis=0)

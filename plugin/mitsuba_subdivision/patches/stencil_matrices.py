@@ -19,23 +19,23 @@ from .patch_table import PatchTable, RefinedPatches
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Samples are evaluated in runs of about this many weights of each kind, which bounds temporary memory.
+# Weights per run of samples, for points and for each derivative, which bounds temporary memory.
 CHUNK = 1 << 19
 
 
 class StencilMatrices(NamedTuple):
     """Samples of a limit surface as weights over the cage's control points.
 
-    A matrix times ``(n_v, k)`` control points is ``(s, k)``: the result of that name of `LimitSurface.evaluate`, for
-    any control points, and for other values that are subdivided as points are. The weights do not depend on the
-    positions of control points. The transpose of a matrix takes gradients by samples to gradients by control points.
+    A matrix times ``(n_v, k)`` control points is ``(s, k)``: the field of the same name of `SurfaceSamples`, for any
+    control points, and for other values that are subdivided like points. The weights do not depend on the positions of
+    control points. The transpose of a matrix maps gradients by samples to gradients by control points.
 
     Attributes
     ----------
     p : (s, n_v) CSR array of float64
         Rows sum to one.
     dp_du, dp_dv : (s, n_v) CSR array of float64
-        Derivatives by the samples' own (u, v); rows sum to zero. At extraordinary points tangents, see
+        Derivatives by the (u, v) of the samples; rows sum to zero. At extraordinary points tangents, see
         `SurfaceSamples`.
     d2p_duu, d2p_duv, d2p_dvv : (s, n_v) CSR array of float64, or None
         Second derivatives, if requested. Not a number at an extraordinary point itself.
@@ -51,23 +51,23 @@ class StencilMatrices(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StencilRows:
-    """Some rows of several matrices."""
+    """Rows of ``d`` sparse matrices with the same structure."""
 
-    rows: IntArray  # (n,) int
-    columns: IntArray  # (n, K) int: entries of a row with the same column add up
-    weights: FloatArray  # (d, n, K) float64: of ``d`` matrices
+    rows: IntArray  # (n,) int: row indices
+    columns: IntArray  # (n, K) int: column indices; entries of a row with the same column add up
+    weights: FloatArray  # (d, n, K) float64
 
 
 def joined_matrices(parts: Iterable[StencilRows], count: int, shape: tuple[int, int]) -> list[sparse.csr_array]:
-    """A number of matrices, from their rows in any order."""
+    """Assemble ``count`` sparse matrices from their rows, given in any order."""
     entries: list[list[tuple[IntArray, IntArray, FloatArray]]] = [[] for _ in range(count)]
     for part in parts:
         columns = part.columns.astype(np.int32).ravel()
         rows = np.repeat(part.rows.astype(np.int32), part.columns.shape[1])
-        for own, weights in zip(entries, part.weights, strict=True):
-            own.append((rows, columns, weights.ravel()))
+        for matrix_entries, weights in zip(entries, part.weights, strict=True):
+            matrix_entries.append((rows, columns, weights.ravel()))
     none = np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32), np.empty(0)
-    matrices = [StencilTable.of(*shape, none, *own).matrix for own in entries]
+    matrices = [StencilTable.of(*shape, none, *matrix_entries).matrix for matrix_entries in entries]
     for matrix in matrices:
         matrix.eliminate_zeros()
     return matrices
@@ -82,7 +82,7 @@ def sample_matrices(
     uv: FloatArray,
     derivatives: int = 1,
 ) -> StencilMatrices:
-    """Limit stencils of samples, given as for `PatchSampler.evaluate`."""
+    """Limit stencils of samples, which are given as for `PatchSampler.evaluate`."""
 
     def stencils(signature: Signature, uv: FloatArray, corner: IntArray) -> FloatArray:
         return derivative_stencils(patches.scheme, signature, uv, corner, derivatives)
@@ -99,9 +99,9 @@ def vertex_matrices(
     uv: FloatArray,
     count: int = 3,
 ) -> list[sparse.csr_array]:
-    """Weights of points and of two tangents, or of points alone, quickly for the vertices of a tessellation.
+    """Weights of points and two tangents (``count`` 3), or of points (1); fast for the vertices of a tessellation.
 
-    Arguments as for `sample_matrices`. Tangents as `element_stencils` has them.
+    Other arguments are as for `sample_matrices`, and tangents as of `element_stencils`.
     """
     from scipy import sparse
 
@@ -112,15 +112,16 @@ def vertex_matrices(
     if refined is None:
         rows = _rows(patches, control_of_vertex, half_edge, uv, stencils)
         return joined_matrices(rows, count, (len(uv), control_count))
-    # Otherwise there would be too many classes.
-    every = np.arange(refined.table.topology.vertex_count)
-    rows = _rows(refined.table, every, *_in_refined(patches, refined, half_edge, uv), stencils)
-    of_mesh = sparse.csr_array(
+    # The cage has too many classes of patches: evaluate on the cage refined once.
+    refined_vertices = np.arange(refined.table.topology.vertex_count)
+    rows = _rows(refined.table, refined_vertices, *_in_refined(patches, refined, half_edge, uv), stencils)
+    mesh_of_control = sparse.csr_array(
         (np.ones(len(control_of_vertex)), (np.arange(len(control_of_vertex)), control_of_vertex)),
         shape=(len(control_of_vertex), control_count),
     )
-    matrix = refined.matrix @ of_mesh
-    return [(own @ matrix).tocsr() for own in joined_matrices(rows, count, (len(uv), len(every)))]
+    refinement = refined.matrix @ mesh_of_control
+    shape = len(uv), len(refined_vertices)
+    return [(weights @ refinement).tocsr() for weights in joined_matrices(rows, count, shape)]
 
 
 def _rows(
@@ -128,38 +129,37 @@ def _rows(
     control_of_vertex: IntArray,
     half_edge: IntArray,
     uv: FloatArray,
-    # Of samples of a class, from its signature, their parameters and their corners: ``(d, s, K)`` weights
+    # From a class's signature, and the parameters and patch corners of its samples, to ``(d, s, K)`` weights
     stencils: Callable[[Signature, FloatArray, IntArray], FloatArray],
 ) -> Iterator[StencilRows]:
     class_index, patch, patch_corner = patches.patch_at(half_edge)
     order = np.lexsort((*uv.T[::-1], patch_corner, class_index))
     begins = np.flatnonzero(np.diff(class_index[order], prepend=-1))
-    for of_class in counted(np.split(order, begins)[1:], "Weights of patch classes"):
-        patch_class = patches.classes[class_index[of_class[0]]]
-        run = max(1, CHUNK // patch_class.controls.shape[1])
-        for at in np.split(of_class, range(run, len(of_class), run)):
-            # Samples in the same place of their patches have the same weights.
-            places = np.stack([patch_corner[at], *uv[at].T])
+    for class_samples in counted(np.split(order, begins)[1:], "Weights of patch classes"):
+        patch_class = patches.classes[class_index[class_samples[0]]]
+        length = max(1, CHUNK // patch_class.controls.shape[1])
+        for run in np.split(class_samples, range(length, len(class_samples), length)):
+            # Samples at the same parameters of their patches have the same weights.
+            places = np.stack([patch_corner[run], *uv[run].T])
             is_new = (np.diff(places, axis=1, prepend=-1) != 0).any(axis=0)
-            distinct = at[is_new]
+            distinct = run[is_new]
             weights = stencils(patch_class.signature, uv[distinct], patch_corner[distinct])
-            controls = control_of_vertex[patch_class.controls[patch[at]]]
-            yield StencilRows(at, controls, weights[:, np.cumsum(is_new) - 1])
+            controls = control_of_vertex[patch_class.controls[patch[run]]]
+            yield StencilRows(run, controls, weights[:, np.cumsum(is_new) - 1])
 
 
 def _in_refined(
     patches: PatchTable, refined: RefinedPatches, half_edge: IntArray, uv: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Samples as locations in the cage refined once: corners of faces there, and parameters."""
+    """Locate samples in the cage refined once. Returns corners of its faces, and parameters."""
     t, domain = patches.elements, patches.scheme.domain
     half_edge, uv = half_edge.copy(), uv.copy()
-    # Any other element has parameters for each of its corners already.
+    # In elements that are not whole, every corner has a patch, whose parameters are already those of the refined face.
     whole = np.flatnonzero(patches.is_whole[t.face[half_edge]])
-    number, in_child = domain.first_child(uv[whole].T)
+    child, uv_in_child = domain.first_child(uv[whole].T)
     for corner in range(domain.corner_count):
-        at = whole[number == corner]
-        uv[at] = domain.rotation(corner).inverse()(in_child.T[number == corner])
-        later = whole[number > corner]
+        uv[whole[child == corner]] = domain.rotation(corner).inverse()(uv_in_child.T[child == corner])
+        later = whole[child > corner]
         half_edge[later] = t.next[half_edge[later]]
     # Face h of the refined cage lies at half-edge h of the cage, and begins there.
     return refined.table.topology.face_offsets[half_edge], uv

@@ -1,1 +1,1 @@
-"""Cages refined once, and refinements as functions of sharpness."""
+"""One refinement of a control cage."""

@@ -1,4 +1,4 @@
-"""The scheme of a cage, with the cage's rules."""
+"""Scheme of a cage with the rules of the cage."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from ..schemes.scheme_table import require_scheme
 
 
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
-    """The chosen scheme, or the cage's own or Catmull-Clark, with the cage's rules.
+    """Return a scheme with the cage's rules: ``chosen``, by default the cage's scheme, else Catmull-Clark.
 
-    Raises SchemeError if the scheme is unknown, has no rules for a face, a vertex or a tag of the cage, or makes no
-    surface of it. Warns if the cage's file names another scheme.
+    Raises SchemeError if the scheme is unknown, does not support a face, a vertex or a tag of the cage, or if the cage
+    has no surface. Warns if the cage's file names another scheme.
     """
     scheme = _with_rules_of(cage, chosen)
     cut = cage.cut_mesh
@@ -22,20 +22,19 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
         )
     if scheme.element == "face" and cage.is_hole.all():
         raise SchemeError(f'{cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary')
-    found = scheme.unsupported(cut.topology)
-    if found is not None:
-        source, first = cage.source, int(found.indices[0])
-        first = first if found.kind == "face" else int(cut.vertex[first])
-        where = source.at_face(first) if found.kind == "face" else source.at_vertex(first)
+    unsupported = scheme.unsupported(cut.topology)
+    if unsupported is not None:
+        source, first = cage.source, int(unsupported.indices[0])
+        first = first if unsupported.kind == "face" else int(cut.vertex[first])
+        where = source.at_face(first) if unsupported.kind == "face" else source.at_vertex(first)
         raise SchemeError(
-            f"{where} {found.problem}; the scheme {scheme.name} expects {found.expected} "
-            f"({len(found.indices)} in all; numbers count from {source.index_base})"
+            f"{where} {unsupported.problem}; the scheme {scheme.name} expects {unsupported.expected} "
+            f"({len(unsupported.indices)} in all; numbers count from {source.index_base})"
         )
     return scheme
 
 
 def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
-    """The chosen scheme, or the cage's own, with the cage's rules."""
     chosen = chosen or cage.scheme or "catmull_clark"
     if isinstance(chosen, str):
         scheme = scheme_named(chosen)
@@ -55,9 +54,9 @@ def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
         and not scheme.has_phantom_points
         and bool((cut.twin < 0).any() or cut.vertex_rules.any()),
     }
-    for what, asked in lacking.items():
-        if asked:
-            raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {what}")
+    for feature, is_lacking in lacking.items():
+        if is_lacking:
+            raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {feature}")
     has_triangles = bool((cage.face_sizes == 3).any())
     try:
         return with_rules(

@@ -1,9 +1,9 @@
-"""A control cage refined once: a cage with the same limit surface and more control points.
+"""Refinement of a control cage: a cage with the same limit surface and more control points.
 
-A scheme refines the *cut* mesh, in which a crease is a border on either side. The refined cage has its vertices joined
-again, and tags that make the same cut. Whether they do is checked, not assumed: the refined cage's own cut mesh must be
-the refined cut mesh, half-edge by half-edge, with the same rules and the same sharpness. Then refinement does the same
-to both from then on, so that they have the same limit surface.
+A scheme refines the *cut* mesh, in which each crease is a border of the faces on either side. In the refined cage the
+copies of vertices are merged again, and tags reproduce the cut. This is verified: the cut mesh of the refined cage must
+equal the refined cut mesh, half-edge by half-edge, with the same rules and sharpness. Then all further refinements are
+equal, and so are the limit surfaces.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ from .refined_corners import RefinedCorners
 if TYPE_CHECKING:
     from scipy import sparse
 
-# Corners that are added may depend on creases that are added. Then nothing is left to add.
+# Maximum number of iterations of `_with_tags`. One may add creases, the next one corners that depend on these creases.
 MOST_REPAIRS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class CageRefinement:
-    """A cage refined once, and how it follows from the cage before.
+    """A refined cage, and the maps from the coarse cage to it.
 
     Attributes
     ----------
     cage : ControlCage
-        With the same limit surface, texture coordinates and attributes. Under Catmull-Clark and Loop its vertices are
-        first those of the cage before, with their numbers, then one for each edge, then, under Catmull-Clark, one for
-        each face. Under Doo-Sabin there is one for each face corner.
+        The refined cage, with the same limit surface, texture coordinates and attributes. Under Catmull-Clark and Loop
+        its vertices are those of the coarse cage, with the same indices, then one for each edge, then, under
+        Catmull-Clark, one for each face. Under Doo-Sabin there is one for each face corner.
     matrix : (n, n_v) CSR array of float64
-        Its control points as weights over those before; rows sum to one.
+        Weights of the refined control points over the coarse ones; rows sum to one.
     element : (n_e,) int64
-        For each element of the refined cage, the element before that it lies in; under Doo-Sabin, -1 for a vertex
+        For each element of the refined cage, the coarse element that contains it; under Doo-Sabin, -1 for a vertex
         without an element. Elements are faces, under Doo-Sabin vertices, as for `LimitSurface.evaluate`.
     corner : (n_e,) int64
-        The corner of that element at which it lies, 0-based. From there old parameters are half the new ones, which
-        begin at the new element's corner 0; or the same, where the old one does not have four corners, under Loop
-        three. Under Loop, -1 for the triangle in the middle: there ``((1 - u) / 2, (1 - v) / 2)``, from corner 0, are
-        the old parameters of ``(u, v)`` from corner 1.
+        The 0-based corner of the coarse element at which the refined element lies. With (0, 0) at this corner, and at
+        corner 0 of the refined element, the coarse parameters are half the refined ones; they are equal if the coarse
+        element does not have four corners, under Loop three. Under Loop, -1 for the triangle in the middle: there the
+        coarse parameters, from corner 0, are ``((1 - u) / 2, (1 - v) / 2)``, with ``(u, v)`` from corner 1.
     """
 
     cage: ControlCage
@@ -66,12 +66,13 @@ class CageRefinement:
 
 def refine_cage(
     cage: ControlCage,
-    chosen: str | Scheme | None,  # As for `adapted_scheme`. If it is given, the refined cage names it.
+    chosen: str | Scheme | None,  # As for `adapted_scheme`. If not None, it becomes the refined cage's scheme.
 ) -> CageRefinement:
     """Refine a cage once.
 
-    Raises CageError if no cage has the refined surface, or the refined values of an attribute. Raises SchemeError if
-    the scheme does not number refined faces as Catmull-Clark, Loop or Doo-Sabin do, or has no rules for an attribute.
+    Raises CageError if no cage represents the refined surface, or the refined values of an attribute. Raises
+    SchemeError if the scheme does not order refined faces as Catmull-Clark, Loop or Doo-Sabin do, or does not support
+    an attribute.
     """
     scheme = adapted_scheme(cage, chosen)
     contents = CageContents(
@@ -86,7 +87,7 @@ def refine_cage(
 
 
 def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:
-    """Under a scheme whose elements are faces."""
+    """Refine a cage with a scheme whose elements are faces."""
     refinement = scheme.refine(cage.cut_mesh.topology)
     corners = RefinedCorners.of(cage, scheme, refinement.topology)
     matrix = _over_control_points(cage, refinement, corners.copies)
@@ -99,21 +100,21 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
         holes=np.flatnonzero(cage.is_hole[element]),
         materials={name: np.flatnonzero(np.isin(element, faces)) for name, faces in cage.materials.items()},
     )
-    contents, found = _with_tags(cage, contents, refinement, corners)
-    if not np.array_equal(found.is_hole, cage.is_hole[element]):
+    contents, refined = _with_tags(cage, contents, refinement, corners)
+    if not np.array_equal(refined.is_hole, cage.is_hole[element]):
         raise CageError(
             f'{cage.source.name}: boundary "{cage.boundary}" would make other holes of the refined cage, as a face has '
             "an edge twice; expected none that does"
         )
     if cage.texcoords is not None or cage.attributes:
-        mode, texcoords, attributes = refined_attributes(cage, found, scheme, refinement, matrix, corners)
+        mode, texcoords, attributes = refined_attributes(cage, refined, scheme, refinement, matrix, corners)
         rules = {**contents.rules, "face_varying": mode}
-        found = built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
-    return CageRefinement(found, matrix, element, corner)
+        refined = built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
+    return CageRefinement(refined, matrix, element, corner)
 
 
 def _over_control_points(cage: ControlCage, refinement: Refinement, rows: IntArray) -> sparse.csr_array:
-    """Stencils of some refined vertices of the cut mesh, over the cage's control points."""
+    """Return stencils over the cage's control points of refined vertices of the cut mesh, selected by ``rows``."""
     from scipy import sparse
 
     weights = refinement.stencils.matrix[rows]
@@ -127,13 +128,13 @@ def _over_control_points(cage: ControlCage, refinement: Refinement, rows: IntArr
 def _with_tags(
     cage: ControlCage, contents: CageContents, refinement: Refinement, corners: RefinedCorners
 ) -> tuple[CageContents, ControlCage]:
-    """Add the tags that make the refined cut mesh of a refined cage, and return the cage, too.
+    """Add tags so that the refined cage has the refined cut mesh. Return the contents and the refined cage.
 
-    Raises CageError if there are none.
+    Raises CageError if there are no such tags.
     """
     expected, cut = refinement.topology, cage.cut_mesh.topology
     sharpness = _refined_sharpness(cage.tags, refinement, corners)
-    # The point of an edge between two corners is in the middle and stays there, as a corner does.
+    # The edge point of a border edge between two corners does not move in later refinements, like a corner.
     stays = corners.at_ends(cut.vertex_rules == VertexRule.CORNER, cut)
     rules = expected.vertex_rules[expected.face_vertices]
     for _ in range(MOST_REPAIRS):
@@ -141,10 +142,10 @@ def _with_tags(
         ends = corners.vertex[sharp], corners.vertex[expected.next[sharp]]
         creases = np.stack([*ends, sharpness.edges[sharp]], axis=1)
         contents = replace(contents, creases=creases, corners=sharpness.corners())
-        found = built(contents)
-        is_joined, is_torn, has_other_rule, is_sharper = differences(expected, found.cut_mesh.topology)
-        found_rules = found.cut_mesh.topology.vertex_rules[found.cut_mesh.topology.face_vertices]
-        is_other = has_other_rule & ~(stays & (found_rules == VertexRule.CORNER))
+        refined = built(contents)
+        is_joined, is_torn, has_other_rule, is_sharper = differences(expected, refined.cut_mesh.topology)
+        refined_rules = refined.cut_mesh.topology.vertex_rules[refined.cut_mesh.topology.face_vertices]
+        is_other = has_other_rule & ~(stays & (refined_rules == VertexRule.CORNER))
         is_missing = is_other & (stays | (rules == VertexRule.CORNER))
         if not (is_joined.any() or is_missing.any()):
             break
@@ -157,11 +158,11 @@ def _with_tags(
             f"{where} and another face share two edges or more, so that refined edges would have the same two ends; "
             f"expected faces that share one edge at most ({wrong.sum()} such refined half-edges)"
         )
-    return contents, found
+    return contents, refined
 
 
 def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: RefinedCorners) -> Sharpness:
-    """Sharpness of the refined cage's half-edges and vertices: lowered where it is finite."""
+    """Return the sharpness of the refined cage: finite sharpness is lowered."""
     semi = refinement.topology.semi_sharpness
     edges = np.zeros(refinement.topology.half_edge_count) if semi is None else semi.edges.copy()
     edges[(corners.old_edge >= 0) & tags.is_infinite[corners.old_edge]] = INFINITE
@@ -171,15 +172,15 @@ def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: Refined
 
 
 def built(contents: CageContents) -> ControlCage:
-    """A cage of what another cage held, without the warnings that came with that one."""
+    """Build a cage without warnings."""
     with warnings.catch_warnings():
-        # What is no manifold, or used by no face, was so before.
+        # Problems that cause warnings were already in the coarse cage.
         warnings.simplefilter("ignore", CageWarning)
         return ControlCage.from_arrays(**contents.as_arguments())
 
 
 def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:
-    """Under Doo-Sabin, where a vertex is made of each face corner, and elements are vertices."""
+    """Refine a cage with Doo-Sabin, whose elements are vertices, and whose refined vertices belong to face corners."""
     cut = cage.cut_mesh.topology.with_rules(None, None)
     refinement = scheme.refine(cut)
     t = refinement.topology
@@ -190,7 +191,7 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
         )
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     texcoords, attributes = dual_attributes(cage, scheme, refinement, matrix)
-    found = built(
+    refined = built(
         replace(
             contents,
             positions=matrix @ cage.positions,
@@ -204,4 +205,4 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
     offsets, half_edges = cut.vertex_fans
     element[half_edges] = cut.face_vertices[half_edges]
     corner[half_edges] = ragged.index_in_row(np.diff(offsets))
-    return CageRefinement(found, matrix, element, corner)
+    return CageRefinement(refined, matrix, element, corner)

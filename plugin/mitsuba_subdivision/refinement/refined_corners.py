@@ -1,4 +1,4 @@
-"""Origins of the face corners of a refined mesh: a vertex, an edge or a face of the cage."""
+"""Parents of the face corners of a refined mesh: vertices, edges and faces of the cage."""
 
 from __future__ import annotations
 
@@ -12,29 +12,30 @@ from ..cage.control_cage import ControlCage
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes import Scheme, SchemeError
 
-# Origins of a refined vertex.
+# Kinds of parents of a refined vertex.
 VERTEX, EDGE, FACE = range(3)
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
-    """The face corners, or half-edges, of a cage's mesh refined once.
+    """The face corners, or half-edges, of the refined cut mesh of a cage.
 
-    First come the faces at the old corners, one for each, listed from the old vertex on; then perhaps others, with the
-    points of edges at their corners.
+    The first faces are those at the coarse corners, listed from the coarse vertex on. Then come, under Loop, the middle
+    triangles, whose corners are edge points.
     """
 
     cage: ControlCage
-    refined: Topology  # Of the cut mesh
-    kind: IntArray  # (n_c,) int: whether there is the point of a vertex, an edge or a face at each refined corner
-    # (n_c,) int: of the cage: one that begins at this vertex, runs along this edge, or lies in this face
+    refined: Topology  # The refined cut mesh
+    kind: IntArray  # (n_c,) int: whether the parent of each refined corner is a VERTEX, an EDGE or a FACE
+    # (n_c,) int: a half-edge of the cage that begins at the parent vertex, is along the parent edge or in the parent
+    # face
     half_edge: IntArray
 
     @classmethod
     def of(cls, cage: ControlCage, scheme: Scheme, refined: Topology) -> RefinedCorners:
-        """Find the origin of each corner.
+        """Find the parent of each corner.
 
-        Raises SchemeError if the scheme numbers refined faces in a way of its own.
+        Raises SchemeError if the scheme orders refined faces differently.
         """
         t, cut = cage.topology, cage.cut_mesh.topology
         h = np.arange(t.half_edge_count)
@@ -44,8 +45,8 @@ class RefinedCorners:
         else:
             kind = np.concatenate([np.tile([VERTEX, EDGE, EDGE], len(h)), np.full(len(h), EDGE)])
             half_edge = np.concatenate([np.stack([h, h, t.prev], axis=1).ravel(), h])
-        found = cls(cage, refined, kind, half_edge)
-        # In the cut mesh these are the same vertices, and the same edges on either side.
+        corners = cls(cage, refined, kind, half_edge)
+        # Refined vertices of the cut mesh must correspond one-to-one to its vertices and edges.
         parents = np.where(kind == VERTEX, cut.face_vertices[half_edge], cut.vertex_count + cut.edge[half_edge])
         known = (kind != FACE) & (len(kind) == refined.half_edge_count)
         if not known.any() or not _are_one_to_one(parents[known], refined.face_vertices[known]):
@@ -53,33 +54,33 @@ class RefinedCorners:
                 f"{cage.source.name}: the scheme {scheme.name} numbers refined faces in a way of its own; expected one "
                 "that refines as Catmull-Clark, Loop or Doo-Sabin do"
             )
-        return found
+        return corners
 
     @cached_property
     def edge(self) -> IntArray:
-        """``(n_h,)`` a number for each half-edge that all sides of its edge share, also where it is non-manifold."""
-        found = self.cage.non_manifold
-        return self.cage.topology.edge if found is None else found.edge
+        """``(n_h,)`` edge of each half-edge, equal for all half-edges of a non-manifold edge."""
+        non_manifold = self.cage.non_manifold
+        return self.cage.topology.edge if non_manifold is None else non_manifold.edge
 
     @cached_property
     def is_split(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether some face has the edge twice: the two halves of the face must not get a common vertex."""
+        """``(n_h,)`` whether a face has the edge twice. Its two sides then need separate edge points."""
         t = self.cage.topology
-        of_face = self.edge.astype(np.int64) * t.face_count + t.face
-        _, which, count = np.unique(of_face, return_inverse=True, return_counts=True)
+        edge_and_face = self.edge.astype(np.int64) * t.face_count + t.face
+        _, which, count = np.unique(edge_and_face, return_inverse=True, return_counts=True)
         is_double = np.zeros(int(self.edge.max()) + 1, dtype=bool)
         is_double[self.edge[count[which.ravel()] > 1]] = True
         return is_double[self.edge]
 
     @cached_property
     def vertex(self) -> IntArray:
-        """``(n_c,)`` the refined cage's vertex at each corner: the same on all sides of a cut."""
+        """``(n_c,)`` vertex of the refined cage at each corner, equal on all sides of a cut."""
         t, h = self.cage.topology, self.half_edge
         count, edge_count = self.cage.vertex_count, int(self.edge.max()) + 1
-        of_sides = count + edge_count + t.face_count + self.refined.face_vertices
+        split_vertex = count + edge_count + t.face_count + self.refined.face_vertices
         number = np.select(
             [self.kind == VERTEX, self.kind == FACE, self.is_split[h]],
-            [t.face_vertices[h], count + edge_count + t.face[h], of_sides],
+            [t.face_vertices[h], count + edge_count + t.face[h], split_vertex],
             count + self.edge[h],
         )
         is_new = number >= count
@@ -88,22 +89,22 @@ class RefinedCorners:
 
     @cached_property
     def copies(self) -> IntArray:
-        """``(n,)`` one vertex of the refined cut mesh for each of the refined cage; old ones keep their numbers."""
-        found = np.arange(max(self.cage.vertex_count, int(self.vertex.max()) + 1))
-        later = self.vertex >= self.cage.vertex_count
-        found[self.vertex[later]] = self.refined.face_vertices[later]
-        return found
+        """``(n,)`` a vertex of the refined cut mesh for each vertex of the refined cage; coarse vertices come first."""
+        copies = np.arange(max(self.cage.vertex_count, int(self.vertex.max()) + 1))
+        is_new = self.vertex >= self.cage.vertex_count
+        copies[self.vertex[is_new]] = self.refined.face_vertices[is_new]
+        return copies
 
     @cached_property
     def old_edge(self) -> IntArray:
-        """``(n_c,)`` the cage's half-edge that each refined half-edge is a half of, -1 for new edges."""
-        other = self.refined.next
-        is_edge, goes_to_edge = self.kind == EDGE, self.kind[other] == EDGE
-        from_edge = np.where(is_edge & (self.kind[other] == VERTEX), self.half_edge, -1)
-        return np.where(goes_to_edge & (self.kind == VERTEX), self.half_edge[other], from_edge)
+        """``(n_c,)`` half-edge of the cage of which each refined half-edge is a half, -1 for new edges."""
+        end = self.refined.next
+        is_edge, goes_to_edge = self.kind == EDGE, self.kind[end] == EDGE
+        from_edge = np.where(is_edge & (self.kind[end] == VERTEX), self.half_edge, -1)
+        return np.where(goes_to_edge & (self.kind == VERTEX), self.half_edge[end], from_edge)
 
     def elements(self) -> tuple[IntArray, IntArray]:
-        """Face of the cage that each refined face lies in, and the corner at which it lies; -1 for none."""
+        """Return the face of the cage that contains each refined face, and the corner at which it lies, -1 for none."""
         t, first = self.cage.topology, self.refined.face_offsets[:-1]
         half_edge = self.half_edge[first].astype(np.int64)
         face = t.face[half_edge].astype(np.int64)
@@ -112,14 +113,15 @@ class RefinedCorners:
 
     def values(
         self,
-        indices: IntArray,  # (n_h,) int: of the values at the cage's face corners
+        indices: IntArray,  # (n_h,) int: index of the attribute's value at each face corner of the cage
     ) -> tuple[IntArray, IntArray]:
-        """How many different values of a face-varying attribute there are, and where.
+        """Determine the distinct refined values of a face-varying attribute.
 
-        Corners share a value if they are of the same vertex of the refined cage and follow from the same values: those
-        at the old vertex, or at both ends of the edge.
+        Refined corners share a value if they are at the same vertex of the refined cage and depend on the same values:
+        that at the coarse vertex, or those at both ends of the edge.
 
-        Returns a corner that has each value, (n,) int64, and the indices of the values at all corners, (n_c,) int64.
+        Returns (n,) int64, a refined corner with each value, and (n_c,) int64, the index of the value at each refined
+        corner.
         """
         t, h = self.cage.topology, self.half_edge
         start, end = h, np.where(self.kind == EDGE, t.next[h], h)
@@ -127,11 +129,11 @@ class RefinedCorners:
         start, end = np.where(swaps, end, start), np.where(swaps, start, end)
         pair = np.where(self.kind == FACE, 0, indices[start] * (int(indices.max()) + 1) + indices[end])
         pairs, number = np.unique(pair, return_inverse=True)
-        _, first, found = np.unique(self.vertex * len(pairs) + number, return_index=True, return_inverse=True)
-        return first, found
+        _, first, refined_indices = np.unique(self.vertex * len(pairs) + number, return_index=True, return_inverse=True)
+        return first, refined_indices
 
     def linear(self, values: NDArray[np.float64]) -> NDArray[np.floating]:
-        """``(n_c, k)`` values at refined corners from ``(n_h, k)`` at the cage's: means over edges and faces."""
+        """Interpolate ``(n_h, k)`` values linearly to refined corners, ``(n_c, k)``: means over edges and faces."""
         t, h = self.cage.topology, self.half_edge
         sums = [np.bincount(t.face, column, minlength=t.face_count) for column in values.T]
         means = np.stack(sums, axis=1) / t.face_sizes[:, None]
@@ -141,17 +143,17 @@ class RefinedCorners:
 
     def at_ends(
         self,
-        of_vertices: NDArray[np.bool_],  # (n_v,) bool
-        topology: Topology,  # The mesh before, cut in some way
+        of_vertices: NDArray[np.bool_],  # (n_v,) bool: condition at each vertex
+        topology: Topology,  # The coarse mesh, cut along creases or seams
     ) -> NDArray[np.bool_]:
-        """``(n_c,)`` whether a corner is the point of an edge on a border, at both of whose ends something holds."""
+        """Return ``(n_c,)``: whether a corner is the edge point of a border edge whose ends fulfil the condition."""
         h, t = self.half_edge, topology
         ends = of_vertices[t.face_vertices[h]] & of_vertices[t.face_vertices[t.next[h]]]
         return (self.kind == EDGE) & (t.twin[h] < 0) & ends
 
 
 def _are_one_to_one(one: IntArray, other: IntArray) -> bool:
-    """Whether equal numbers in either array stand beside equal ones in the other."""
-    there, back = np.zeros(one.max() + 1, dtype=np.int64), np.zeros(other.max() + 1, dtype=np.int64)
-    there[one], back[other] = other, one
-    return np.array_equal(there[one], other) and np.array_equal(back[other], one)
+    """Return whether two arrays of labels define the same partition."""
+    to_other, to_one = np.zeros(one.max() + 1, dtype=np.int64), np.zeros(other.max() + 1, dtype=np.int64)
+    to_other[one], to_one[other] = other, one
+    return np.array_equal(to_other[one], other) and np.array_equal(to_one[other], one)

@@ -1,23 +1,23 @@
-"""Masks at borders, creases, corners and semi-sharp features, which Catmull-Clark and Loop have in common.
+"""Masks at borders, creases, corners and semi-sharp features, shared by Catmull-Clark and Loop.
 
-A mask is the set of weights that makes a refined vertex of vertices before. The mask of a vertex depends on the sharp
-edges that meet there; an edge on the border is sharp.
+A mask is the set of weights of coarse vertices for a refined vertex. The mask of a vertex depends on its number of
+sharp edges; a border edge is sharp.
 
 ================  ======================================  ==================================
-vertex            sharp edges there                       mask
+vertex            sharp edges                             mask
 ================  ======================================  ==================================
-smooth            none                                    the scheme's own
-dart              one                                     the scheme's own
+smooth            none                                    the scheme's smooth mask
+dart              one                                     the scheme's smooth mask
 crease            two, with the far ends ``a`` and ``b``  ``(6 S + a + b) / 8``
 corner            three or more, or the vertex is sharp   ``S``: the vertex stays
 ================  ======================================  ==================================
 
-The point of a sharp edge is its midpoint, if both halves of the edge stay sharp. Where a refinement makes something
-smooth, the masks before and after it are blended: the share of the masks before is the mean
-sharpness of what becomes smooth there [DeRose et al. 1998; Hoppe et al. 1994].
+The edge point of a sharp edge is its midpoint, if both halves of the edge stay sharp. Where edges or the vertex become
+smooth in a refinement, the masks before and after it are blended. The weight of the mask before is the mean sharpness
+of these features [DeRose et al. 1998; Hoppe et al. 1994].
 
-OpenSubdiv computes the same (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`), also where Chaikin's method makes an
-edge of a sharpness above one smooth: the share of the midpoint is then above one, too.
+OpenSubdiv computes the same (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). Chaikin's method may make an edge with a
+sharpness above one smooth; the weight of its midpoint is then above one, as in OpenSubdiv.
 """
 
 from __future__ import annotations
@@ -36,25 +36,24 @@ CREASE_NEIGHBOUR = 1 / 8
 
 @dataclass(frozen=True, eq=False)
 class CreaseMasks:
-    """Masks of all vertices and edges, as shares of the scheme's smooth masks and weights besides."""
+    """Masks of all vertices and edges: the scheme's smooth masks times a factor, plus further weights."""
 
-    smooth: FloatArray  # (n_v,) float64: share of the scheme's smooth mask in the mask of each vertex
-    own: FloatArray  # (n_v,) float64: weight of the vertex itself in the rest of its mask
-    # (m,) int64;  weights : (m,) float64: further weights in the rest: of vertex ``columns`` in the mask of vertex
-    # ``rows``
+    smooth: FloatArray  # (n_v,) float64: factor of the scheme's smooth mask in the mask of each vertex
+    own: FloatArray  # (n_v,) float64: further weight of the vertex itself
+    # (m,) int64 and (m,) float64: further weights of neighbours: of vertex ``columns`` in the mask of vertex ``rows``
     rows: IntArray
     columns: IntArray
     weights: FloatArray
-    # (n_h,) float64: share of the edge's midpoint in the point of each half-edge's edge; the rest is the scheme's
-    # smooth mask. Equal on both half-edges of an edge, 1 on borders.
+    # (n_h,) float64: factor of the midpoint in the edge point of each half-edge; that of the scheme's smooth mask is
+    # one minus this. Equal for both half-edges of an edge, 1 on borders.
     midpoint: FloatArray
 
 
 def crease_masks(topology: Topology) -> CreaseMasks:
-    """Find the masks of every vertex and edge of a mesh."""
+    """Compute the masks of all vertices and edges of a mesh."""
     t, semi = topology, topology.semi_sharpness
     border = t.twin < 0
-    # Edges at each vertex: all that begin there, and the last one of an open fan, which ends there.
+    # Edges at each vertex: the outgoing half-edges, and the last edge of an open fan, whose half-edge ends there.
     origin, end = t.face_vertices, t.face_vertices[t.next]
     centre = np.concatenate([origin, end[border]])
     far = np.concatenate([end, origin[border]])
@@ -66,44 +65,44 @@ def crease_masks(topology: Topology) -> CreaseMasks:
 
     of_borders = np.zeros(np.count_nonzero(border))
     sharpness, refined = (np.concatenate([edges, of_borders]) for edges in (semi.edges, semi.edges_refined))
-    across, was_across = semi.across_vertex[semi.across_sharpens], semi.across_sharpness[semi.across_sharpens]
+    across, across_sharpness = semi.across_vertex[semi.across_sharpens], semi.across_sharpness[semi.across_sharpens]
     across_refined = semi.across_refined[semi.across_sharpens]
-    before = _vertex_masks(t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, across[was_across > 0])
+    before = _vertex_masks(
+        t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, across[across_sharpness > 0]
+    )
     after = _vertex_masks(
         t, centre, infinite, infinite | (refined > 0), semi.vertices_refined > 0, across[across_refined > 0]
     )
 
-    # The mean sharpness of all that becomes smooth. By Chaikin's method single edges are sharper than 1, and in meshes
-    # that are cut along seams their mean is, too.
-    at = np.concatenate([centre, np.arange(t.vertex_count), across])
-    was = np.concatenate([sharpness, semi.vertices, was_across])
-    becomes_smooth = (was > 0) & (np.concatenate([refined, semi.vertices_refined, across_refined]) == 0)
-    count = np.bincount(at[becomes_smooth], minlength=t.vertex_count)
-    total = np.bincount(at[becomes_smooth], was[becomes_smooth], minlength=t.vertex_count)
-    share_before = np.minimum(total / np.maximum(count, 1), 1)
-    share_before[(before[0] == after[0]) | (before[0] < 2)] = 1
+    # The mean sharpness of all features that become smooth. With Chaikin's method their sharpness may exceed 1, and in
+    # meshes cut along seams so may the mean.
+    vertex = np.concatenate([centre, np.arange(t.vertex_count), across])
+    sharpness_before = np.concatenate([sharpness, semi.vertices, across_sharpness])
+    becomes_smooth = (sharpness_before > 0) & (np.concatenate([refined, semi.vertices_refined, across_refined]) == 0)
+    count = np.bincount(vertex[becomes_smooth], minlength=t.vertex_count)
+    total = np.bincount(vertex[becomes_smooth], sharpness_before[becomes_smooth], minlength=t.vertex_count)
+    weight_before = np.minimum(total / np.maximum(count, 1), 1)
+    weight_before[(before[0] == after[0]) | (before[0] < 2)] = 1
 
     twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]
     stays_sharp = border | ((semi.edges_refined > 0) & (twin_refined > 0))
-    shares = [(before, share_before), (after, 1 - share_before)]
+    shares = [(before, weight_before), (after, 1 - weight_before)]
     return _blended(shares, centre, far, np.where(stays_sharp, 1, semi.edges))
 
 
 def _vertex_masks(
     t: Topology,
-    centre: IntArray,  # (n,) int: the vertex, for each edge at a vertex
-    # (n,) bool: whether each of these edges is infinitely sharp; whether it is sharp at all
-    infinite: NDArray[np.bool_],
-    sharp: NDArray[np.bool_],
-    sharp_vertices: NDArray[np.bool_],  # (n_v,) bool: vertices that are semi-sharp themselves
-    across: IntArray,  # (m,) int: the vertex, for each semi-sharp edge across the cut that sharpens it
+    centre: IntArray,  # (n,) int: the vertex of each pair of a vertex and an edge at it
+    infinite: NDArray[np.bool_],  # (n,) bool: whether the edge of each pair is infinitely sharp
+    sharp: NDArray[np.bool_],  # (n,) bool: whether it is infinitely sharp or semi-sharp
+    sharp_vertices: NDArray[np.bool_],  # (n_v,) bool: semi-sharp vertices
+    across: IntArray,  # (m,) int: the vertex of each semi-sharp edge across the cut that sharpens it
 ) -> tuple[IntArray, FloatArray]:
-    """Find the mask of every vertex, before or after a refinement.
+    """Determine the mask of every vertex, before or after a refinement.
 
     Returns (n_v,) int64, the number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3
-    for the corner mask. More than three count as 3, and so does whatever else makes the vertex a corner. And (n,)
-    float64, for each edge at a vertex, 1 if it is sharp and 0 if it is not. The one sharp edge at a dart is cut into
-    two border edges, which count a half each.
+    for the corner mask. It is also 3 for more edges and for other corners. And (n,) float64, for each pair 1 if the
+    edge is sharp and 0 if not. The sharp edge of a dart is cut into two border edges, which count 1/2 each.
     """
     along = sharp.astype(float)
     along[infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5
@@ -116,12 +115,12 @@ def _vertex_masks(
 def _blended(
     shares: list[tuple[tuple[IntArray, FloatArray], FloatArray]], centre: IntArray, far: IntArray, midpoint: FloatArray
 ) -> CreaseMasks:
-    """Masks before and after a refinement, with the share of each at every vertex; the shares sum to one."""
+    """Blend the masks before and after a refinement with their weights at each vertex, which sum to one."""
     smooth, own = np.zeros((2, len(shares[0][1])))
     rows, columns, weights = [], [], []
     for (sharp_count, along), share in shares:
         smooth += share * (sharp_count < 2)
-        # None beside the smooth mask; the vertex's weight in the crease mask; all of the corner mask.
+        # The vertex's weight beside the smooth mask (none), in the crease mask and in the corner mask.
         own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]
         creased = np.flatnonzero((along > 0) & (sharp_count == 2)[centre] & (share > 0)[centre])
         rows.append(centre[creased])

@@ -1,4 +1,4 @@
-"""Parameter domains: the unit square and the unit triangle, their corners, and their four halved copies."""
+"""Parameter domains: the unit square and the unit triangle, their corners and their four children."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ class AffineMap(NamedTuple):
 
     def __call__(self, uv: FloatArray) -> FloatArray:
         """Map ``(s, 2)`` parameters."""
-        # Products and sums one by one, not by BLAS: a fused or reordered sum could lose the low bits of tiny
-        # parameters.
+        # Not by BLAS: a fused or reordered sum could lose the low bits of tiny parameters.
         (a, b), (c, d) = self.matrix
         return np.stack(
             [a * uv[..., 0] + b * uv[..., 1] + self.offset[0], c * uv[..., 0] + d * uv[..., 1] + self.offset[1]],
@@ -38,7 +37,7 @@ class AffineMap(NamedTuple):
         return AffineMap(inverse, -inverse @ self.offset)
 
     def is_same(self, other: AffineMap) -> bool:
-        """Whether two maps are equal, bit by bit."""
+        """Return whether two maps are exactly equal."""
         return np.array_equal(self.matrix, other.matrix) and np.array_equal(self.offset, other.offset)
 
 
@@ -46,16 +45,16 @@ IDENTITY = AffineMap(np.eye(2), np.zeros(2))
 
 
 class ParameterDomain:
-    """A parameter domain with a corner at (0, 0), which splits into four copies of itself at half the size.
+    """A parameter domain with a corner at (0, 0), which splits into four copies of half the size, its children.
 
-    There are two, `SQUARE` and `TRIANGLE`. Arguments ``u`` and ``v`` may be arrays of NumPy or of Dr.Jit.
+    There are two, `SQUARE` and `TRIANGLE`. Arguments ``u`` and ``v`` may be NumPy or Dr.Jit arrays.
 
     Parameters
     ----------
     corners : (m, 2) float64
         Counter-clockwise from (0, 0). Edge i begins at corner i.
     children : tuple of AffineMap
-        From the domain to each copy's own parameters. Copy 0 holds the corner (0, 0).
+        Maps from the parameters of the domain to those of each child. Child 0 contains the corner (0, 0).
     """
 
     def __init__(self, name: str, corners: FloatArray, children: tuple[AffineMap, ...]) -> None:
@@ -77,14 +76,14 @@ class ParameterDomain:
         return np.stack([v - v_next, u_next - u], axis=1)
 
     def rotation(self, corner: int) -> AffineMap:
-        """From parameters with (0, 0) at corner ``corner`` to parameters with (0, 0) at corner 0."""
+        """Return the map from parameters with (0, 0) at corner ``corner`` to parameters with (0, 0) at corner 0."""
         start = self.corners[corner]
         along_u = self.corners[(corner + 1) % self.corner_count] - start
         along_v = self.corners[corner - 1] - start
         return AffineMap(np.stack([along_u, along_v], axis=1), start)
 
     def inside(self, uv: FloatArray) -> FloatArray:
-        """``(s,)`` depth of parameters in the domain: positive inside, zero on the domain's edges, negative outside."""
+        """Return ``(s,)`` depth of parameters: positive inside the domain, zero on its edges, negative outside."""
         return reduce(np.minimum, self.edge_distances(uv[..., 0], uv[..., 1]))
 
     @property
@@ -92,49 +91,49 @@ class ParameterDomain:
         raise NotImplementedError
 
     def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
-        """Depth of parameters inside each edge, along `edge_normals`."""
+        """Return signed distances of parameters from each edge along `edge_normals`, positive inside."""
         raise NotImplementedError
 
     def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
-        """Weights of the corners in linear interpolation: barycentric coordinates, or bilinear weights."""
+        """Return the weights of corners in linear interpolation: bilinear weights, or barycentric coordinates."""
         raise NotImplementedError
 
     def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """Derivatives of `corner_weights` by u, and by v."""
+        """Return the derivatives of `corner_weights` by u, and by v."""
         raise NotImplementedError
 
     def indices(self, degree: int) -> IntArray:
-        """``(n, 2)`` steps along u and v to the points that divide each edge into ``degree`` parts, u fastest."""
+        """Return ``(n, 2)`` indices along u and v of the grid with ``degree`` intervals along each edge, u fastest."""
         v, u = np.indices((degree + 1, degree + 1)).reshape(2, -1)
         return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
     def extent(self, uv: ArrayLike) -> FloatArray:
-        """``(s,)`` size of the smallest scaled copy of the domain, with its corner at (0, 0), that contains ``uv``.
+        """Return ``(s,)`` size of the smallest copy of the domain, scaled about (0, 0), that contains ``uv``.
 
-        It is 1 for the whole domain.
+        The size of the domain is 1.
         """
         raise NotImplementedError
 
     def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """The first of `children` that holds parameters ``(2, s)``, and the parameters ``(2, s)`` there."""
+        """Return the first of `children` that contains parameters ``(2, s)``, and the child's parameters ``(2, s)``."""
         raise NotImplementedError
 
     def clamped(self, uv: FloatArray) -> FloatArray:
-        """``(s, 2)`` parameters moved into the domain, to the nearest point or nearly so."""
+        """Return ``(s, 2)`` parameters clamped to the domain, to the nearest point or close to it."""
         raise NotImplementedError
 
     def from_square(self, uv: FloatArray) -> FloatArray:
-        """``(s, 2)`` random numbers, uniform in the unit square, made uniform in the domain."""
+        """Map ``(s, 2)`` random numbers that are uniform in the unit square to ones that are uniform in the domain."""
         raise NotImplementedError
 
     def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
-        """Points ``(g, 2)`` and weights ``(g,)`` of Gauss's rule with ``order`` points along each parameter."""
+        """Return points ``(g, 2)`` and weights ``(g,)`` of Gauss quadrature, ``order`` points along each parameter."""
         raise NotImplementedError
 
 
 @lru_cache(maxsize=32)
 def _gauss(order: int) -> tuple[FloatArray, FloatArray]:
-    """Gauss's rule on [-1, 1], whose eigenvalue problem takes longer than the few sums that need it."""
+    """Return Gauss-Legendre nodes and weights on [-1, 1]; cached, as they need an eigenvalue problem."""
     return np.polynomial.legendre.leggauss(order)
 
 
@@ -171,7 +170,7 @@ class _Square(ParameterDomain):
     def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
         nodes, weights = _gauss(order)
         nodes, weights = (nodes + 1) / 2, weights / 2
-        u, v = (each.ravel() for each in np.meshgrid(nodes, nodes))
+        u, v = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
         return np.stack([u, v], axis=1), np.outer(weights, weights).ravel()
 
 
@@ -210,7 +209,7 @@ class _Triangle(ParameterDomain):
         return np.where(uv.sum(axis=-1, keepdims=True) > 1, 1 - uv, uv)
 
     def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
-        # As the square with one of its sides drawn together to a point.
+        # The rule of the square, with one side collapsed to a point.
         uv, weights = SQUARE.quadrature(order)
         u, v = uv.T
         return np.stack([u, v * (1 - u)], axis=1), weights * (1 - u)
@@ -226,7 +225,7 @@ SQUARE: ParameterDomain = _Square(
     (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (-1, -1)), _halved(1, (0, -1))),
 )
 
-# The middle child is turned by half a turn: its parameters run backwards.
+# The middle child is rotated by half a turn: its parameters run backwards.
 TRIANGLE: ParameterDomain = _Triangle(
     "triangle",
     np.array([(0, 0), (1, 0), (0, 1)], dtype=float),

@@ -15,8 +15,8 @@ from .stencil_table import StencilTable
 class DooSabin(Scheme):
     """Doo-Sabin subdivision of polygon meshes. Patches belong to vertices, extraordinary points lie in faces.
 
-    Each corner of an n-gon becomes a vertex with the weights ``(n + 5) / 4n`` on itself and ``(3 + 2 cos(2 pi j / n)) /
-    4n`` on the corner j steps along [Doo and Sabin 1978]. Border edges and vertices of an open mesh make no faces.
+    Each corner of an n-gon becomes a vertex. The weight of the corner is ``(n + 5) / 4n``, that of the corner j steps
+    farther ``(3 + 2 cos(2 pi j / n)) / 4n`` [Doo and Sabin 1978]. Border edges and border vertices create no faces.
     """
 
     name = "doo_sabin"
@@ -26,34 +26,35 @@ class DooSabin(Scheme):
     regular_valence = 4
     has_convex_rules = True
     regular_lattice = np.array([(i, j) for j in (-0.5, 0.5, 1.5) for i in (-0.5, 0.5, 1.5)])
-    # The domain spans the centres of the faces around the vertex, whose first face has the centre (0, 0).
+    # The corners of the domain are the centres of the faces around the vertex; that of the first face is (0, 0).
     first_edge = np.array([(0.5, 0.5), (-0.5, 0.5)])
     edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
-    # A vertex on a border has no patch, so that no patch has control points beyond one.
+    # A border vertex has no patch, so no patch has control points beyond a border.
     phantom_points = ()
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
-        """Vertices of a valence below 3, which would become faces of two corners."""
+        """Return vertices of a valence below 3, which would become faces with two corners."""
         return low_valence(topology, 3)
 
     def refine(self, topology: Topology) -> Refinement:
-        """Make one face for every face, interior edge and interior vertex, in this order.
+        """Create one face for every face, inner edge and inner vertex, in this order.
 
-        New vertex ``h`` is made of the face corner ``h``. The half-edges of the new faces inside old ones keep the old
-        numbers.
+        Refined vertex ``h`` belongs to the face corner ``h``. The half-edges of refined faces inside coarse faces keep
+        their indices.
         """
         t = topology
         corners = np.arange(t.half_edge_count)
         first = t.edge_half_edge[t.twin[t.edge_half_edge] >= 0]
         second = t.twin[first]
-        of_edges = np.stack([t.next[first], first, t.next[second], second], axis=1)
+        edge_faces = np.stack([t.next[first], first, t.next[second], second], axis=1)
         fan_offsets, fans = t.vertex_fans
         valences = np.diff(fan_offsets)
         sizes = np.concatenate([t.face_sizes, np.full(len(first), 4), valences[valences > 0]])
-        refined = Topology(t.half_edge_count, sizes, np.concatenate([corners, of_edges.ravel(), fans]))
+        refined = Topology(t.half_edge_count, sizes, np.concatenate([corners, edge_faces.ravel(), fans]))
 
         size, begin = t.face_sizes[t.face], t.face_offsets[t.face]
-        # The mask of each face, one weight for each of its corners: of a large face all corners share its cosines.
+        # One mask for each face, with a weight for each of its corners, so that cosines are computed once for each
+        # face.
         steps = corners - begin
         mask = np.where(steps == 0, (size + 5) / (4 * size), (3 + 2 * np.cos(2 * np.pi * steps / size)) / (4 * size))
         corner = np.repeat(corners, size)
@@ -65,7 +66,7 @@ class DooSabin(Scheme):
         return Refinement(refined, StencilTable.of(t.half_edge_count, t.vertex_count, (corner, member, weight)))
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
-        """The four new vertices around a vertex of valence 4; of another valence, the one in the half-edge's face."""
+        """Return the four refined vertices around a vertex of valence 4; else the one in the half-edge's face."""
         fan: list[int] = []
         current = half_edge
         while not fan or current != half_edge:
@@ -75,7 +76,7 @@ class DooSabin(Scheme):
             return [(IDENTITY, half_edge)]
         parts = []
         for k, child in enumerate(self.domain.children):
-            # The new half-edge inside the old face; the part's own (0, 0) lies k faces before.
+            # The refined half-edge inside the coarse face; the child's (0, 0) is k faces before it.
             start = fan[k]
             for _ in range((4 - k) % 4):
                 start = int(refined.turn(start))
@@ -83,12 +84,12 @@ class DooSabin(Scheme):
         return parts
 
     def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
-        """Uniform biquadratic B-splines."""
+        """Evaluate uniform biquadratic B-splines."""
         return tensor_basis(_quadratic(uv[:, 0], derivatives), _quadratic(uv[:, 1], derivatives), derivatives)
 
 
 def _quadratic(t: FloatArray, derivatives: int) -> FloatArray:
-    """Uniform quadratic B-spline segment: ``(derivatives + 1, s, 3)``."""
+    """Evaluate a uniform quadratic B-spline segment: ``(derivatives + 1, s, 3)``."""
     s = 1 - t
     one = np.ones_like(t)
     rows: list[list[FloatArray]] = [[s * s / 2, (1 + 2 * s * t) / 2, t * t / 2], [-s, s - t, t], [one, -2 * one, one]]

@@ -1,4 +1,4 @@
-"""The base class of a subdivision scheme, and what the rules of several schemes share."""
+"""Base class of subdivision schemes, and functions that the rules of several schemes share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TriangleRule = Literal["catmull_clark", "smooth"]
 
 
 class SchemeError(ValueError):
-    """A scheme cannot be used: its name is unknown, it is no scheme, or its rules do not cover a cage."""
+    """A scheme cannot be used: it is unknown or invalid, or its rules do not support a cage."""
 
 
 class Refinement(NamedTuple):
@@ -30,28 +30,28 @@ class Refinement(NamedTuple):
     topology : Topology
         The refined mesh.
     stencils : StencilTable
-        The refined vertices as weighted sums of the vertices before.
+        The refined vertices as weighted sums of the coarse vertices.
     """
 
     topology: Topology
     stencils: StencilTable
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """Refined points, ``(n_new, k)``, from those before."""
+        """Return the refined points, ``(n_new, k)``, of coarse points."""
         return self.stencils.matrix @ points
 
 
 class PhantomPoint(NamedTuple):
-    """A phantom point: a control point beyond the border as a combination of control points within.
+    """A control point beyond the border, as a combination of control points inside the mesh.
 
-    With these points a patch beside the border is a regular one, whose limit surface is that of the masks at borders.
+    With phantom points a patch beside the border is a regular patch, with the same limit surface as the border masks.
 
     Attributes
     ----------
     offsets : tuple of (2,)
-        Lattice steps from the phantom point to the control points that it is made of.
+        Lattice steps from the phantom point to the control points that are combined.
     weights : tuple of float
-        Their weights, in the same order; they sum to one.
+        Weights of these control points; they sum to one.
     """
 
     offsets: tuple[tuple[float, float], ...]
@@ -59,17 +59,17 @@ class PhantomPoint(NamedTuple):
 
 
 class Unsupported(NamedTuple):
-    """Faces or vertices that a scheme has no rules for.
+    """Faces or vertices that the rules of a scheme do not support.
 
     Attributes
     ----------
     kind : "face" or "vertex"
     indices : (n,) int64
-        0-based numbers of these faces or vertices, at least one.
+        0-based indices of these faces or vertices, at least one.
     problem : str
-        The problem of the first of them, such as "has 5 corners".
+        Problem of the first one, such as "has 5 corners".
     expected : str
-        Meshes that the scheme has rules for, such as "triangles only".
+        Supported meshes, such as "triangles only".
     """
 
     kind: Literal["face", "vertex"]
@@ -79,44 +79,43 @@ class Unsupported(NamedTuple):
 
 
 class Scheme(ABC):
-    """Base class of every stationary subdivision scheme: refinement rules, regular basis and parameter domain.
+    """Base class of stationary subdivision schemes: refinement rules, regular basis and parameter domain.
 
-    Everything else is derived by running `refine` on local meshes. Scheme objects are keys of caches of derived data,
-    so they must have a hash and never change; a copy gets the ``crease_method`` and the ``triangle_rule`` of a cage.
-    `check_scheme` tries the rules of a scheme.
+    Everything else is derived by running `refine` on local meshes. Scheme objects are cache keys of derived data, so
+    they must be hashable and immutable. The ``crease_method`` and ``triangle_rule`` of a cage are set on a copy.
+    `check_scheme` tests the rules of a scheme.
 
     Attributes
     ----------
     name : str
     element : "face" or "vertex"
-        The elements, with a parameter domain each: faces of the cage, or vertices.
+        The elements, which have a parameter domain each: faces or vertices of the cage.
     domain : ParameterDomain
         `SQUARE` or `TRIANGLE`, with as many corners as a regular face, or as a regular vertex has faces.
     regular_face_size, regular_valence : int
-        A one-ring of such faces and vertices only has a polynomial limit surface.
+        The limit surface is polynomial over a one-ring that has only faces of this size and vertices of this valence.
     regular_lattice : (R, 2) float64
-        Parameters at which the control points of the regular patch sit.
+        Parameters of the control points of the regular patch.
     first_edge : (2, 2) float64
         Lattice points at the two ends of the half-edge that names the regular element.
     edge_turn : (2, 2) float64
-        Matrix that turns a lattice edge of a regular face into the edge that follows it.
+        Matrix that maps a lattice edge of a regular face to the next edge of the face.
     phantom_points : tuple of PhantomPoint, or None
-        How a regular patch's control points beyond the border follow from those within; empty if none lie there. With
-        None, the default, a scheme whose elements are faces refuses open cages and infinitely sharp creases and
-        corners.
+        Rules for the control points of a regular patch beyond the border; empty if there are no such points. With None,
+        the default, a scheme whose elements are faces refuses open cages and infinitely sharp creases and corners.
     regular_border_faces : int
-        Number of regular faces at a vertex on the border, beside which the limit surface is still polynomial; at a
-        corner it is one. A scheme with phantom points must state it.
+        Number of regular faces at a border vertex beside which the limit surface is polynomial; at a corner it is one.
+        Required with phantom points.
     splits_corners : bool
-        Whether refined face ``h`` is a quadrilateral at the face corner ``h`` of the mesh before, and begins there. If
-        so, cages with many classes of patches are refined once, which saves time. False by default.
+        Whether refined face ``h`` is a quadrilateral at the coarse face corner ``h``, and begins there. If so, cages
+        with many classes of patches are refined once, which saves time. False by default.
     has_convex_rules : bool
-        Whether no weight of the rules, or of the regular basis, is negative: then the surface over an element lies in
-        the convex hull of its one-ring, which saves time where adaptive tessellations are chosen. False by default.
+        Whether no weight of the rules and of the regular basis is negative. If so, the surface over an element lies in
+        the convex hull of its one-ring, which saves time in adaptive tessellation. False by default.
     has_local_borders : bool
-        Whether a vertex on a border, or a corner, takes weights of its neighbours on the border only, and no weight
-        depends on its valence. If so, faces that lie far away in its fan are left out (`TaggedFan.near`), which saves
-        time. False by default.
+        Whether the mask of a border vertex or a corner has weights for its neighbours on the border only, and no weight
+        depends on its valence. If so, distant faces of its fan are left out (`TaggedFan.near`), which saves time. False
+        by default.
     crease_method : "uniform" or "chaikin", or None
         Decay of semi-sharp features in `refine`. With None, the default, the scheme refuses semi-sharp features.
     triangle_rule : "catmull_clark" or "smooth", or None
@@ -140,17 +139,17 @@ class Scheme(ABC):
     triangle_rule: TriangleRule | None = None
 
     def __repr__(self) -> str:
-        # With the rules that a cage has set in place of the scheme's own.
+        # Include the rules that a cage has set.
         rules = [f'{name}="{vars(self)[name]}"' for name in ("crease_method", "triangle_rule") if name in vars(self)]
         return f"{type(self).__name__}({', '.join(rules)})"
 
     @property
     def has_phantom_points(self) -> bool:
-        """Whether there are rules at borders and sharp features: for open cages, and cages with creases or corners."""
+        """Whether the scheme supports open cages, and cages with creases or corners."""
         return self.element == "face" and self.phantom_points is not None
 
     def unsupported(self, topology: Topology) -> Unsupported | None:  # noqa: ARG002
-        """Say which faces or vertices of a mesh the rules do not cover; None, the default, if they cover all."""
+        """Return the faces or vertices of a mesh that the rules do not support; None (default) if there are none."""
         return None
 
     @abstractmethod
@@ -162,21 +161,21 @@ class Scheme(ABC):
 
     @abstractmethod
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
-        """Parts of the element named by a half-edge after one refinement.
+        """Return the children of an element, which is named by a half-edge, after one refinement.
 
-        A part is given by the map from the element's parameters to its own, and by the half-edge of the refined mesh
-        that names it. There are four, the copies of the domain, or one, with the identity, where an element has
-        another number of corners than the domain (a corner of an n-gon under Catmull-Clark).
+        A child consists of the map from the element's parameters to the child's, and the half-edge of the refined mesh
+        that names it. There are four children, one for each copy of the domain, or one child with the identity if the
+        element does not fit the domain (a corner of an n-gon under Catmull-Clark).
         """
 
     @abstractmethod
     def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
-        """Weights of the regular patch's control points, in the order of `regular_lattice`.
+        """Return weights of the regular patch's control points, in the order of `regular_lattice`.
 
         Parameters
         ----------
         uv : (s, 2) float
-            The precision of ``uv`` is the precision of the result.
+            The result has the same precision.
         derivatives : 0, 1 or 2
 
         Returns
@@ -187,7 +186,7 @@ class Scheme(ABC):
 
 
 def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
-    """Vertex rules after a refinement that keeps the vertices and appends new ones."""
+    """Return the vertex rules after a refinement that keeps the vertices and appends new ones."""
     if topology.rules is None:
         return None
     return np.concatenate([topology.rules, np.zeros(new_count, dtype=np.int8)])
@@ -195,13 +194,15 @@ def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
 
 def kept_sharpness(
     topology: Topology,
-    # (n_h',) int: of the refined mesh. The faces at old corners come first, each listed from the old vertex on.
+    # (n_h',) int: `Topology.face_vertices` of the refined mesh. The faces at coarse corners come first, each listed
+    # from the coarse vertex on.
     face_vertices: NDArray[np.integer],
-    last: int,  # Place of the last edge in each of these faces. The first edge and the last are halves of old edges.
-    new_count: int,  # Number of vertices that are new
+    # Index of the last edge in each of these faces. The first and the last edge are halves of coarse edges.
+    last: int,
+    new_count: int,  # Number of appended vertices
     method: CreaseMethod,
 ) -> SemiSharpness | None:
-    """Semi-sharp features after a refinement that keeps the vertices and makes a face at every corner of the mesh."""
+    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner."""
     semi, t = topology.semi_sharpness, topology
     if semi is None:
         return None
@@ -214,7 +215,7 @@ def kept_sharpness(
 
 
 def low_valence(topology: Topology, least: int) -> Unsupported | None:
-    """Interior vertices of a valence below the least that a scheme supports."""
+    """Return inner vertices of a valence below the least that a scheme supports, as `Scheme.unsupported`."""
     inside = ~topology.is_border_vertex & (topology.vertex_face_count > 0)
     low = np.flatnonzero(inside & (topology.vertex_face_count < least))
     if not len(low):
@@ -223,14 +224,14 @@ def low_valence(topology: Topology, least: int) -> Unsupported | None:
 
 
 def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
-    """Products of the values and derivatives ``(derivatives + 1, s, r)`` of one-dimensional bases along u and v.
+    """Multiply the values and derivatives ``(derivatives + 1, s, r)`` of one-dimensional bases along u and v.
 
     Returns (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
     """
     orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
     count = u.shape[1:]
-    # Samples come last, so that NumPy's loops are long.
-    u, v = (np.ascontiguousarray(each.swapaxes(1, 2)) for each in (u, v))
+    # Samples are along the last axis, so that NumPy's inner loops are long.
+    u, v = (np.ascontiguousarray(basis.swapaxes(1, 2)) for basis in (u, v))
     products = np.empty((len(orders), v.shape[1], count[1], count[0]), dtype=u.dtype)
     for product, (a, b) in zip(products, orders, strict=True):
         np.multiply(v[b][:, None], u[a], out=product)

@@ -1,4 +1,4 @@
-"""The table of schemes, by name: those of this package, and those that users add."""
+"""Registry of schemes by name: built-in schemes, and those that users register."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from functools import lru_cache
 
 from .scheme import Scheme, SchemeError
 
-# The module and the class of each scheme of this package; the scheme is made when it is first used.
+# Module and class of each built-in scheme. A scheme is created at its first use.
 SCHEME_CLASSES = {"catmull_clark": "CatmullClark", "doo_sabin": "DooSabin", "loop": "Loop"}
 _SCHEMES: dict[str, Scheme] = {}
 
 
 def scheme_named(name: str) -> Scheme:
-    """Look a scheme up by name.
+    """Return the scheme of a name.
 
     Raises
     ------
     SchemeError
-        If there is none of that name; the message lists those there are.
+        If the name is unknown; the message lists the known names.
     """
     if name not in _SCHEMES:
         if name not in SCHEME_CLASSES:
@@ -32,20 +32,20 @@ def scheme_named(name: str) -> Scheme:
 
 @lru_cache(maxsize=256)
 def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
-    """The scheme with the rules of a cage: a copy, or the scheme itself if these are its rules.
+    """Return the scheme with the rules of a cage: a copy, or the scheme itself if it has these rules.
 
     Raises
     ------
     SchemeError
-        If the scheme has no such rules: only Catmull-Clark knows another one for triangles.
+        If the scheme does not support the rules. Only Catmull-Clark has another rule for triangles.
     """
     changed = {
         name: rule
-        for name, rule, usual in (
+        for name, rule, default in (
             ("crease_method", crease_method, "uniform"),
             ("triangle_rule", triangle_rule, "catmull_clark"),
         )
-        if rule != (getattr(scheme, name) or usual)
+        if rule != (getattr(scheme, name) or default)
     }
     for name, rule in changed.items():
         if getattr(scheme, name) is None:
@@ -58,26 +58,26 @@ def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme
 
 
 def register_scheme(scheme: Scheme) -> None:
-    """Register a scheme under its name, for `LimitSurface` and scenes, in place of any other of that name.
+    """Register a scheme under its name, for `LimitSurface` and scenes. Replaces a scheme of the same name.
 
     Parameters
     ----------
     scheme : Scheme
-        Its methods must not change between calls; data derived from them is kept. `check_scheme` tries its rules.
+        Its methods must always return the same results, as derived data is cached. `check_scheme` tests its rules.
 
     Raises
     ------
     SchemeError
-        If it is no `Scheme`, or has no name.
+        If it is not a `Scheme`, or has no name.
     """
     require_scheme(scheme)
     _SCHEMES[scheme.name] = scheme
 
 
 def require_scheme(scheme: object) -> None:
-    """Check that an object is a scheme, with a name."""
+    """Raise SchemeError unless an object is a scheme with a name."""
     if not isinstance(scheme, Scheme):
-        what = f"the class {scheme.__name__}" if isinstance(scheme, type) else repr(scheme)
-        raise SchemeError(f"scheme {what}; expected a scheme's name, or an object of a class derived from Scheme")
+        label = f"the class {scheme.__name__}" if isinstance(scheme, type) else repr(scheme)
+        raise SchemeError(f"scheme {label}; expected a scheme's name, or an object of a class derived from Scheme")
     if not isinstance(getattr(scheme, "name", None), str) or not scheme.name:
         raise SchemeError(f"{type(scheme).__name__} has no name; expected a string of one or more characters")

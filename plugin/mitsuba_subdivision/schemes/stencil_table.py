@@ -1,4 +1,4 @@
-"""Refined vertices as weighted sums of the vertices before."""
+"""Refined vertices as weighted sums of coarse vertices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..mesh.connectivity import IntArray
 from .domain import FloatArray
 
 if TYPE_CHECKING:
-    # SciPy's sparse arrays take a tenth of a second and 20 MB to import, and local meshes do without them.
+    # Importing SciPy's sparse arrays takes 0.1 s and 20 MB, and local meshes do not need them.
     from scipy import sparse
 
 
@@ -25,9 +25,9 @@ class StencilTable:
     row_count, column_count : int
         Number of vertices after the refinement, and before it.
     rows, columns : (n,) int
-        For each entry, the refined vertex and the vertex before that it weights. Entries with the same two add up.
+        For each entry, the refined vertex and the coarse vertex. Entries with the same row and column add up.
     weights : (n,) float64
-        The entries' weights. Those of a row sum to one.
+        Weight of each entry. The weights of a row sum to one.
     """
 
     def __init__(
@@ -38,8 +38,8 @@ class StencilTable:
 
     @classmethod
     def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:
-        """Make a table of several (rows, columns, weights). Entries with the same row and column add up."""
-        # Faces of n corners have stencils of n² entries: half of the memory, and of what `matrix` would convert.
+        """Create a table from several (rows, columns, weights). Entries with the same row and column add up."""
+        # int32 halves the memory, as faces with n corners have n² entries, and saves a conversion in `matrix`.
         is_short = max(row_count, column_count) <= np.iinfo(np.int32).max
         index_type = np.int32 if is_short else np.int64
         rows: IntArray = np.concatenate([rows for rows, _, _ in entries], dtype=index_type, casting="same_kind")
@@ -51,51 +51,53 @@ class StencilTable:
 
     @classmethod
     def from_matrix(cls, matrix: sparse.coo_array | sparse.csc_array | sparse.csr_array) -> StencilTable:
-        """Make a table of the rows of a sparse array."""
+        """Create a table from the rows of a sparse array."""
         entries = matrix.tocoo()
         row_count, column_count = entries.shape
         return cls(row_count, column_count, entries.row, entries.col, entries.data)
 
     @cached_property
     def matrix(self) -> sparse.csr_array:
-        """``(row_count, column_count)`` stencils as the rows of a sparse array."""
+        """``(row_count, column_count)`` sparse array with a stencil in each row."""
         from scipy import sparse
 
         shape = self.row_count, self.column_count
         is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
-        rows, columns = (each.astype(np.int32, copy=False) if is_short else each for each in (self.rows, self.columns))
+        rows, columns = (
+            indices.astype(np.int32, copy=False) if is_short else indices for indices in (self.rows, self.columns)
+        )
         return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
 
     def chosen(self, rows: IntArray) -> StencilTable:
-        """Stencils of some refined vertices, as a table of as many rows."""
+        """Return the stencils of the refined vertices ``rows``, as a table with ``len(rows)`` rows."""
         order, first = self._by_row
         counts = np.diff(first)[rows]
         entries = order[ragged.ranges(first[rows], counts)]
-        own = np.repeat(np.arange(len(rows), dtype=self.rows.dtype), counts)
-        return StencilTable(len(rows), self.column_count, own, self.columns[entries], self.weights[entries])
+        new_rows = np.repeat(np.arange(len(rows), dtype=self.rows.dtype), counts)
+        return StencilTable(len(rows), self.column_count, new_rows, self.columns[entries], self.weights[entries])
 
     def only(self, rows: IntArray) -> StencilTable:
-        """The same stencils of some refined vertices, without weights of the others."""
+        """Return a table of the same size, without the entries of refined vertices not in ``rows``."""
         is_kept = np.zeros(self.row_count, dtype=bool)
         is_kept[rows] = True
-        own = np.flatnonzero(is_kept[self.rows])
-        kept = self.rows[own], self.columns[own], self.weights[own]
+        entries = np.flatnonzero(is_kept[self.rows])
+        kept = self.rows[entries], self.columns[entries], self.weights[entries]
         return StencilTable(self.row_count, self.column_count, *kept)
 
     @cached_property
     def _by_row(self) -> tuple[IntArray, IntArray]:
-        """Entries sorted by their rows, and where those of each row begin, and after them, where the last ends."""
+        """Order of the entries sorted by row, and offsets of the rows in this order, see `ragged.offsets`."""
         first = ragged.offsets(np.bincount(self.rows, minlength=self.row_count))
-        # Few bits sort in linear time.
+        # NumPy sorts integers of up to 16 bits in linear time.
         return np.argsort(self.rows.astype(np.min_scalar_type(self.row_count)), kind="stable"), first
 
     def dense(self, rows: IntArray) -> FloatArray:
-        """Stencils of some refined vertices, ``(len(rows), column_count)``."""
-        number = np.full(self.row_count, -1)
-        number[rows] = np.arange(len(rows))
-        # A row that is wanted twice is summed at the last of its places, and copied to the others.
-        kept = number[self.rows]
-        own = kept >= 0
-        flat = kept[own] * self.column_count + self.columns[own]
-        sums = np.bincount(flat, self.weights[own], minlength=len(rows) * self.column_count).astype(np.float64)
-        return sums.reshape(-1, self.column_count)[number[rows]]
+        """Return the stencils of the refined vertices ``rows``, ``(len(rows), column_count)``."""
+        new_row = np.full(self.row_count, -1)
+        new_row[rows] = np.arange(len(rows))
+        # A row that occurs several times in ``rows`` is summed at its last index, and copied to the others.
+        entry_row = new_row[self.rows]
+        is_kept = entry_row >= 0
+        flat = entry_row[is_kept] * self.column_count + self.columns[is_kept]
+        sums = np.bincount(flat, self.weights[is_kept], minlength=len(rows) * self.column_count).astype(np.float64)
+        return sums.reshape(-1, self.column_count)[new_row[rows]]

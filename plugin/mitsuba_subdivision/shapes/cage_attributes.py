@@ -5,9 +5,9 @@
     exact_shading.py         evaluates them at hits
     displacement.py          uses them as heights
 
-The parameter ``cage_NAME`` holds the control values of attribute NAME, flat. The buffer ``vertex_NAME`` holds its
-values at the vertices of the tessellation: a sparse weight matrix times the control values. In spectral variants, it
-holds spectra of colours.
+The parameter ``cage_NAME`` contains the control values of the attribute NAME, flat. The buffer ``vertex_NAME`` contains
+its values at the vertices of the tessellation: the product of a sparse weight matrix and the control values. In
+spectral variants, colours are stored as coefficients of spectra.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 PREFIX = "cage_"
 
-# Called with an attribute's name and the gradient with respect to its values, after reverse mode has reached them.
+# Callback for an attribute's name and the gradient by its values, after reverse mode has reached these.
 OnBackward = Callable[[str, FloatBuffer], None]
 
 
 class CageAttributes:
     """Control values of texture coordinates and attributes, and the mesh buffers computed from them.
 
-    Weights are computed when a value first changes, so a shape with constant values never needs them.
+    Weights are computed when values first change, so a shape with constant values never needs them.
     """
 
     # See `WeightedValues`.
@@ -54,17 +54,17 @@ class CageAttributes:
         self,
         variant: Variant,
         surface: LimitSurface,
-        names: Iterable[str],  # Of the attributes that `traverse` exposes
+        names: Iterable[str],  # Names of the attributes that `traverse` exposes
     ) -> None:
         self._source = surface.cage.source.name
         self._float = variant.Float if dr.is_jit_v(variant.Float) else None
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
-        # Meshes of equal values share their memory until one is assigned.
+        # Meshes with equal values share memory until values are assigned.
         self._given = {name: self._upload(channel.values) for name, channel in self._channels.items()}
-        kind = self._float or dr.scalar.ArrayXf
-        # By the parameters' names, such as "cage_texcoords"
+        flat_type = self._float or dr.scalar.ArrayXf
+        # Control values by names of parameters, such as "cage_texcoords"
         self.values: dict[str, FloatBuffer] = {
-            f"{PREFIX}{name}": kind(given.array) for name, given in self._given.items()
+            f"{PREFIX}{name}": flat_type(shared.array) for name, shared in self._given.items()
         }
         self.moving: set[str] = set()  # Names of the parameters that move vertices
         self._colors = {
@@ -74,12 +74,12 @@ class CageAttributes:
         }
         self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
         self._followers: list[tuple[str, Callable[[FloatBuffer], None]]] = []
-        # Attributes that differ from their loaded values, with their derivatives.
+        # Updated values of attributes, as watched for reverse-mode passes.
         self._moved: dict[str, FloatBuffer] = {}
         self._computed: dict[str, set[int]] = {}
 
     def add_follower(self, name: str, take: Callable[[FloatBuffer], None], *, moves: bool = False) -> None:
-        """Call a function with each new array of an attribute's values; `moves` says whether they move vertices."""
+        """Call ``take`` with each new array of an attribute's values. ``moves``: whether these displace vertices."""
         self._followers.append((name, take))
         if moves:
             self.moving.add(f"{PREFIX}{name}")
@@ -88,11 +88,11 @@ class CageAttributes:
         """Expose the parameters."""
         flags = mi.ParamFlags
         for name, values in self.values.items():
-            moves = flags.Discontinuous if name in self.moving else flags.Differentiable
-            callback.put(name, values, flags.Differentiable | moves)
+            discontinuity = flags.Discontinuous if name in self.moving else flags.Differentiable
+            callback.put(name, values, flags.Differentiable | discontinuity)
 
     def set_triangles(self, table: VertexTable, attributes: AttributeTable) -> None:
-        """Set the vertices of a tessellation."""
+        """Set the tessellation whose vertices have attributes."""
         self._loaded = attributes.values
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}
         self._uploaded = {name: self._upload(values.astype(np.float32)) for name, values in shown.items()}
@@ -100,9 +100,9 @@ class CageAttributes:
         self._weights: dict[tuple, Any] = {}
 
     def update(self, keys: Iterable[str], on_backward: OnBackward) -> list[str]:
-        """Read the attributes that are named in ``keys`` again.
+        """Apply the parameters of this object that are named in ``keys``.
 
-        Returns list of str: names of their attributes. Raises ValueError if the number of values has changed, or one is
+        Returns list of str: names of the attributes. Raises ValueError if the number of values has changed, or one is
         not finite.
         """
         names = [name for name in self._channels if f"{PREFIX}{name}" in keys]
@@ -116,19 +116,19 @@ class CageAttributes:
         return names
 
     def renew(self, name: str, gradient: FloatBuffer, on_backward: OnBackward) -> None:
-        """Attach the arrays computed from an attribute to its values again, after reverse mode has reached them."""
+        """Attach an attribute's followers and buffers to its values again, after reverse mode has reached these."""
         lost = self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"])
         if lost and not is_recording() and dr.any(gradient != 0):
             warn_of_lost(self._source, f"{PREFIX}{name}")
         self._move(name, on_backward)
 
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
-        """Mesh buffers of some attributes, by default of all, keyed by buffer name."""
-        chosen = self._channels if names is None else names
-        return {mesh_name(name): self._stored(name) for name in chosen if name in self._loaded}
+        """Mesh buffers of the given attributes, by default of all, by name of the buffer."""
+        attributes = self._channels if names is None else names
+        return {mesh_name(name): self._stored(name) for name in attributes if name in self._loaded}
 
     def _upload(self, values: NDArray[np.floating]) -> SharedArray:
-        """Values, flat; in JIT variants, meshes with equal values share one array."""
+        """Flat array of values; in JIT variants, meshes with equal values share it."""
         if self._float is None:
             return SharedArray(values.ravel())
         from ..kernels.array_types import ArrayTypes
@@ -147,12 +147,12 @@ class CageAttributes:
         size = channel.values.shape[1]
         if self._float is not None:
             return weights(values, size)
-        found = weights @ np.array(values, dtype=np.float64).reshape(-1, size)
-        return np.asarray(found, dtype=np.float32).ravel()
+        vertex_values = weights @ np.array(values, dtype=np.float64).reshape(-1, size)
+        return np.asarray(vertex_values, dtype=np.float32).ravel()
 
     @property
     def all_weights(self) -> dict[tuple, Any]:
-        """Weights of all attributes."""
+        """Weights of all attributes, computed if necessary."""
         for name in self._uploaded:
             self._weights_of(self._channels[name])
         return self._weights
@@ -174,8 +174,8 @@ class CageAttributes:
         if dr.grad_enabled(values):
             values = dr.custom(Watched, {name: values}, lambda gradients: on_backward(name, gradients[name]))[name]
         self._moved[name] = values
-        for follows, take in self._followers:
-            if follows == name:
+        for follower_name, take in self._followers:
+            if follower_name == name:
                 take(values)
 
     def _require_values(self, name: str) -> None:
@@ -188,5 +188,5 @@ class CageAttributes:
             return
         take_over(values)
         if not dr.all(dr.isfinite(values)):
-            wrong = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
-            raise ValueError(f"number {wrong[0]} is not finite; expected finite numbers ({len(wrong)} such in all)")
+            invalid = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
+            raise ValueError(f"number {invalid[0]} is not finite; expected finite numbers ({len(invalid)} such in all)")

@@ -1,8 +1,8 @@
-"""What frozen functions (``@dr.freeze``) need of a shape.
+"""Support of shapes for frozen functions (``@dr.freeze``).
 
-A frozen function has to know every array that it reads. Dr.Jit finds the arrays that a Python shape itself holds, but
-does not look into objects of other classes. What its first call records runs again at the later ones, without Python.
-So nothing is read back while it records, checks of values among it, and all tables are on the device before.
+A frozen function must know every array that it reads. Dr.Jit finds the arrays that are attributes of a Python shape,
+but does not search objects of other classes. The first call records kernels, which later calls run without Python. So
+while a function is recorded, values are neither read back nor checked, and all tables must already be on the device.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ import drjit as dr
 
 from ..mesh.shared import SharedArray
 
-# Packages whose objects hold Dr.Jit arrays.
+# Prefixes of modules whose objects contain Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
 _PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
 
 
 @contextmanager
 def paused_collection() -> Iterator[None]:
-    """Pause the collector; a context manager and a decorator.
+    """Pause the garbage collector; a context manager and a decorator.
 
-    A collector that was disabled stays disabled. With overlapping threads, it runs again at the latest when all end.
+    A collector that was disabled stays disabled. With overlapping threads, it is enabled again at the latest when all
+    of them leave the context.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -40,22 +41,23 @@ def paused_collection() -> Iterator[None]:
 
 
 def is_recording() -> bool:
-    """Whether a frozen function is being recorded, so that values of arrays cannot be read."""
+    """Whether a frozen function is being recorded, when values of arrays cannot be read."""
     return bool(dr.flag(dr.JitFlag.FreezingScope))
 
 
 class DeviceState:
-    """Exposes the arrays of a shape, and of the objects that it holds, to Dr.Jit; a shape keeps one."""
+    """Exposes all arrays of a shape, including those of its attributes, to Dr.Jit. Each shape keeps one."""
 
     def __init__(
         self,
-        shape: Any,  # Not kept alive
+        shape: Any,  # Only a weak reference is stored
     ) -> None:
         self._shape = weakref.ref(shape)
-        # Whether a frozen function has seen the arrays. Dr.Jit goes on reading its tables, which are in NumPy's memory.
+        # Whether a frozen function has seen the arrays. It continues to read tables in NumPy's memory, which must not
+        # change.
         self.is_frozen = False
 
-    # A scene that the garbage collector frees while a frozen function is called ends the process.
+    # Freeing a scene during a call of a frozen function ends the process.
     @paused_collection()
     def _traverse_1_cb_ro(self, callback: Callable[..., Any]) -> None:
         dr.detail.traverse_py_cb_ro(self._arrays(), callback)
@@ -70,7 +72,7 @@ class DeviceState:
 
 
 def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
-    """Arrays of Dr.Jit in a value, in objects of kernels and shapes, and in containers; each object once."""
+    """Iterate over the Dr.Jit arrays in a value, in containers, and in objects of kernels and shapes, each once."""
     if id(value) in seen:
         return
     seen.add(id(value))
@@ -79,8 +81,8 @@ def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
         if dr.is_jit_v(kind):
             yield value
     elif isinstance(value, (dict, list, tuple)):
-        for each in value.values() if isinstance(value, dict) else value:
-            yield from _arrays_in(each, seen)
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _arrays_in(item, seen)
     elif isinstance(value, partial):
         yield from _arrays_in(value.func, seen)
     elif isinstance(value, MethodType):

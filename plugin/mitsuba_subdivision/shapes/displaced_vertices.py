@@ -1,7 +1,7 @@
 """Displaced vertices of the shape; see `shapes.displacement`.
 
 The only input from the tessellation is the location of each vertex on the surface. Copies of a vertex along creases and
-seams move by the mean of their displacements, so that they stay equal bit by bit. Each copy keeps the normal of its
+seams are displaced by the mean of their displacements, so that they stay bitwise equal. Each copy has the normal of its
 side.
 """
 
@@ -38,46 +38,47 @@ if TYPE_CHECKING:
 class VertexLocations:
     """Locations of the vertices of a tessellation on the surface."""
 
-    # (n,) int64: corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`
+    # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`
     corner: IntArray
     uv: FloatArray  # (n, 2) float64: samples at corners of elements have (0, 0)
     weld_target: IntArray  # (n,) int64: the first copy of each vertex; the vertex itself where it has no copies
 
     @cached_property
     def copies(self) -> IntArray:
-        """``(g, c)`` copies of each vertex that has several, padded with -1."""
+        """``(g, c)`` vertices at each location with several copies, padded with -1."""
         order = np.argsort(self.weld_target, kind="stable")
         _, begins, counts = np.unique(self.weld_target[order], return_index=True, return_counts=True)
-        several = counts > 1
-        begins, counts = begins[several, None], counts[several, None]
-        along = np.arange(counts.max(initial=0))
-        found = order[np.minimum(begins + along, len(order) - 1)]
-        found[along >= counts] = -1
-        return found
+        has_copies = counts > 1
+        begins, counts = begins[has_copies, None], counts[has_copies, None]
+        column = np.arange(counts.max(initial=0))
+        copies = order[np.minimum(begins + column, len(order) - 1)]
+        copies[column >= counts] = -1
+        return copies
 
     @cached_property
     def group(self) -> IntArray:
         """``(n,)`` row of `copies` of each vertex; -1 for a vertex without copies."""
-        found = np.full(len(self.weld_target), -1, dtype=np.int64)
+        group = np.full(len(self.weld_target), -1, dtype=np.int64)
         rows, columns = np.nonzero(self.copies >= 0)
-        found[self.copies[rows, columns]] = rows
-        return found
+        group[self.copies[rows, columns]] = rows
+        return group
 
     def follow_slopes(self, surface: LimitSurface, channel: Channel) -> NDArray[np.bool_]:
-        """Whether a channel's heights have slopes along the surface: everywhere but at some extraordinary points.
+        """Whether the slope of heights along the surface exists at each vertex.
 
-        Where a seam ends at an extraordinary point, positions and values contract at different rates.
+        It does not exist at an extraordinary point where a seam ends, as positions and values contract at different
+        rates.
 
         Returns (n,) bool.
         """
-        found = np.ones(len(self.corner), dtype=bool)
+        follows = np.ones(len(self.corner), dtype=bool)
         corners = np.flatnonzero((self.uv == 0).all(axis=1))
         cage = surface.cage
         sampler = PatchSampler(surface.patches, cage.positions, cage.cut_mesh.vertex)
         samples = sampler.evaluate(self.corner[corners], self.uv[corners])
         points = corners[samples.level == AT_EXTRAORDINARY_POINT]
-        found[points] = contracts_alike(channel, surface.patches, self.corner[points])
-        return found
+        follows[points] = contracts_alike(channel, surface.patches, self.corner[points])
+        return follows
 
 
 class DeviceDisplacement:
@@ -90,7 +91,7 @@ class DeviceDisplacement:
         self,
         locations: VertexLocations,
         slopes: NDArray[np.bool_],  # (n,) bool: see `VertexLocations.follow_slopes`
-        surface: SurfaceKernel,  # With the displacement, and the same control points
+        surface: SurfaceKernel,  # Displaced surface, with the control points of the vertices
         float_type: type,
         *,
         has_normals: bool,  # Whether normals are needed
@@ -111,21 +112,21 @@ class DeviceDisplacement:
         dr.eval(self._has_copies)
 
     def _read_values(self) -> None:
-        """Evaluate what heights depend on, if it has changed."""
+        """Evaluate the channel of the heights if its values have changed."""
         channel = self._displacement.channel
-        now, read = channel.values.flat, self._read
-        # Derivatives of the same values may be new.
-        if read is None or (now.index, now.index_ad) != (read.index, read.index_ad):
-            # A copy that is kept, so that no other array gets its numbers.
-            self._read, self._value = type(now)(now), channel(self._location)[0]
+        values, read = channel.values.flat, self._read
+        # Equal values may be attached to other variables.
+        if read is None or (values.index, values.index_ad) != (read.index, read.index_ad):
+            # Keep a reference, so that Dr.Jit assigns its indices to no other array.
+            self._read, self._value = type(values)(values), channel(self._location)[0]
             dr.eval(self._value)
 
     @property
     def _displacement(self) -> Displacement:
-        found = self._surface.displacement
-        if found is None:
+        displacement = self._surface.displacement
+        if displacement is None:
             raise RuntimeError("a surface without displacement; expected one that `ShapeDisplacement` was attached to")
-        return found
+        return displacement
 
     def __call__(
         self,
@@ -133,20 +134,20 @@ class DeviceDisplacement:
         normals: FloatBuffer,
         points: FloatBuffer,  # noqa: ARG002
     ) -> tuple[FloatBuffer, FloatBuffer]:
-        """Displace flat positions and normals of the surface of the control points."""
+        """Displace flat positions and normals. ``points`` are the control points of the surface."""
         p: Vector3 = dr.unravel(self._types.vector3, positions)
         n: Vector3 = dr.unravel(self._types.vector3, normals)
         self._read_values()
         height = self._displacement.heights.height(self._value) * self._displacement.scale
         positions = dr.ravel(p + self._mean(height * n))
         if self._has_normals:
-            own = self._surface.at(self._location).n
-            exists = self._follows & (dr.squared_norm(n) > 0) & (dr.squared_norm(own) > 0)
-            normals = dr.ravel(dr.select(exists, own, n))
+            displaced_normal = self._surface.at(self._location).n
+            exists = self._follows & (dr.squared_norm(n) > 0) & (dr.squared_norm(displaced_normal) > 0)
+            normals = dr.ravel(dr.select(exists, displaced_normal, n))
         return positions, normals
 
     def _mean(self, vectors: Vector3) -> Vector3:
-        """For each vertex, the mean of the vectors of all copies of it."""
+        """Replace the vector of each vertex by the mean over its copies."""
         if not self._copies:
             return vectors
         flat, total = dr.ravel(vectors), self._types.vector3(0)
@@ -157,7 +158,7 @@ class DeviceDisplacement:
 
 
 class HostDisplacement:
-    """Displaces vertices in NumPy arrays."""
+    """Displaces vertices on the host."""
 
     is_differentiable = False
 
@@ -177,48 +178,48 @@ class HostDisplacement:
     def __call__(
         self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer
     ) -> tuple[FloatBuffer, FloatBuffer]:
-        """Displace flat positions and normals of the surface of the control points."""
+        """Displace flat positions and normals. ``points`` are the control points of the surface."""
         self._read_values()
         positions, normals = (np.array(flat).reshape(-1, 3) for flat in (positions, normals))
         heights, scale = self._displacement.heights, self._displacement.host_scale
         height = np.array(heights.height(self._values[0])) * scale
         positions = positions + self._mean(height[:, None] * normals).astype(np.float32)
         if self._has_normals:
-            h, h_u, h_v = (scale * each for each in heights(*self._values))
-            own = _rows(unit(displaced(self._limit(points), (h, h_u, h_v)).normal))
-            exists = self._slopes & normals.any(axis=1) & own.any(axis=1)
-            normals = np.where(exists[:, None], own, normals).astype(np.float32)
+            h, h_u, h_v = (scale * component for component in heights(*self._values))
+            displaced_normal = _rows(unit(displaced(self._limit(points), (h, h_u, h_v)).normal))
+            exists = self._slopes & normals.any(axis=1) & displaced_normal.any(axis=1)
+            normals = np.where(exists[:, None], displaced_normal, normals).astype(np.float32)
         return positions.ravel(), normals.ravel()
 
     def _read_values(self) -> None:
-        """Evaluate what heights depend on, if it has changed."""
+        """Evaluate the channel of the heights if its values have changed."""
         channel = self._displacement.channel
         if channel is not self._read:
             values = channel.with_derivatives(self._locations.corner, self._locations.uv)
-            self._values = [_columns(each) if each.shape[1] > 1 else _columns(each)[0] for each in values]
+            self._values = [_columns(rows) if rows.shape[1] > 1 else _columns(rows)[0] for rows in values]
             self._read = channel
 
     def _limit(self, points: FloatBuffer) -> PatchValues:
-        """The undisplaced limit surface at the vertices."""
+        """Evaluate the undisplaced limit surface at the vertices."""
         points, vertex = np.array(points, dtype=np.float64).reshape(-1, 3), self._surface.cage.cut_mesh.vertex
         sampler = PatchSampler(self._surface.patches, points, vertex)
         samples = sampler.evaluate(self._locations.corner, self._locations.uv, derivatives=2)
         # Second derivatives do not exist at extraordinary points.
-        value, du, dv, *second = (_columns(each) for each in np.nan_to_num(samples.values))
+        value, du, dv, *second = (_columns(rows) for rows in np.nan_to_num(samples.values))
         return PatchValues(value, du, dv, _columns(samples.normal), tuple(second))
 
     def _mean(self, vectors: FloatArray) -> FloatArray:
-        """For each vertex, the mean of the vectors of all copies of it."""
+        """Replace the vector of each vertex by the mean over its copies."""
         copies, group = self._locations.copies, self._locations.group
         exists = copies >= 0
         mean = np.where(exists[..., None], vectors[copies], 0).sum(axis=1) / exists.sum(axis=1)[:, None]
-        found = vectors.copy()
-        found[group >= 0] = mean[group[group >= 0]]
-        return found
+        result = vectors.copy()
+        result[group >= 0] = mean[group[group >= 0]]
+        return result
 
 
 def _columns(rows: NDArray) -> list[Float]:
-    """Columns of an array, the vector components that `displaced` takes."""
+    """Columns of an array: vector components for `displaced`."""
     return [mapped(dr.scalar.ArrayXf64, column) for column in rows.T]
 
 

@@ -1,14 +1,14 @@
-"""The displacement of a shape: its height channel and scale, on the device and on the host.
+"""The displacement of a shape: heights, their channel and their scale, on the device and on the host.
 
     parameters.py            checks ``displacement`` and ``displacement_scale``
     heights.py               heights and their slopes, of a texture or an attribute; their range
-    displacement.py          heights, their channel and their scale, together: this module
+    displacement.py          displacement of a shape: this module
     displaced_vertices.py    displaced vertices of a tessellation, with exact normals
     exact_shading.py         hits on the displaced surface
-    kernels/displacement.py  the formulas, and the displaced surface that rays intersect
+    kernels/displacement.py  formulas, and the displaced surface that rays intersect
 
-In object space, a surface point S moves to S + scale h N, along the unit limit normal N. A point without a normal does
-not move.
+In object space, a surface point S is displaced to S + scale h N, along the unit limit normal N. A point without a
+normal is not displaced.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ class ShapeDisplacement:
         self,
         variant: Variant,
         surface: LimitSurface,
-        positions: FloatArray,  # (n, 3) float64: its control points, relative to the centre of `RecentredPoints`
-        given: Any,  # The parameter `displacement`
+        positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `RecentredPoints`
+        given: Any,  # Value of the parameter ``displacement``
         scale: float,
-        exact: ExactShading | None = None,  # Exact shading, whose surface is displaced as well
+        exact: ExactShading | None = None,  # Exact shading of the shape, whose surface is displaced, too
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
-        # `attribute` names the cage's channel that the heights depend on: an attribute, or "texcoords".
+        # ``self.attribute`` is the name of the channel that the heights depend on: an attribute, or "texcoords".
         self.heights: SurfaceHeights
         if isinstance(given, str):
             self.attribute = _attribute_named(given, surface)
@@ -72,13 +72,13 @@ class ShapeDisplacement:
                 )
             self.attribute, self._loaded = TEXCOORDS, surface.channel(TEXCOORDS)
             self.heights = TextureHeights(variant, given)
-        # On a device, once they have been updated.
+        # Updated values of the channel on the device; None until the first update.
         self._values: FloatBuffer = None
-        # The parameter ``displacement_scale``, a flat array of one number
+        # The parameter ``displacement_scale``: a flat array of one number.
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
-        # The displaced surface on the device, that of exact shading if there is any. None in scalar variants without.
+        # The displaced surface on the device, shared with exact shading. None in scalar variants without exact shading.
         self.kernel: SurfaceKernel | None = None
-        # The values of exact shading are updated by `CageAttributes` already.
+        # Values of the channel on the device; None with exact shading, whose values `CageAttributes` updates.
         self._own_values: ControlValues | None = None
         if exact is not None:
             self.kernel, channel = exact.kernel, exact.channel(self.attribute)
@@ -92,23 +92,23 @@ class ShapeDisplacement:
         self.take_scale(self.checked_scale())
 
     def checked_scale(self) -> float:
-        """The value of ``displacement_scale``; NaN while a frozen function is recorded, which cannot read it.
+        """The value of ``displacement_scale``; NaN while a frozen function is recorded, when it cannot be read.
 
         Raises ValueError if it is not a finite number.
         """
         if is_recording():
             return np.nan
-        found = np.array(self.scale).ravel()
-        if len(found) != 1 or not np.isfinite(found[0]):
-            raise ValueError(f"{found.tolist()} was given; expected a finite number")
-        return float(found[0])
+        values = np.array(self.scale).ravel()
+        if len(values) != 1 or not np.isfinite(values[0]):
+            raise ValueError(f"{values.tolist()} was given; expected a finite number")
+        return float(values[0])
 
     def take_scale(self, checked: float) -> None:
-        """Take over ``displacement_scale``, given its `checked_scale`."""
+        """Apply ``displacement_scale``, whose `checked_scale` is ``checked``."""
         if self._is_jit:
-            # A literal would be compiled into kernels.
+            # Dr.Jit compiles literals into kernels.
             dr.make_opaque(self.scale)
-        # A copy, as users assign the parameter in place, before it is checked.
+        # A copy, because users assign the parameter in place before it is checked.
         self._scale = type(self.scale)(self.scale) if self._is_jit else checked
         if self.kernel is not None and self.kernel.displacement is not None:
             self.kernel.displacement.scale = self._scale
@@ -119,7 +119,7 @@ class ShapeDisplacement:
 
     @property
     def channel(self) -> Channel:
-        """The channel, with its current values, which are read from the device."""
+        """The channel with its current values, read from the device."""
         if self._values is None:
             return self._loaded
         values = np.array(self._values, dtype=np.float64).reshape(self._loaded.values.shape)
@@ -131,7 +131,7 @@ class ShapeDisplacement:
         callback.put("displacement_scale", self.scale, flags.Differentiable | flags.Discontinuous)
 
     def set_values(self, values: FloatBuffer) -> None:
-        """Set new values, flat, of the channel that the heights depend on."""
+        """Set values, flat, of the channel that the heights depend on."""
         self._values = dr.detach(values)
         if not self._is_jit:
             self._loaded, self._values = self.channel, None
@@ -143,27 +143,27 @@ class ShapeDisplacement:
         return [self.scale, *self.heights.variables()]
 
     def bound(self) -> DisplacementBound:
-        """The scaled heights at any samples, and their bound, for adaptive rates."""
-        found = self.range()
-        return DisplacementBound(self._heights_at, max(abs(found.low), abs(found.high)))
+        """Scaled heights as a function of the location, and their bound, for adaptive tessellation."""
+        heights = self.range()
+        return DisplacementBound(self._heights_at, max(abs(heights.low), abs(heights.high)))
 
     def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
         columns = [mapped(float_type, column) for column in self.channel.evaluate(start, uv).T]
         heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
-        # A texture of one value has one number for all samples.
+        # A constant texture returns one number for all samples.
         return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))
 
     def range(self) -> HeightRange:
         """Interval of the scaled heights."""
         heights = AttributeHeights(self.channel) if isinstance(self.heights, AttributeHeights) else self.heights
-        found = heights.range()
-        low, high = sorted((found.low * self.host_scale, found.high * self.host_scale))
+        unscaled = heights.range()
+        low, high = sorted((unscaled.low * self.host_scale, unscaled.high * self.host_scale))
         return HeightRange(low, high)
 
 
 def _attribute_named(given: str, surface: LimitSurface) -> str:
-    """Name, in the cage, of the attribute that the parameter gives.
+    """Return the name in the cage of the attribute that the parameter names.
 
     Raises ValueError if there is no such attribute, or its values are not scalar.
     """

@@ -1,6 +1,6 @@
-"""Heights that displace a surface: a texture over texture coordinates, or an attribute of the cage.
+"""Heights of a displacement: a texture over texture coordinates, or an attribute of the cage.
 
-They are evaluated for arrays of a kernel, for single points, and for whole host arrays; see `Heights`.
+They are evaluated for arrays of a kernel, single points, and arrays on the host; see `Heights`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ..variants import Variant
 if TYPE_CHECKING:
     from ..patches import Channel
 
-# Step of central differences, in texture coordinates.
+# Step of central differences of a texture, in texture coordinates.
 DIFFERENCE = 2.0**-10
-# Samples along each side of the unit square, where the range of heights is unknown.
+# Number of samples along each side of the unit square, from which the range of textures that are no bitmaps follows.
 RANGE_SAMPLES = 256
-# Textures that are not functions of texture coordinates, and what to give instead.
+# Textures that are not functions of texture coordinates, and the expected alternatives for messages.
 _ELSEWHERE = {
     "MeshAttribute": 'the name of the attribute itself, such as "vertex_height"',
     "VolumeAdapter": "one over texture coordinates",
@@ -39,16 +39,16 @@ _LUMINANCE = (0.212671, 0.715160, 0.072169)
 class HeightRange:
     """Interval of the heights of a displacement, without its scale."""
 
-    # Of textures that are no bitmap, of samples
+    # For textures that are no bitmaps, the interval of samples
     low: float
     high: float
 
 
 class SurfaceHeights(Heights, Protocol):
-    """Heights whose range is known."""
+    """Heights with a known range."""
 
     def range(self) -> HeightRange:
-        """Interval that contains all heights, or those of samples."""
+        """Interval that contains all heights; for textures that are no bitmaps, only those of samples."""
         ...
 
 
@@ -57,7 +57,7 @@ class AttributeHeights:
 
     def __init__(
         self,
-        channel: Channel,  # Of one component
+        channel: Channel,  # With one component
     ) -> None:
         self._values = channel.values
 
@@ -66,7 +66,7 @@ class AttributeHeights:
         return value, du, dv
 
     def height(self, value: Value) -> Float:
-        """The heights alone."""
+        """Heights without derivatives."""
         return value
 
     def variables(self) -> list:
@@ -118,19 +118,19 @@ class TextureHeights:
         return self._each(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
 
     def _slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
-        """Derivatives of the height by s and by t."""
+        """Derivatives of the heights by s and t."""
         by_s, by_t = self._each(self._gradient, s, t, active)
         return self._corrected(by_s, by_t) if self._gradient == self._own_gradient else (by_s, by_t)
 
     def _moving_slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
-        """Slopes of a bitmap whose own derivatives by s and t are differences over a texel.
+        """Slopes of a bitmap, with derivatives by s and t that are differences over a texel.
 
-        Between texels a bitmap's slope along s does not depend on s, and jumps at the next: its derivative would be
-        zero everywhere, although the normals of the displaced surface turn.
+        Bilinear interpolation makes the slope along s constant in s between texels, with jumps at these. Its derivative
+        would be zero everywhere, although the normals of the displaced surface vary.
         """
         s_0, t_0 = dr.detach(s), dr.detach(t)
         slopes = self._slopes(s_0, t_0, active)
-        # Steps that lead one texel on.
+        # Lengths of a texel in texture coordinates.
         texels = abs(self._to_uv()) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
         step_s, step_t = (1 / np.maximum(texels.max(axis=0), 1)).tolist()
         for parameter, ds, dt in ((s, step_s / 2, 0.0), (t, 0.0, step_t / 2)):
@@ -138,40 +138,40 @@ class TextureHeights:
                 behind = self._slopes(s_0 - ds, t_0 - dt, active)
                 ahead = self._slopes(s_0 + ds, t_0 + dt, active)
             move = dr.replace_grad(type(s)(0), parameter)  # type: ignore[func-returns-value]  # The stub is wrong.
-            per = 1 / (2 * (ds + dt))
-            slopes = [slope + (b - a) * per * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
+            inverse = 1 / (2 * (ds + dt))
+            slopes = [slope + (b - a) * inverse * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
         return slopes
 
     def height(self, value: Value) -> Float:
-        """The heights alone."""
+        """Heights without derivatives."""
         s, t = value
         return self._each(self._height, s, t, True)
 
     def variables(self) -> list:
-        """Differentiable arrays: the texture's parameters that have derivatives."""
+        """Differentiable arrays: the differentiable parameters of the texture."""
         if not self._is_jit:
             return []
         return [value for _, value in mi.traverse(self._texture) if dr.is_diff_v(value)]
 
     def range(self) -> HeightRange:
-        """Least and greatest height: of a bitmap's texels, which bound it; of other textures at samples."""
+        """Interval of the texels of a bitmap, which contains all heights; for other textures, of samples."""
         parameters = mi.traverse(self._texture)
         if "data" in parameters and self._texture.class_name().startswith("BitmapTexture"):
             data = np.array(parameters["data"])
             values = data @ np.array(_LUMINANCE, dtype=data.dtype) if data.shape[2] == 3 else data
             return HeightRange(float(values.min()), float(values.max()))
-        along = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
+        centres = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
         float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
-        s, t = (mapped(float_type, each) for each in np.meshgrid(along, along))
+        s, t = (mapped(float_type, coordinate) for coordinate in np.meshgrid(centres, centres))
         values = np.array(self.height((s, t)))
         return HeightRange(float(values.min()), float(values.max()))
 
     def _each(self, function: Callable, s: Float, t: Float, active: Mask) -> Value:
-        """Results of a function; scalar variants call it point by point."""
+        """Evaluate a function of s and t; point by point in scalar variants."""
         if self._is_jit or not dr.is_array_v(s):
             return function(s, t, active)
-        found = np.array([function(*each, True) for each in zip(s, t, strict=True)])
-        return type(s)(found) if found.ndim == 1 else [type(s)(column) for column in found.T]
+        results = np.array([function(*uv, True) for uv in zip(s, t, strict=True)])
+        return type(s)(results) if results.ndim == 1 else [type(s)(column) for column in results.T]
 
     def _interaction(self, s: Float, t: Float) -> mi.SurfaceInteraction3f:
         si = dr.zeros(self._variant.SurfaceInteraction3f, max(dr.width(s), dr.width(t)) if self._is_jit else 1)
@@ -185,9 +185,9 @@ class TextureHeights:
         return self._texture.eval_1_grad(self._interaction(s, t), active)
 
     def _corrected(self, by_s: Float, by_t: Float) -> Sequence[Float]:
-        """Gradients of a rotated bitmap with sides of unequal length.
+        """Correct the gradient of a rotated bitmap whose sides differ in length.
 
-        Mitsuba 3.9.1 multiplies them by the numbers of texels along either side after ``to_uv`` instead of before.
+        Mitsuba 3.9.1 multiplies the gradient by the resolution after applying ``to_uv`` instead of before.
         """
         sides = np.array(self._texture.resolution(), dtype=np.float64)
         if sides[0] == sides[1]:
@@ -206,17 +206,17 @@ class TextureHeights:
         return np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
 
     def _derivative(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
-        found = []
+        gradient = []
         with dr.resume_grad():
             for direction in ((1, 0), (0, 1)):
                 step = self._variant.Float(0)
                 dr.enable_grad(step)
-                along_s, along_t = direction
-                height = self._height(dr.detach(s) + along_s * step, dr.detach(t) + along_t * step, active)
+                step_s, step_t = direction
+                height = self._height(dr.detach(s) + step_s * step, dr.detach(t) + step_t * step, active)
                 if dr.grad_enabled(height):
                     dr.forward_from(step)
-                found.append(dr.grad(height))
-        return found
+                gradient.append(dr.grad(height))
+        return gradient
 
     def _difference(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
         return (

@@ -1,4 +1,4 @@
-"""Updates a shape's vertices and exact shading from its parameters, for repeated reverse-mode passes."""
+"""Updates a shape's vertices and exact shading from its parameters, and after each reverse-mode pass."""
 
 from __future__ import annotations
 
@@ -22,27 +22,26 @@ if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
 
-# Dr.Jit's number of an array has the number of its derivative in the upper half.
+# Number of bits of a Dr.Jit variable index. The index of its derivative is in the bits above.
 _HALF = 32
 
 
 class MovingVertices:
-    """Positions and normals of a shape in the world, and its exact shading, as control points and placement move them.
+    """Positions and normals of a shape in world space and its exact shading, for moving control points and placement.
 
-    Surfaces are evaluated in object space, relative to the centre of the control points as they were loaded. One affine
-    map then takes them to the world.
+    Surfaces are evaluated in object space, relative to the centre of the loaded control points, and then mapped to
+    world space.
 
-    After a gradient has passed backwards through a computation, Dr.Jit forgets the computation. Another gradient, of
-    another view, needs all this `attached` to the parameters once more. If the parameters were computed from other
-    variables, Dr.Jit has forgotten that computation as well, and gradients end at the parameters: `warn_of_lost` says
-    so.
+    Dr.Jit removes a computation from its graph once a gradient has passed backwards through it. So the arrays must be
+    `attached` to the parameters again before the gradient of another view. If the parameters were themselves computed
+    from other variables, that computation is lost: gradients end at the parameters, and `warn_of_lost` warns.
     """
 
     def __init__(
         self,
         vertices: Vertices,
         points: RecentredPoints,
-        name: str,  # What warnings call the shape
+        name: str,  # Name of the shape in warnings
         shading: ExactShading | None,
         displacement: ShapeDisplacement | None,
     ) -> None:
@@ -53,13 +52,13 @@ class MovingVertices:
 
     def evaluated(
         self,
-        control_points: FloatBuffer,  # The parameter
+        control_points: FloatBuffer,  # Parameter of the shape, in object space
         placement: Placement,
-        on_backward: Callable,  # Called with gradients, by name, after reverse mode has reached the moving arrays
+        on_backward: Callable,  # Called with the gradients of the moving arrays, by name, after each reverse-mode pass
         *,
         moves_points: bool,  # Whether control points have changed
     ) -> dict[str, FloatBuffer]:
-        """Evaluate the mesh's buffers, by their names, and have exact shading follow."""
+        """Evaluate the mesh's buffers, and update exact shading. Returns the buffers by name."""
         points = self._points(control_points)
         is_attached = self.are_differentiable and dr.grad_enabled(points)
         kernel = self._kernel
@@ -75,7 +74,7 @@ class MovingVertices:
     def attached(
         self, control_points: FloatBuffer, placement: Placement, on_backward: Callable
     ) -> dict[str, FloatBuffer]:
-        """The buffers of the last evaluation, attached to the parameters again, as is exact shading."""
+        """Attach exact shading and the buffers of the last evaluation to the parameters again."""
         points = self._points(control_points)
         if self._kernel is not None and dr.grad_enabled(points):
             self._kernel.attach(points)
@@ -83,13 +82,13 @@ class MovingVertices:
 
     def warn_of_lost(
         self,
-        # By names of the arrays computed from the parameters. Gradients are zero for shapes of scenes out of
-        # use.
+        # Gradients by the arrays computed from the parameters, by name. Zero for shapes of scenes that are no longer
+        # used.
         gradients: dict[str, FloatBuffer | Matrix4],
         control_points: FloatBuffer,
         placement: Placement,
     ) -> None:
-        """Warn if a gradient has come to the parameters, but could not get to what these were computed from."""
+        """Warn if a gradient has reached the parameters, but not the variables that these were computed from."""
         lost = self._computed - computed_ones(control_points, placement.matrix, *self._others())
         if lost and not is_recording() and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
             parameters = "control_points, to_world or heights" if self._others() else "control_points or to_world"
@@ -103,7 +102,7 @@ class MovingVertices:
         return None if self._displacement is None else self._displacement.kernel
 
     def _others(self) -> list[FloatBuffer]:
-        """Arrays besides the parameters that vertices are computed from."""
+        """Arrays that vertices depend on besides control points and placement."""
         return [] if self._displacement is None else self._displacement.variables()
 
     def _placed(
@@ -125,7 +124,7 @@ class MovingVertices:
 
 
 class Watched(dr.CustomOp):
-    """Identity on arrays that calls a function after reverse mode has passed through it."""
+    """Identity function of arrays, which calls a function after reverse mode has passed through it."""
 
     def eval(self, arrays, on_backward):
         self.on_backward = on_backward
@@ -145,19 +144,19 @@ class Watched(dr.CustomOp):
 
 
 def on_backward_of(renew: Callable[..., None]) -> Callable[..., None]:
-    """Function that calls a method of a shape, which renews derivatives, and does not keep the shape alive."""
+    """Return a function that calls the bound method ``renew`` of a shape without keeping the shape alive."""
     reference = weakref.WeakMethod(renew)
 
     def call(*arguments: Any) -> None:
-        alive = reference()
-        if alive is not None:
-            alive(*arguments)
+        method = reference()
+        if method is not None:
+            method(*arguments)
 
     return call
 
 
 def warn_of_lost(name: str, parameters: str) -> None:
-    """Warn that a gradient has come to parameters of a shape, but could not get to what they were computed from."""
+    """Warn that a gradient has reached parameters of a shape, but not the variables that they were computed from."""
     warn(
         f"{name}: gradients came to {parameters} a second time since the last update, and could not go on to the "
         "variables that these were computed from, as Dr.Jit forgets a computation once gradients have passed through "
@@ -177,20 +176,20 @@ def loss_of_views(
 ) -> Float:
     """Render a scene through several sensors, and sum a loss of each image.
 
-    ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With one
-    ``dr.backward`` per view, only the first would: after it, Dr.Jit forgets how the parameters were computed.
+    ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With one call of
+    ``dr.backward`` per view, only the first one would: Dr.Jit then forgets how the parameters were computed.
 
     Parameters
     ----------
     scene : mi.Scene
     params : mi.SceneParameters
-        Of the scene, updated.
+        Parameters of the scene, updated.
     loss : callable
-        Takes a picture, ``(height, width, channels)``, and the index of its view; returns a differentiable number.
+        Function of an image, ``(height, width, channels)``, and the index of its view; returns a differentiable number.
     sensors : sequence of int or mi.Sensor, optional
         By default all sensors of the scene.
     seed : int
-        Each view of each seed has random numbers of its own.
+        Each pair of a seed and a view has different random numbers.
     **options
         As for ``mi.render``: ``spp``, ``spp_grad``, ``integrator``.
 
@@ -203,7 +202,7 @@ def loss_of_views(
     ValueError
         If there is no sensor.
     """
-    # Mitsuba's stub wants an array for the seed, but a number does.
+    # Mitsuba's stub only accepts an array as seed.
     render: Any = mi.render
     sensors = range(len(scene.sensors())) if sensors is None else sensors
     if not len(sensors):
@@ -215,12 +214,12 @@ def loss_of_views(
 
 
 def computed_ones(*values: Any) -> set[int]:
-    """Find arrays that were computed from variables with derivatives, which Dr.Jit still knows.
+    """Find arrays whose derivatives depend on other variables in Dr.Jit's graph.
 
-    There is no such computation behind a variable whose own gradient is asked for, and none after a gradient has passed
-    through it, which Dr.Jit then forgets by default.
+    A variable whose gradient was enabled directly has no such dependence, nor has an array after a gradient has passed
+    through its computation, which Dr.Jit then removes by default.
 
-    Returns set of int: Dr.Jit's numbers of the arrays' derivatives.
+    Returns set of int: Dr.Jit's indices of the arrays' derivatives.
     """
     derivatives = {index >> _HALF for value in values for index in dr.detail.collect_indices(value)} - {0}
     graph = str(dr.graphviz_ad(as_string=True))
@@ -228,7 +227,7 @@ def computed_ones(*values: Any) -> set[int]:
 
 
 def _placed(positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4) -> tuple[FloatBuffer, FloatBuffer]:
-    """Flat positions and unit normals in the world, of those in object space."""
+    """Map flat positions and unit normals from object space to world space."""
     if dr.is_jit_v(positions):
         from ..kernels.affine_map import placed
         from ..kernels.array_types import ArrayTypes

@@ -1,10 +1,10 @@
-"""Bounds the nesting of shape constructors on one stack.
+"""Limits the nesting of shape constructors on one stack.
 
-Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. A thread that waits for Dr.Jit runs other tasks
-meanwhile, on the same stack, in the order in which they were queued: all other shapes' constructors, before any kernel.
-Waiting cannot be avoided, as `Mesh.parameters_changed` itself waits, for the mesh's bounding box. So each of a thousand
-constructors would begin inside the one before. Here, a constructor that is nested too deeply runs in a thread of its
-own, and its caller waits for that thread without running tasks.
+Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. A thread that waits for Dr.Jit runs other queued
+tasks on the same stack: all constructors of other shapes, before any kernel. Waiting cannot be avoided, because
+`Mesh.parameters_changed` waits for the mesh's bounding box. So a thousand constructors would be nested in each other.
+Here, a constructor that would be nested too deeply runs in a new thread, and its caller waits for this thread without
+running tasks.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from contextvars import copy_context
 from functools import wraps
 from typing import Any
 
-# So many constructors may begin inside each other on one stack. Each takes 4 to 15 of the thousand frames that Python
-# allows, and less than 8 kB of a stack that has half a megabyte at least.
+# Maximum number of nested constructors on one stack. Each takes 4 to 15 of the thousand frames that Python allows, and
+# less than 8 kB of a stack of at least half a megabyte.
 DEEPEST = 32
 
 _stack = threading.local()
 
 
 def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
-    """Run calls of a function in a new thread if `DEEPEST` of them are on this thread's stack already."""
+    """Decorate a function to run in a new thread if `DEEPEST` calls are already on this thread's stack."""
 
     @wraps(function)
     def call(*arguments: Any) -> None:
@@ -53,5 +53,5 @@ def _in_own_thread(function: Callable[..., None], *arguments: Any) -> None:
     thread.start()
     thread.join()
     if errors:
-        # Nothing else keeps the error, which keeps the frames that it came through.
+        # Remove the last reference to the error, whose traceback keeps its frames alive.
         raise errors.pop()

@@ -1,6 +1,6 @@
 """The shape's parameters: names, types, defaults, checks and descriptions.
 
-The rows of the plugin's page and of the table in ``plugin/guide/parameters.md`` are generated from it.
+The plugin's page and the table in ``plugin/guide/parameters.md`` are generated from this table.
 """
 
 from __future__ import annotations
@@ -92,21 +92,21 @@ to world space; and ``shading_cage_NAME``, the values that hits interpolate.
 class Parameter:
     """A row of the shape's parameter table."""
 
-    name: str  # ``NAME`` in it stands for an attribute's name
-    # As Mitsuba's documentation names it: "string", "float", "int", "bool", "tensor", "transform", "texture" or
+    name: str  # May contain ``NAME``, a placeholder for an attribute's name
+    # Type as in Mitsuba's documentation: "string", "float", "int", "bool", "tensor", "transform", "texture" or
     # "float[]"; several are joined by " or "
     type: str
     description: str  # With literals between double backticks, without a full stop at the end
-    default: Any = None  # None if there is none
-    default_text: str = ""  # Describes a default that is not one value
+    default: Any = None  # None if there is no default
+    default_text: str = ""  # Description of a default that is not a single value
     choices: tuple[str, ...] = ()  # Values that a string may have; empty for any
-    accepts: Callable[[Any], bool] | None = None  # Whether a value of the right type is allowed
+    accepts: Callable[[Any], bool] | None = None  # Predicate for values of the right type
     expected: str = ""  # Description of accepted values, for messages
     flags: tuple[str, ...] = ()  # Empty if the parameter is read at load time only
 
     @property
     def text(self) -> str:
-        """Description and default, in one cell as in Mitsuba's tables."""
+        """Description and default, in one table cell as in Mitsuba's documentation."""
         default = self.default_text
         if not default and self.default is not None:
             value = str(self.default).lower() if isinstance(self.default, bool) else self.default
@@ -114,9 +114,9 @@ class Parameter:
         return f"{self.description}. (Default: {default})" if default else self.description
 
     def checked(self, value: Any) -> Any:
-        """The same value. Raises ValueError if it has another type, or is not allowed."""
+        """Return ``value``. Raises ValueError if its type is wrong, or it is not allowed."""
         kind, expected = _TYPES[self.type]
-        # In Python true is an integer as well.
+        # In Python, bool is a subclass of int.
         if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
             raise ValueError(f'parameter "{self.name}" is {value!r}; expected {expected}')
         if self.choices and value not in self.choices:
@@ -155,7 +155,7 @@ def _film_size(name: str, side: str) -> Parameter:
 
 
 def _rule(name: str, description: str) -> Parameter:
-    # A cage checks its rules itself, as it may have them from a file.
+    # Not checked here: the cage checks its rules, which may also come from a file.
     return Parameter(name, "string", description, default_text=f"the file's, or ``{RULES[name][0]}``")
 
 
@@ -380,7 +380,7 @@ PARAMETERS = (
 )
 PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 
-# Further parameters, which only `traverse` exposes.
+# Parameters that only `traverse` exposes.
 STATE_PARAMETERS = (
     Parameter(
         "control_points", "float[]", "Vertices of the control cage, flat x, y, z, in object space", flags=DISCONTINUOUS
@@ -436,9 +436,9 @@ STATE_PARAMETERS = (
 
 
 def value_of(props: mi.Properties, name: str) -> Any:
-    """The checked value of a parameter that a scene gives to the shape; the default where there is none.
+    """The checked value of a parameter in a scene, or its default.
 
-    Raises ValueError if it has another type, or is not allowed; says what was expected.
+    Raises ValueError if its type is wrong, or it is not allowed.
     """
     parameter = PARAMETER_OF_NAME[name]
     return parameter.checked(props[name]) if name in props else parameter.default
@@ -446,7 +446,7 @@ def value_of(props: mi.Properties, name: str) -> Any:
 
 @contextmanager
 def errors_about(parameter: str) -> Iterator[None]:
-    """Put the name of a parameter before the messages of errors of value."""
+    """Prefix messages of ValueError with the name of a parameter."""
     try:
         yield
     except ValueError as error:
@@ -454,7 +454,7 @@ def errors_about(parameter: str) -> Iterator[None]:
 
 
 def plugin_page() -> str:
-    """The page as reStructuredText, with the parameter table."""
+    """The plugin's page as reStructuredText, with the parameter table."""
     rows = "\n\n".join(map(_row, (*PARAMETERS, *STATE_PARAMETERS)))
     return _PAGE.format(count=len(PARAMETERS), rows=rows)
 

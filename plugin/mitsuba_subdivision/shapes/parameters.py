@@ -1,4 +1,4 @@
-"""Reads and checks the parameters of the shape ``subdivision``, for every variant alike."""
+"""Reads and checks the parameters of the shape ``subdivision``, independently of the variant."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..cage.errors import noting_warnings, warn, without_warnings
 from ..cage.rules import RULES
 from ..cage.source import CageSource
 
-# Not for types only: Dr.Jit looks up the types of a dataclass that a shape holds.
+# Needed at run time: Dr.Jit resolves the annotations of dataclasses that a shape refers to.
 from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
 from ..mesh.shared import Shared
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 # Parameters of a cage in memory, and their shapes, with -1 for any size.
 ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
 TAGS = {"creases": (-1, 3), "corners": (-1, 2), "holes": (-1,)}
-# Mesh and time code of a USD file.
+# Parameters that select the mesh and the time code of a USD file.
 IN_FILE = ("prim", "time")
 
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
-# A file modified less than this many nanoseconds ago may change without a new modification time: the resolution of
-# file times is some milliseconds, and two seconds on some systems.
+# Minimum age in nanoseconds of a file whose cage is shared. Later changes of a younger file may not change its
+# modification time, whose resolution is some milliseconds, or two seconds on some systems.
 SETTLED = 2_000_000_000
 _CAGES: Shared[ControlCage] = Shared()
-# Warnings that each cage issued when it was built, repeated for each shape.
+# Warnings that were issued when each cage was built. They are repeated for each shape.
 _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
 
 
@@ -54,20 +54,20 @@ class Parameters:
     """Checked parameters of a shape."""
 
     surface: LimitSurface  # In object space
-    source: str  # Name of the cage, of its file, or "control cage". Messages begin with it.
+    source: str  # Name of the cage or of its file, or "control cage", at the beginning of messages
     to_world: NDArray[np.float64]  # (4, 4) float64
     tessellation: Tessellation
     shading: str
     face_normals: bool
     evaluator: Evaluator
-    sample_offset: float  # Extraordinary vertices are sampled at ``u = v = sample_offset``
-    displacement: Any  # Texture, or mesh attribute ``vertex_NAME``, with the heights
+    sample_offset: float  # Parameters u = v at which extraordinary vertices are sampled
+    displacement: Any  # Heights: a texture, or the name ``vertex_NAME`` of a mesh attribute; None without displacement
     displacement_scale: float
-    shown: NDArray[np.bool_] | None  # (n_f,) bool or None: elements whose triangles are kept; None for all
+    shown: NDArray[np.bool_] | None  # (n_f,) bool: elements whose triangles are kept; None for all
 
 
 def read_parameters(props: mi.Properties) -> Parameters:
-    """Read and check the parameters that a scene gives to the shape.
+    """Read and check the parameters of the shape in a scene.
 
     Raises ValueError if a parameter is unknown, missing, contradictory, or has a wrong type or value. Raises CageError
     if the cage is invalid.
@@ -76,9 +76,9 @@ def read_parameters(props: mi.Properties) -> Parameters:
     from ..schemes import scheme_named
 
     _reject_unknown(props)
-    asked = value_of(props, "scheme")
+    scheme_name = value_of(props, "scheme")
     with errors_about("scheme"):
-        scheme = None if asked is None else scheme_named(asked)
+        scheme = None if scheme_name is None else scheme_named(scheme_name)
     tessellation = read_tessellation(props)
     shading, evaluator, offset = (value_of(props, name) for name in ("shading", "evaluator", "sample_offset"))
     if evaluator == "stam" and offset == 0:
@@ -109,13 +109,13 @@ def read_parameters(props: mi.Properties) -> Parameters:
 
 
 def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | None:
-    """Mask of the faces that are shown; None for all."""
-    given = [name for name in ("material", "shown_faces") if name in props]
-    if not given:
+    """Mask of the faces to show; None for all."""
+    selections = [name for name in ("material", "shown_faces") if name in props]
+    if not selections:
         return None
-    if len(given) > 1:
+    if len(selections) > 1:
         raise ValueError('parameters "material" and "shown_faces" contradict each other; expected only one of them')
-    cage, (name,) = surface.cage, given
+    cage, (name,) = surface.cage, selections
     if surface.scheme.element != "face":
         raise ValueError(
             f'parameter "{name}" chooses faces; expected none for the scheme "{surface.scheme.name}", whose surface '
@@ -130,9 +130,9 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
         faces = cage.materials[material]
     else:
         faces = _tensor(props, name, (-1,))
-        wrong = faces[(faces < 0) | (faces >= cage.face_count)]
-        if len(wrong):
-            raise ValueError(f'parameter "{name}" has {wrong[0]}; expected 0 to {cage.face_count - 1}')
+        out_of_range = faces[(faces < 0) | (faces >= cage.face_count)]
+        if len(out_of_range):
+            raise ValueError(f'parameter "{name}" has {out_of_range[0]}; expected 0 to {cage.face_count - 1}')
     shown = np.zeros(cage.face_count, dtype=bool)
     shown[faces] = True
     if not (shown & ~cage.is_hole).any():
@@ -141,25 +141,25 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
 
 
 def _displacement(props: mi.Properties) -> tuple[Any, float]:
-    """Texture or mesh attribute of the heights, or None, and their scale."""
+    """Heights, as a texture, a name of a mesh attribute or None, and their scale."""
     scale = value_of(props, "displacement_scale")
     if "displacement" not in props:
         if scale is not None:
             raise ValueError('parameter "displacement_scale" needs "displacement"')
         return None, 1.0
-    given = props["displacement"]
-    if not isinstance(given, str) and not hasattr(given, "eval_1_grad"):
-        what = given.class_name() if hasattr(given, "class_name") else repr(given)
+    heights = props["displacement"]
+    if not isinstance(heights, str) and not hasattr(heights, "eval_1_grad"):
+        description = heights.class_name() if hasattr(heights, "class_name") else repr(heights)
         raise ValueError(
-            f'parameter "displacement" is {what}; expected a texture, or the name of an attribute, such as '
+            f'parameter "displacement" is {description}; expected a texture, or the name of an attribute, such as '
             '"vertex_height"'
         )
-    return given, 1.0 if scale is None else float(scale)
+    return heights, 1.0 if scale is None else float(scale)
 
 
 def _reject_unknown(props: mi.Properties) -> None:
     for name in props.keys():  # noqa: SIM118 - Properties iterates over pairs
-        # Nested objects may have any name; Mitsuba itself rejects those that a shape cannot have.
+        # Nested objects may have any name. Mitsuba rejects kinds of objects that a shape cannot have.
         if name in PARAMETER_OF_NAME or is_attribute_parameter(name) or props.type(name) in _OBJECTS:
             continue
         import difflib
@@ -180,7 +180,7 @@ def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
                 f'parameters "filename" and "{arrays[0]}" contradict each other; expected only one of them'
             )
         name = value_of(props, "filename")
-        # Mitsuba's stub says of this function only that it is an object.
+        # Mitsuba's stub declares this function as an object.
         file_resolver: Any = mi.file_resolver
         path = str(file_resolver().resolve(name))
         if not os.path.isfile(path):
@@ -189,13 +189,13 @@ def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
         if scheme is not None:
             rules["scheme"] = scheme
         return cage_of_file(path, prim=value_of(props, "prim"), time=value_of(props, "time"), strict=strict, **rules)
-    for given in IN_FILE:
-        if given in props:
-            raise ValueError(f'parameter "{given}" needs a USD file as "filename"')
+    for option in IN_FILE:
+        if option in props:
+            raise ValueError(f'parameter "{option}" needs a USD file as "filename"')
     missing = [name for name in ARRAYS if name not in props]
     if missing:
-        wanted = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
-        raise ValueError(f'no control cage: expected "filename", or {wanted}' + (" as well" if arrays else ""))
+        expected = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
+        raise ValueError(f'no control cage: expected "filename", or {expected}' + (" as well" if arrays else ""))
     parts = {name: _tensor(props, name, shape) for name, shape in {**ARRAYS, **TAGS}.items() if name in props}
     return cage_of_arrays(
         value_of(props, "cage_name"), **parts, strict=strict, **rules, **read_attributes(props, _tensor)
@@ -203,12 +203,14 @@ def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
 
 
 def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Values of a tensor, of a shape with -1 for any size. One-dimensional tensors hold integers."""
+    """Read a tensor and check its shape, with -1 for any size. One-dimensional tensors must contain integers."""
     value = props[name]
     if not hasattr(value, "shape"):
         raise ValueError(f'parameter "{name}" is {value!r}; expected a tensor')
     array = np.array(value)
-    if array.ndim != len(shape) or any(want not in (-1, size) for want, size in zip(shape, array.shape, strict=True)):
+    if array.ndim != len(shape) or any(
+        expected_size not in (-1, size) for expected_size, size in zip(shape, array.shape, strict=True)
+    ):
         expected = f"(n, {shape[1] if shape[1] >= 0 else 'k'})" if len(shape) == 2 else "(m,)"
         raise ValueError(f'parameter "{name}" has shape {array.shape}; expected {expected}')
     if len(shape) == 2:
@@ -219,38 +221,38 @@ def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarr
 
 
 def cage_of_file(path: str, **options: Any) -> ControlCage:
-    """`ControlCage.from_file`, returning the cage of a living shape if the file is unchanged. Warns for each shape."""
-    found_format = FORMATS.get(os.path.splitext(path)[1].lower())
-    if found_format is None or found_format.refers_to_files:
+    """Call `ControlCage.from_file`, or reuse a living shape's cage if the file is unchanged. Warns for each shape."""
+    file_format = FORMATS.get(os.path.splitext(path)[1].lower())
+    if file_format is None or file_format.refers_to_files:
         return ControlCage.from_file(path, **options)
-    found = os.stat(path)
-    if abs(clock.time_ns() - found.st_mtime_ns) < SETTLED:
+    status = os.stat(path)
+    if abs(clock.time_ns() - status.st_mtime_ns) < SETTLED:
         return ControlCage.from_file(path, **options)
-    state = found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
-    key = path, *state, *sorted(options.items())
+    file_state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    key = path, *file_state, *sorted(options.items())
     return _shared(key, lambda: ControlCage.from_file(path, **options))
 
 
 def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
-    """`ControlCage.from_arrays`, returning the cage of a living shape if all arguments are equal.
+    """Call `ControlCage.from_arrays`, or reuse the cage of a living shape if all arguments are equal.
 
-    Messages call the cage by its name. It warns for each shape without a name: the warnings of a cage with one were
-    given before.
+    Messages contain ``name``. Without a name, it warns for each shape; with a name, the creator of the cage has warned
+    before.
     """
     if name is None:
         return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))
     with without_warnings():
-        # Shapes of equal cages share one by different names: the first name is that of the cage.
+        # Equal cages with different names are shared, under the name of the first one.
         key = "named", _digest(arguments)
         return _shared(key, lambda: ControlCage.from_arrays(**arguments, source=CageSource(name)))
 
 
 def _digest(value: Any) -> Hashable:
-    """Cache key of an argument, which does not keep arrays alive."""
+    """Cache key of an argument, without references to arrays."""
     if isinstance(value, Mapping):
-        return tuple((name, _digest(each)) for name, each in value.items())
+        return tuple((name, _digest(item)) for name, item in value.items())
     if isinstance(value, Attribute):
-        return _digest({each.name: getattr(value, each.name) for each in fields(value)})
+        return _digest({field.name: getattr(value, field.name) for field in fields(value)})
     if isinstance(value, np.ndarray):
         return value.shape, str(value.dtype), blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
     return value

@@ -15,14 +15,15 @@ from ..kernels.array_types import FloatBuffer, Matrix4
 if TYPE_CHECKING:
     import mitsuba as mi
 
+# Last row of the matrix of an affine map.
 _LAST_ROW = (0, 0, 0, 1)
-# Points are far from the origin if their middle is more than this many times half their extent away from it. Nearer
-# points lose at most two of 24 bits by rounding to float32.
+# Least distance from the origin at which control points are recentred, relative to half their extent. Closer points
+# lose at most two of 24 bits by rounding to float32.
 FAR = 4
 
 
 def checked_matrix(transform: Any, name: str = "to_world") -> NDArray[np.float64]:
-    """``(4, 4)`` matrix of one of Mitsuba's transformations, of a scalar or a JIT variant: the parameter of a name.
+    """Return the ``(4, 4)`` matrix of a transformation of Mitsuba, in any variant; ``name`` is the parameter's name.
 
     Raises ValueError if it is not an invertible affine map.
     """
@@ -44,22 +45,21 @@ def checked_matrix(transform: Any, name: str = "to_world") -> NDArray[np.float64
 class RecentredPoints:
     """Control points relative to a centre, if they are far from the origin.
 
-    In single precision such points lose digits, as normals would show. A coordinate that still has the value with which
-    it was loaded is replaced by its double-precision value relative to the centre.
+    In single precision such points lose digits, which is visible in normals. So a coordinate with the value that was
+    loaded is replaced by its double-precision value relative to the centre.
     """
 
     def __init__(
         self,
-        positions: NDArray[np.float64],  # (n, 3) float64: as they are loaded
-        float_type: type,  # Flat Dr.Jit array of the parameter `control_points`
+        positions: NDArray[np.float64],  # (n, 3) float64: loaded control points
+        float_type: type,  # Flat Dr.Jit array of the parameter ``control_points``
         *,
-        # Whether points may be recentred at all: published forms show what they make of the points as they
-        # are
+        # Whether points may be recentred. Published forms are evaluated at the points as they are.
         recentres: bool,
     ) -> None:
-        self.centre: NDArray[np.float64] | None = None  # (3,) float64; None if the points stay as they are
-        self.positions = positions  # (n, 3) float64: as they were loaded, relative to the centre
-        # Reductions along columns of three are slow.
+        self.centre: NDArray[np.float64] | None = None  # (3,) float64; None if points are not recentred
+        self.positions = positions  # (n, 3) float64: loaded control points, relative to the centre
+        # NumPy's reductions over the rows of an (n, 3) array are slow.
         columns = np.ascontiguousarray(positions.T)
         low, high = columns.min(axis=1), columns.max(axis=1)
         centre = ((low + high) / 2).astype(np.float32).astype(np.float64)
@@ -70,33 +70,33 @@ class RecentredPoints:
             self._centres = mapped(float_type, np.tile(centre, len(positions)))
 
     def __call__(self, control_points: FloatBuffer) -> FloatBuffer:
-        """Flat control points relative to the centre."""
-        # A wrong number of control points raises an error where they are used.
+        """Return flat control points relative to the centre."""
+        # The functions that use the points check their number.
         if self.centre is None or len(control_points) != len(self._loaded):
             return control_points
         moved = control_points - self._centres
-        found = dr.select(control_points == self._loaded, self._relative, moved)
-        # What replaces a coordinate has its derivatives.
-        return dr.replace_grad(found, moved) if dr.grad_enabled(control_points) else found  # type: ignore[func-returns-value]  # The stub is wrong.
+        relative = dr.select(control_points == self._loaded, self._relative, moved)
+        # Attach replaced coordinates to the control points.
+        return dr.replace_grad(relative, moved) if dr.grad_enabled(control_points) else relative  # type: ignore[func-returns-value]  # The stub is wrong.
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The map of ``to_world`` for points relative to their centre."""
+    """The map of ``to_world`` for points relative to the centre of `RecentredPoints`."""
 
-    matrix: Matrix4  # Of Dr.Jit, with derivatives if the parameter has any; of NumPy in scalar variants
-    inverse: Matrix4  # Of the parameter alone, without derivatives
-    is_identity: bool  # Whether it is the identity and has no derivatives
-    mirrors: bool  # Whether it is a reflection, which turns triangles inside out
+    matrix: Matrix4  # Dr.Jit matrix attached to the parameter; NumPy matrix in scalar variants
+    inverse: Matrix4  # Inverse of the parameter without the centre, detached
+    is_identity: bool  # Whether the matrix is the identity and is not differentiated
+    mirrors: bool  # Whether the map is a reflection, which reverses the orientation of triangles
 
     @classmethod
     def of(
         cls,
         to_world: mi.AffineTransform4f,
-        value: NDArray[np.float64],  # (4, 4) float64: its matrix
+        value: NDArray[np.float64],  # (4, 4) float64: matrix of ``to_world``
         centre: NDArray[np.float64] | None,  # (3,) float64 or None
     ) -> Placement:
-        """The placement by a transformation."""
+        """The placement of a transformation."""
         is_jit = dr.is_jit_v(to_world.matrix)
         matrix, inverse = cls._recentred(to_world.matrix if is_jit else value, centre), np.linalg.inv(value)
         is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)
@@ -108,9 +108,9 @@ class Placement:
         )
 
     def recorded(self, to_world: mi.AffineTransform4f, centre: NDArray[np.float64] | None) -> Placement:
-        """The placement by a transformation whose value cannot be read, as a frozen function is being recorded.
+        """The placement of a transformation while a frozen function is recorded, when its value cannot be read.
 
-        It mirrors if this one does.
+        It is assumed to be a reflection if this placement is one.
         """
         matrix = dr.detach(to_world.matrix)
         return Placement(self._recentred(to_world.matrix, centre), dr.rcp(matrix), False, self.mirrors)

@@ -1,7 +1,7 @@
 """Registration of the plugins of this package for every variant of Mitsuba.
 
-A plugin is registered for one variant, and must be a class of that variant: with another one's class Mitsuba silently
-builds a scene without shapes.
+A plugin is registered for one variant, and must be a class of this variant: with a class of another variant, Mitsuba
+silently builds a scene without shapes.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from ..variants import variant_module, variant_name
 from .device_state import paused_collection
 
 PLUGIN_NAME = "subdivision"
-# In every variant, Mitsuba looks up the kind of a plugin in this variant. It needs the kind because `load_dict` merges
-# equal objects unless they are shapes.
+# Variant in which Mitsuba looks up the kind of a plugin, whatever variant is set. `load_dict` needs the kind, as it
+# merges equal objects unless they are shapes.
 QUERY_VARIANT = "scalar_rgb"
 
 _registered: dict[str, type] = {}
-# Re-entrant, as making the class may itself switch variants in another module's callback.
+# Re-entrant, because creating the class may switch variants in a callback of another module.
 _lock = threading.RLock()
 
 
 def register() -> None:
-    """Register the plugins for every variant: for loaded ones now, for others when they are first set. Idempotent."""
+    """Register the plugins for loaded variants now, and for others when they are first set. Idempotent."""
     mi.detail.add_variant_callback(_on_variant_change)
     current = mi.variant()
     if current is None:
@@ -37,10 +37,10 @@ def register() -> None:
 
 
 def register_variant(variant: ModuleType | str) -> type:
-    """Register the plugins for a variant, and for the one in which Mitsuba looks up plugin kinds. Idempotent.
+    """Register the plugins for a variant, and for the variant in which Mitsuba looks up plugin kinds. Idempotent.
 
-    `register` does this for every variant that is set. Call it for a variant that is used without being set, as by
-    ``mi.parser.instantiate``.
+    `register` suffices for variants that are set. Call this function for a variant that is used without being set, as
+    by ``mi.parser.instantiate``.
 
     Parameters
     ----------
@@ -55,19 +55,19 @@ def register_variant(variant: ModuleType | str) -> type:
     Raises
     ------
     ValueError
-        If Mitsuba has no such variant, none is set, or it is something else.
+        If Mitsuba has no such variant, no variant is set, or the argument is no variant.
     """
     variant_module(variant)
     name = variant_name(variant)
     with _lock, paused_collection():
-        for needed in (QUERY_VARIANT, name):
-            if needed not in _registered:
+        for variant_to_register in (QUERY_VARIANT, name):
+            if variant_to_register not in _registered:
                 from .subdivision_shape import make_subdivision
 
-                module = getattr(mi, needed)
+                module = getattr(mi, variant_to_register)
                 shape = make_subdivision(module)
                 module.register_shape(PLUGIN_NAME, shape)
-                _registered[needed] = shape
+                _registered[variant_to_register] = shape
         return _registered[name]
 
 
@@ -79,6 +79,6 @@ def _on_variant_change(_old: str | None, new: str) -> None:
 
 def _register_loaded_variants() -> None:
     for variant in mi.variants():
-        # A variant is loaded when it is first set or first used by name; loading all of them would take seconds.
+        # Variants are loaded when they are first set or accessed; loading all of them would take seconds.
         if f"mitsuba.{variant}" in sys.modules:
             register_variant(variant)

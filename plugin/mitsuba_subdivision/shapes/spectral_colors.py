@@ -1,7 +1,7 @@
-"""Colours in spectral variants: coefficients of smooth spectra, which Mitsuba's meshes store in place of colours.
+"""Colours in spectral variants: coefficients of smooth spectra, which Mitsuba's meshes store instead of colours.
 
-Mitsuba looks them up in a table when an attribute is added to a mesh [Jakob and Hanika 2019]. Here colours may change
-and have derivatives, so that kernels look them up.
+Mitsuba looks them up in a table when an attribute is added to a mesh [Jakob and Hanika 2019]. Here they are looked up
+in kernels, because colours may change and be differentiated.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from ..mesh.shared import Shared
 from ..variants import Variant
 
 TABLE = "data/srgb.coeff"
-# Bytes of the file's mark and of its resolution.
+# Sizes in bytes of the magic number at the beginning of the file, and of the resolution that follows.
 _MARK, _WORD = 4, 4
-# The last coefficient of black and white.
+# Last coefficient of the spectra of black and white; the others are zero.
 _BLACK, _WHITE = -8192.0, 8192.0
-# Colours below are black: the table is scaled by the inverse of the largest component.
+# Lower bound of the largest component of a colour, by which the other components are divided.
 _DARKEST = 1e-6
 
 
@@ -35,30 +35,30 @@ def holds_spectra(variant: Variant, mesh_name: str, size: int) -> bool:
 
 
 class SpectralUpsampling:
-    """Coefficients of the spectra of colours, differentiable in JIT variants."""
+    """Conversion of colours to coefficients of spectra, differentiable in JIT variants."""
 
     @classmethod
     def shared(cls, variant: Variant) -> SpectralUpsampling:
-        """The same object for all shapes of a variant, while it is referenced."""
+        """The object of a variant, shared by its shapes while it is referenced."""
         return _UPSAMPLING.get(variant, lambda: cls(variant))
 
     def __init__(
         self,
-        variant: Variant,  # A spectral one
+        variant: Variant,  # Spectral variant
     ) -> None:
         self._variant = variant
         if not dr.is_jit_v(variant.Float):
             return
-        # Mitsuba's stub says of this function only that it is an object.
+        # Mitsuba's stub declares this function as an object.
         file_resolver: Any = mi.file_resolver
         with open(str(file_resolver().resolve(TABLE)), "rb") as file:
             content = file.read()
         self._resolution = size = int(np.frombuffer(content, "<u4", 1, _MARK)[0])
         values = np.frombuffer(content, "<f4", size + 9 * size**3, _MARK + _WORD)
-        self._levels, self._table = (upload(variant.Float, each) for each in (values[:size], values[size:]))
+        self._levels, self._table = (upload(variant.Float, array) for array in (values[:size], values[size:]))
 
     def stored(self, colors: FloatBuffer) -> FloatBuffer:
-        """Coefficients of a mesh's buffer of colours, both flat."""
+        """Convert a mesh's flat buffer of colours to a flat buffer of coefficients."""
         variant = self._variant
         if dr.is_jit_v(variant.Float):
             return dr.ravel(variant.Color3f(self(dr.unravel(variant.Color3f, colors))))
@@ -67,10 +67,10 @@ class SpectralUpsampling:
         return np.array(mesh.attribute_buffer("vertex_color"))
 
     def __call__(self, color: Value) -> Value:
-        """Coefficients of colours on a device."""
+        """Convert colours to coefficients on the device."""
         variant, last = self._variant, self._resolution - 1
-        r, g, b = (dr.clip(each, 0, 1) for each in color)
-        # The table has a part for each component that is the largest; of equal ones, the last counts.
+        r, g, b = (dr.clip(component, 0, 1) for component in color)
+        # The table has a part for each component that is the largest, or the last one of the largest.
         is_blue = b >= dr.maximum(r, g)
         is_green = ~is_blue & (g >= r)
         largest = dr.maximum(dr.select(is_blue, b, dr.select(is_green, g, r)), _DARKEST)
@@ -93,14 +93,14 @@ class SpectralUpsampling:
         def along_y(z: Index) -> Value:
             return dr.lerp(along_x(y, z), along_x(y + 1, z), second - y)
 
-        found = dr.lerp(along_y(z), along_y(z + 1), height)
-        # Greys have constant spectra, in closed form.
+        coefficients = dr.lerp(along_y(z), along_y(z + 1), height)
+        # Greys have constant spectra with a closed form.
         is_grey = (r == g) & (g == b)
-        grey = dr.replace_grad(self._grey(dr.detach(b)), found)  # type: ignore[func-returns-value]  # The stub is wrong.
-        return dr.select(is_grey, grey, found)
+        grey = dr.replace_grad(self._grey(dr.detach(b)), coefficients)  # type: ignore[func-returns-value]  # The stub is wrong.
+        return dr.select(is_grey, grey, coefficients)
 
     def _interval(self, largest: Float) -> Index:
-        """Level at or below each number."""
+        """Index of the last level that is not above ``largest``."""
         last = self._resolution - 1
 
         def is_above(level: Index) -> Mask:
@@ -109,9 +109,9 @@ class SpectralUpsampling:
         return dr.binary_search(1, last, is_above) - 1
 
     def _grey(self, value: Float) -> Value:
-        inside = (value > 0) & (value < 1)
-        within = dr.select(inside, value, 0.5)
-        constant = dr.select(inside, (within - 0.5) / dr.sqrt(within * (1 - within)), 0)
+        is_inside = (value > 0) & (value < 1)
+        clamped = dr.select(is_inside, value, 0.5)
+        constant = dr.select(is_inside, (clamped - 0.5) / dr.sqrt(clamped * (1 - clamped)), 0)
         constant = dr.select(value <= 0, _BLACK, dr.select(value >= 1, _WHITE, constant))
         return self._variant.Color3f(0, 0, constant)
 

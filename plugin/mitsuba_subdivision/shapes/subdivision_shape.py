@@ -1,4 +1,4 @@
-"""The shape plugin ``subdivision``: the only module that touches ``mi.Mesh``."""
+"""The shape plugin ``subdivision``, a subclass of ``mi.Mesh``."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ if TYPE_CHECKING:
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
-# Parameters whose update chooses new triangles.
+# Parameters whose update selects new triangles.
 _CHOOSING = set(LIMITS)
 
 
 def make_subdivision(
-    variant: Variant,  # Such as `mitsuba.llvm_ad_rgb`; its `Mesh` is the base class
+    variant: Variant,  # Such as `mitsuba.llvm_ad_rgb`; provides the base class `Mesh`
 ) -> type:
     """Make the shape class of a variant of Mitsuba."""
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
 
     class MeshBuffers(variant.TraversalCallback):
-        """Reads or assigns the buffers that a mesh's `traverse` exposes; Mitsuba gives Python no other access."""
+        """Reads or assigns buffers of a mesh in its `traverse`: Mitsuba gives Python no other access."""
 
         def __init__(
             self,
             mesh: mi.Mesh,
             names: Collection[str],
-            # Values to assign; if omitted, buffers are read into it
+            # Values to assign; None to read buffers into `self.values`
             values: dict[str, FloatBuffer | IndexBuffer] | None = None,
         ) -> None:
             super().__init__()
@@ -63,12 +63,12 @@ def make_subdivision(
                 return
             if not self.assigns:
                 buffer = variant.get_property(value, cpp_type, self.mesh)
-                # A copy, as the buffer itself changes when the mesh does.
+                # A copy, as the mesh modifies the buffer in place.
                 self.values[name] = type(buffer)(buffer)
             elif is_jit:
                 variant.set_property(value, cpp_type, self.values[name])
             else:
-                # `set_property` would copy twice: into an array of Mitsuba's type, and from there into the mesh.
+                # `set_property` would copy twice: to an array of Mitsuba's type, and from there to the mesh.
                 buffer = variant.get_property(value, cpp_type, self.mesh)
                 if len(buffer) != len(self.values[name]):
                     variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
@@ -76,9 +76,9 @@ def make_subdivision(
                 np.array(buffer, copy=False)[:] = self.values[name]
 
     class Subdivision(variant.Mesh):
-        """Limit surface of a control cage, as a mesh of triangles whose vertices follow the control points.
+        """Limit surface of a control cage as a triangle mesh whose vertices follow the control points.
 
-        The plugin's page, which `help` shows, is generated from the parameter table.
+        At run time, the docstring is the plugin's page, generated from the parameter table.
         """
 
         __doc__ = plugin_page()
@@ -99,7 +99,7 @@ def make_subdivision(
             self._evaluated: dict[str, int] = {}
             self._lengths: dict[str, int] = {}
             kind = variant.Float if is_jit else dr.scalar.ArrayXf
-            # Mitsuba draws points of such emitters by the mesh's own texture coordinates.
+            # Mitsuba samples textured emitters by the mesh's texture coordinates.
             self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
@@ -128,9 +128,9 @@ def make_subdivision(
             self._cage = self._cage_attributes(attributes)
             self.control_points = mapped(kind, surface.cage.positions)
             if is_jit:
-                # In Dr.Jit's own memory, as frozen functions replace it.
+                # Copied to Dr.Jit's own memory, as frozen functions replace the array.
                 self.control_points = dr.opaque(self.control_points)
-            # Of numbers: whether NumPy's memory is aligned would decide which kernel is compiled.
+            # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
             self._take_to_world(parameters.to_world)
             self._prepare(surface.cage.positions, parameters.to_world)
@@ -149,30 +149,30 @@ def make_subdivision(
                 self._exact.follow_side_of(self)
                 interaction_hook(variant, self).attach(self, self._exact)
             self._device_state = DeviceState(self) if is_jit else None
-            # Values given here would be converted one by one from a list: there are none, and buffers are set later.
+            # Empty, because Mitsuba would convert values from a list one by one. `_assemble` sets the buffers.
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
             self._assemble(moves_points=False)
 
         def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
-            """Attributes of the cage, connected to all that depends on them but the mesh's buffers."""
+            """Attributes of the cage, with exact shading and displacement as their followers."""
             surface = self._parameters.surface
-            found = CageAttributes(
+            attributes = CageAttributes(
                 variant, surface, [name for name in (TEXCOORDS, *names) if name in surface.attribute_names]
             )
             if self._exact is not None:
                 for name, values in self._exact.values.items():
-                    found.add_follower(name, values.set)
+                    attributes.add_follower(name, values.set)
             if self._displacement is not None:
-                found.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
-            return found
+                attributes.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
+            return attributes
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
-            """Choose triangles and the evaluator of their vertices."""
+            """Select triangles and the evaluator of their vertices."""
             parameters, surface = self._parameters, self._parameters.surface
-            bound = None if self._displacement is None else self._displacement.bound()
-            table = self._tessellation.table(surface, control_points, to_world, bound)
+            displacement_bound = None if self._displacement is None else self._displacement.bound()
+            table = self._tessellation.table(surface, control_points, to_world, displacement_bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
             if self._exact is None or self._has_textured_emitter:
                 attributes = surface.attribute_table(table)
@@ -192,7 +192,7 @@ def make_subdivision(
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
             buffers = self._tessellate(moves_points=moves_points)
-            # Triangles are made while the kernels for the vertices run.
+            # The kernels for the vertices run while the host prepares the triangles.
             dr.eval(buffers)
             self._has_turned_faces = self._placement.mirrors
             faces = self._triangles.faces(are_turned=self._has_turned_faces)
@@ -202,9 +202,9 @@ def make_subdivision(
             super().parameters_changed(self._built)
 
         def retessellate(self) -> None:
-            """Choose new triangles of an adaptive tessellation for the current control points.
+            """Select new triangles of an adaptive tessellation for the current control points.
 
-            Afterwards, call ``parameters_changed()`` of a scene that holds the shape. An update of the parameter that
+            Afterwards, call ``parameters_changed()`` of the scene that contains the shape. Updating the parameter that
             limits the tessellation does both.
             """
             self._require_unfrozen()
@@ -230,7 +230,7 @@ def make_subdivision(
         @paused_collection()
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
-            # Before anything changes.
+            # Check parameters before anything changes.
             self._require_lengths(keys)
             if "control_points" in keys:
                 self._require_control_points()
@@ -246,7 +246,7 @@ def make_subdivision(
                 self._require_unfrozen()
                 tessellation = tessellation.with_error(np.array(self._error).ravel())
             if "faces" in keys:
-                # Mitsuba discards its silhouette edges.
+                # Mitsuba discards the silhouette edges of old faces.
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
             self._parameterization = None
@@ -280,18 +280,18 @@ def make_subdivision(
             if is_attached and self._triangles.weld_target is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
-            # Listed among the keys, so that Mitsuba keeps these normals instead of averaging those of the triangles.
+            # With the moved buffers among the keys, Mitsuba does not replace normals by averages of triangle normals.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
         def _require_lengths(self, keys: list[str]) -> None:
-            """Check buffers of vertices that a user has assigned: Mitsuba reads as many as there were."""
+            """Check the lengths of vertex buffers that a user has assigned: Mitsuba reads as many values as before."""
             names = [name for name in self._lengths if name in keys and name.startswith("vertex_")]
             for name, values in self._get_buffers(*names).items():
                 if len(values) != self._lengths[name]:
                     raise ValueError(f'parameter "{name}": {len(values)} numbers; expected {self._lengths[name]}')
 
         def _require_unfrozen(self) -> None:
-            """Check that no frozen function reads the arrays that other triangles replace."""
+            """Check that no frozen function has read the triangles, which are about to be replaced."""
             if self._device_state is not None and self._device_state.is_frozen:
                 raise RuntimeError(
                     f"{self._parameters.source}: a frozen function has read the triangles of this shape; choose others "
@@ -303,14 +303,14 @@ def make_subdivision(
                 require_control_points(self.control_points, self._parameters.surface.cage.vertex_count)
 
         def _take_to_world(self, matrix: NDArray[np.float64] | None) -> None:
-            """Set the placement to the parameter's value, a checked matrix, if it can be read."""
+            """Set the placement to ``to_world``, whose checked value is ``matrix``, or None if it cannot be read."""
             centre = self._points.centre
             if matrix is None:
                 self._placement = self._placement.recorded(self.to_world, centre)
             else:
                 self._placement = Placement.of(self.to_world, matrix, centre)
             if is_jit:
-                # Literals would be compiled into kernels.
+                # Dr.Jit compiles literals into kernels.
                 dr.make_opaque(self.to_world, self._placement.matrix, self._placement.inverse)
 
         def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
@@ -323,7 +323,7 @@ def make_subdivision(
 
         def renew_derivatives(
             self,
-            gradients: dict[str, FloatBuffer | Matrix4],  # By names of the arrays computed from the parameters
+            gradients: dict[str, FloatBuffer | Matrix4],  # Gradient by each array computed from the parameters
         ) -> None:
             """Attach the moving arrays to the parameters again, without evaluating them; see `MovingVertices`."""
             self._vertices.warn_of_lost(gradients, self.control_points, self._placement)
@@ -346,13 +346,13 @@ def make_subdivision(
             self._replace_gradients(self._vertices.attached(self.control_points, self._placement, on_backward))
 
         def _replace_gradients(self, buffers: dict[str, FloatBuffer]) -> None:
-            """Give the mesh's buffers the derivatives of others, except for buffers that a user has assigned since."""
-            now = self._get_buffers(*buffers)
+            """Attach the mesh's buffers to the graphs of ``buffers``, unless a user has assigned them since."""
+            current = self._get_buffers(*buffers)
             self._set_buffers(
                 {
-                    name: dr.replace_grad(now[name], buffer)  # type: ignore[func-returns-value]  # The stub is wrong.
+                    name: dr.replace_grad(current[name], buffer)  # type: ignore[func-returns-value]  # The stub is wrong.
                     for name, buffer in buffers.items()
-                    if now[name].index == self._evaluated.get(name)
+                    if current[name].index == self._evaluated.get(name)
                 }
             )
 
@@ -364,15 +364,15 @@ def make_subdivision(
             self._lengths |= {name: len(value) for name, value in values.items()}
 
         def _get_buffers(self, *names: str) -> dict[str, FloatBuffer | IndexBuffer]:
-            found = MeshBuffers(self, names)
-            super().traverse(found)
-            return found.values
+            reader = MeshBuffers(self, names)
+            super().traverse(reader)
+            return reader.values
 
         def _weld_outlines(self, has_new_faces: bool) -> None:
-            """Let Mitsuba find the mesh's edges as if all vertices in the same place were one.
+            """Build Mitsuba's edge data structure as if coincident vertices were one vertex.
 
-            Copies of vertices differ in normals or texture coordinates, but leave no gap: projective integrators would
-            take them for silhouettes of the surface.
+            Coincident vertices have different normals or texture coordinates, but leave no gap in the surface.
+            Projective integrators would treat the edges between them as silhouettes.
             """
             if has_new_faces:
                 super().parameters_changed(["faces"])
@@ -385,21 +385,21 @@ def make_subdivision(
             self._has_outlines = True
 
         def surface_area(self) -> Float:
-            """Area of the triangles, with derivatives, which Mitsuba's own method does not have."""
+            """Area of the triangles; differentiable, unlike that of `mi.Mesh`."""
             area = super().surface_area()
             if not self.parameters_grad_enabled():
                 return area
             faces = self.face_indices(dr.arange(variant.UInt32, self.face_count()))
             a, b, c = (self.vertex_position(faces[i]) for i in range(3))
             squared = dr.squared_norm(dr.cross(b - a, c - a))
-            # Where a triangle has no area, its derivative is not a number.
+            # The derivative of the square root is infinite at zero, for a degenerate triangle.
             doubled = dr.select(squared > 0, dr.sqrt(dr.select(squared > 0, squared, 1)), 0)
             return dr.replace_grad(area, dr.sum(doubled) / 2)
 
         def vertex_normal(self, index: Index, active: Mask = True) -> Vector3:
             """Normal at a vertex of the mesh.
 
-            Raises RuntimeError if the mesh has none, whose buffer Mitsuba would read beyond its end.
+            Raises RuntimeError if the mesh has no normals: Mitsuba would read beyond the end of the buffer.
             """
             self._require_at_vertices("vertex_normal", "normals", self.has_vertex_normals())
             return super().vertex_normal(index, active)
@@ -407,7 +407,7 @@ def make_subdivision(
         def vertex_texcoord(self, index: Index, active: Mask = True) -> Vector2:
             """Texture coordinates at a vertex of the mesh.
 
-            Raises RuntimeError if the mesh has none, whose buffer Mitsuba would read beyond its end.
+            Raises RuntimeError if the mesh has no texture coordinates: Mitsuba would read beyond the end of the buffer.
             """
             self._require_at_vertices("vertex_texcoord", "texture coordinates", self.has_vertex_texcoords())
             return super().vertex_texcoord(index, active)
@@ -415,7 +415,7 @@ def make_subdivision(
         def eval_parameterization(
             self, uv: Vector2, ray_flags: int = int(mi.RayFlags.All), active: Mask = True
         ) -> mi.SurfaceInteraction3f:
-            """Interaction where the surface has some texture coordinates; invalid where it has not.
+            """Interaction at the point of the surface with given texture coordinates; invalid where there is none.
 
             Raises RuntimeError if the cage has no texture coordinates.
             """
@@ -430,7 +430,7 @@ def make_subdivision(
             return self._parameterization.hit(self, variant.Point2f(uv), int(ray_flags), variant.Mask(active))
 
         def recompute_vertex_normals(self) -> None:
-            """Replace the normals of the limit surface by means of those of the triangles.
+            """Replace the normals of the limit surface by averages of triangle normals.
 
             Raises RuntimeError if the mesh has no normals.
             """
@@ -438,20 +438,20 @@ def make_subdivision(
             super().recompute_vertex_normals()
 
         def merge(self, other: mi.Mesh) -> mi.Mesh:  # noqa: ARG002
-            """Refuse: merged meshes would not follow control points."""
+            """Raise RuntimeError: a merged mesh would not follow the control points."""
             raise RuntimeError(
                 f"{self._parameters.source}: merge: the shape's vertices follow its control points; expected meshes "
                 "without any, such as those of files that write_ply writes"
             )
 
-        def _require_at_vertices(self, method: str, what: str, is_there: bool) -> None:
-            if is_there:
+        def _require_at_vertices(self, method: str, quantity: str, exists: bool) -> None:
+            if exists:
                 return
-            reason = "it has face normals" if what == "normals" else "the cage has none"
-            if self._exact is not None and (what == "normals" or self._has_texcoords):
+            reason = "it has face normals" if quantity == "normals" else "the cage has none"
+            if self._exact is not None and (quantity == "normals" or self._has_texcoords):
                 reason = 'exact shading evaluates them at hits; expected the shading "vertex"'
             raise RuntimeError(
-                f"{self._parameters.source}: {method}: the mesh has no {what} at its vertices, as {reason}"
+                f"{self._parameters.source}: {method}: the mesh has no {quantity} at its vertices, as {reason}"
             )
 
         def to_string(self) -> str:
@@ -482,9 +482,9 @@ def make_subdivision(
 
 
 def _has_textured_emitter(props: mi.Properties, variant: Variant) -> bool:
-    given = (props[name] for name in props.keys() if props.type(name) == mi.Properties.Type.Object)  # noqa: SIM118
-    varying = int(mi.EmitterFlags.SpatiallyVarying)
-    return any(isinstance(each, variant.Emitter) and int(each.flags()) & varying for each in given)
+    objects = (props[name] for name in props.keys() if props.type(name) == mi.Properties.Type.Object)  # noqa: SIM118
+    spatially_varying = int(mi.EmitterFlags.SpatiallyVarying)
+    return any(isinstance(child, variant.Emitter) and int(child.flags()) & spatially_varying for child in objects)
 
 
 def _is_exact(parameters: Parameters, variant: Variant) -> bool:

@@ -1,4 +1,4 @@
-"""The shape's tessellation parameters: one rate for the whole surface, or an error limit."""
+"""The shape's tessellation parameters: a uniform rate, or an error limit of an adaptive tessellation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..surface import LimitSurface
     from ..tessellation import DisplacementBound, Sensor, VertexTable
 
-# Limits of an adaptive tessellation, which has one of these.
+# Parameters of the limit of an adaptive tessellation. Exactly one must be given.
 LIMITS = ("chord_error", "pixel_error", "max_edge")
 SENSOR = ("sensor_to_world", "sensor_fov", "film_width", "film_height")
 ADAPTIVE = (*LIMITS, "max_rate", *SENSOR, "outline")
@@ -46,14 +46,14 @@ class UniformTessellation:
 
 @dataclass(frozen=True, eq=False)
 class ViewingSensor:
-    """A sensor as the shape's parameters describe it."""
+    """The sensor described by the shape's parameters."""
 
     to_world: NDArray[np.float64]  # (4, 4) float64: camera-to-world transformation
     fov: float  # Field of view along the film's width, in degrees; 0 if the sensor is orthographic
     film_size: tuple[int, int]  # (int, int): width and height in pixels
 
     def in_world(self) -> Sensor:
-        """The sensor in the form that error criteria take."""
+        """Convert to the sensor of error criteria."""
         from ..tessellation import Sensor
 
         eye, axis, (width, height) = self.to_world[:3, 3], self.to_world[:3, 2], self.film_size
@@ -61,7 +61,7 @@ class ViewingSensor:
             # The film is two units wide in camera space.
             sizes = np.linalg.norm(self.to_world[:3, :2], axis=0) * 2 / width
             return Sensor(eye, float(sizes.min()), axis / np.linalg.norm(axis))
-        # At a depth of one. Seen from the same distance, pixels get smaller towards the corners of the film.
+        # Size of a pixel at depth one. At equal distance, pixels get smaller towards the corners of the film.
         pixel = 2 * np.tan(np.radians(self.fov) / 2) / width
         corner = np.hypot(width, height) / 2 * pixel
         return Sensor(eye, float(pixel / np.hypot(1, corner)))
@@ -69,29 +69,29 @@ class ViewingSensor:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveTessellation:
-    """The fewest triangles that meet an error limit."""
+    """As few triangles as an error limit allows."""
 
     limit: str  # One of `LIMITS`
     error: float  # Value of the limit
-    max_rate: int  # Most segments along an edge of the cage
+    max_rate: int  # Maximum number of segments along an edge of the cage
     sensor: ViewingSensor | None
     fits_outline: bool  # Whether the limit holds only where the sensor may see the surface edge-on
 
     def table(
         self,
         surface: LimitSurface,
-        control_points: NDArray,  # (n, 3) float64: in object space
+        control_points: NDArray,  # (n, 3) float64 in object space
         to_world: NDArray,  # (4, 4) float64
-        # In object space. With it, the limit holds everywhere, as the silhouettes are unknown.
+        # In object space. With a displacement, the limit holds everywhere, as silhouettes are unknown.
         bound: DisplacementBound | None = None,
     ) -> VertexTable:
         """Prepare the tessellation."""
         from ..tessellation import Criterion, DisplacementBound, Measure
 
         if bound is not None:
-            # The largest factor by which the linear map stretches a length.
-            stretch, of_object = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
-            bound = DisplacementBound(lambda start, uv: stretch * of_object(start, uv), stretch * bound.extent)
+            # The spectral norm is the largest factor by which the linear map scales a length.
+            stretch, object_heights = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
+            bound = DisplacementBound(lambda start, uv: stretch * object_heights(start, uv), stretch * bound.extent)
         sensor = None if self.sensor is None else self.sensor.in_world()
         criterion = Criterion(
             Measure.EDGE if self.limit == "max_edge" else Measure.CHORD,
@@ -100,12 +100,12 @@ class AdaptiveTessellation:
             sensor if self.fits_outline and bound is None else None,
             bound,
         )
-        in_world = control_points @ to_world[:3, :3].T + to_world[:3, 3]
+        world_points = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):
-            return surface.adaptive_sampling(criterion, self.max_rate, in_world)
+            return surface.adaptive_sampling(criterion, self.max_rate, world_points)
 
     def with_error(self, error: NDArray[np.floating]) -> AdaptiveTessellation:
-        """The same tessellation with another value of the limit, given as an array of one number.
+        """Return the tessellation with another value of the limit, an array of one number.
 
         Raises ValueError if the array has another size, or the number is not above 0.
         """
@@ -115,8 +115,8 @@ class AdaptiveTessellation:
 
     def lines(self) -> list[str]:
         """Lines of `to_string` that describe the tessellation."""
-        found = ["tessellation = adaptive", f"{self.limit} = {self.error:.6g}", f"max_rate = {self.max_rate}"]
-        return [*found, "outline = sensor"] if self.fits_outline else found
+        lines = ["tessellation = adaptive", f"{self.limit} = {self.error:.6g}", f"max_rate = {self.max_rate}"]
+        return [*lines, "outline = sensor"] if self.fits_outline else lines
 
 
 Tessellation = UniformTessellation | AdaptiveTessellation
@@ -128,32 +128,32 @@ def read_tessellation(props: mi.Properties) -> Tessellation:
     Raises ValueError if one has a wrong type or value, or contradicts another.
     """
     if value_of(props, "tessellation") == "uniform":
-        wrong = [name for name in ADAPTIVE if name in props]
-        if wrong:
-            raise ValueError(f'parameter "{wrong[0]}" needs "tessellation" = "adaptive"')
+        adaptive_only = [name for name in ADAPTIVE if name in props]
+        if adaptive_only:
+            raise ValueError(f'parameter "{adaptive_only[0]}" needs "tessellation" = "adaptive"')
         return UniformTessellation(value_of(props, "tessellation_rate"))
     if "tessellation_rate" in props:
         raise ValueError(
             'parameter "tessellation_rate" needs "tessellation" = "uniform"; expected "max_rate", the highest rate of '
             "an adaptive tessellation"
         )
-    given = [name for name in LIMITS if name in props]
-    if len(given) != 1:
+    limits = [name for name in LIMITS if name in props]
+    if len(limits) != 1:
         raise ValueError(
-            f"an adaptive tessellation has {' and '.join(given) or 'no limit'}; expected exactly one of "
+            f"an adaptive tessellation has {' and '.join(limits) or 'no limit'}; expected exactly one of "
             f"{', '.join(LIMITS)}"
         )
-    (limit,) = given
+    (limit,) = limits
     error, fits_outline = float(value_of(props, limit)), value_of(props, "outline") == "sensor"
     sensor = _sensor(props, limit == "pixel_error" or fits_outline, "outline" if fits_outline else limit)
     return AdaptiveTessellation(limit, error, value_of(props, "max_rate"), sensor, fits_outline)
 
 
 def _sensor(props: mi.Properties, is_needed: bool, needed_by: str) -> ViewingSensor | None:
-    given = [name for name in SENSOR if name in props]
+    sensor_parameters = [name for name in SENSOR if name in props]
     if not is_needed:
-        if given:
-            raise ValueError(f'parameter "{given[0]}" needs "pixel_error", or "outline" = "sensor"')
+        if sensor_parameters:
+            raise ValueError(f'parameter "{sensor_parameters[0]}" needs "pixel_error", or "outline" = "sensor"')
         return None
     missing = [name for name in SENSOR if name not in props]
     if missing:
@@ -167,7 +167,7 @@ def _sensor(props: mi.Properties, is_needed: bool, needed_by: str) -> ViewingSen
 
 
 def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outline: bool = False) -> dict[str, Any]:
-    """Parameters of a shape that tessellate it adaptively for a sensor.
+    """Return parameters of a shape that tessellate it adaptively for a sensor.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outli
     import mitsuba as mi
 
     kind = getattr(sensor, "class_name", lambda: type(sensor).__name__)()
-    found = {
+    options = {
         "tessellation": "adaptive",
         **(
             {} if pixel_error is None else {"pixel_error": PARAMETER_OF_NAME["pixel_error"].checked(float(pixel_error))}
@@ -209,4 +209,4 @@ def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outli
     width, height = (int(size) for size in np.ravel(np.array(sensor.film().size())))
     matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     to_world = mi.ScalarTransform4f(matrix.tolist())
-    return {**found, "sensor_to_world": to_world, "sensor_fov": fov, "film_width": width, "film_height": height}
+    return {**options, "sensor_to_world": to_world, "sensor_fov": fov, "film_width": width, "film_height": height}

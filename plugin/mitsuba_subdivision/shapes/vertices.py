@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class ConstantVertices(NamedTuple):
-    """Vertices without derivatives by the control points, with the interface of `EvaluatedVertices`."""
+    """Vertices that are not differentiable, with the interface of `EvaluatedVertices`."""
 
     positions: FloatBuffer
     normals: FloatBuffer
@@ -37,26 +37,25 @@ class ConstantVertices(NamedTuple):
         return self.positions, self.normals
 
 
-# From flat control points without derivatives, relative to the centre of those that were loaded (`RecentredPoints`).
+# Function of flat, detached control points, relative to the centre of the loaded ones (`RecentredPoints`).
 Evaluate = Callable[[FloatBuffer], "EvaluatedVertices | ConstantVertices"]
 
 
 class Vertices:
     """Evaluates the vertices of a tessellation, copies them along the seams of attributes, and displaces them.
 
-    Arrays are those of Dr.Jit, or of NumPy in scalar variants.
+    Arrays are Dr.Jit arrays, or NumPy arrays in scalar variants.
     """
 
     def __init__(
         self,
         evaluate: Evaluate,
-        are_differentiable: bool,  # Whether vertices have derivatives
+        are_differentiable: bool,  # Whether vertices are differentiable with respect to the control points
         *,
-        # (n,) int: the vertex that `evaluate` returns for each vertex of the shape, where seams have several
-        # copies of one
+        # (n,) int: index of each vertex of the shape among those that ``evaluate`` returns, if seams have copies
         copied: IntArray | None = None,
-        displacement: DeviceDisplacement | HostDisplacement | None = None,  # Of the copied vertices
-        # (m,) int: displaced vertices that the shape has. Exact shading needs one copy of each.
+        displacement: DeviceDisplacement | HostDisplacement | None = None,  # Applied to the copied vertices
+        # (m,) int: indices of the displaced vertices that the shape keeps. Exact shading needs one copy of each vertex.
         kept: IntArray | None = None,
         float_type: type | None = None,  # Flat Dr.Jit array of JIT variants
     ) -> None:
@@ -65,16 +64,16 @@ class Vertices:
         self._evaluated: EvaluatedVertices | ConstantVertices | None = None
 
     def __call__(self, points: FloatBuffer, *, keep: bool) -> tuple[FloatBuffer, FloatBuffer]:
-        """Evaluate flat positions and normals, and maybe keep what `attached` needs."""
-        # Free the last evaluation before the next one allocates memory.
+        """Evaluate flat positions and normals. ``keep`` stores the evaluation for `attached`."""
+        # Free the memory of the last evaluation before the next one.
         self._evaluated = None
         evaluated = self._evaluate(dr.detach(points))
-        # Heights may get derivatives later.
+        # Also stored for a displacement, as gradients of heights may be enabled later.
         self._evaluated = evaluated if keep or self._displacement is not None else None
         return self._displaced(*evaluated.attached(points), points)
 
     def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """The vertices of the last call, attached to the control points and the displacement again."""
+        """Attach the vertices of the last call to the control points and the displacement again."""
         if self._evaluated is None:
             raise RuntimeError("vertices were not kept; expected a call that keeps them before")
         return self._displaced(*self._evaluated.attached(points), points)
@@ -82,15 +81,15 @@ class Vertices:
     def _displaced(
         self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer
     ) -> tuple[FloatBuffer, FloatBuffer]:
-        found = self._copies(positions), self._copies(normals)
+        copied = self._copies(positions), self._copies(normals)
         if self._displacement is None:
-            return found
-        positions, normals = self._displacement(*found, points)
+            return copied
+        positions, normals = self._displacement(*copied, points)
         return self._kept(positions), self._kept(normals)
 
 
 class _Selection:
-    """Selects rows of flat 3-vectors; all of them without an index."""
+    """Selects flat 3-vectors by index; all of them if there is no index."""
 
     def __init__(self, index: IntArray | None, float_type: type | None) -> None:
         self._index: IntArray | IndexBuffer | None = index
@@ -117,16 +116,16 @@ def vertices_of(
     *,
     is_exact: bool,  # Whether shading is exact
 ) -> Vertices:
-    """Choose the evaluator of the shape's vertices."""
+    """Create the evaluator of the shape's vertices."""
     evaluate, is_differentiable = _evaluator(table, parameters, float_type)
     if displacement is None:
         return Vertices(evaluate, is_differentiable, copied=attributes.surface_vertex, float_type=float_type)
     from .displaced_vertices import DeviceDisplacement, HostDisplacement, VertexLocations
 
-    # With copies along seams: their displacements differ, and are averaged.
+    # With copies along seams, whose different displacements are averaged.
     split = parameters.surface.attribute_table(table)
-    found = split_weld_targets(table, split)
-    weld_target = np.arange(table.vertex_count) if found is None else found.astype(np.int64)
+    split_targets = split_weld_targets(table, split)
+    weld_target = np.arange(table.vertex_count) if split_targets is None else split_targets.astype(np.int64)
     locations = VertexLocations(*(split.locate or table.locations)(), weld_target)
     slopes = locations.follow_slopes(parameters.surface, displacement.channel)
     has_normals = not (is_exact or parameters.face_normals)
@@ -149,7 +148,7 @@ def vertices_of(
 
 
 def _evaluator(table: VertexTable, parameters: Parameters, float_type: type | None) -> tuple[Evaluate, bool]:
-    """What evaluates the tessellation's vertices, and whether with derivatives."""
+    """The function that evaluates the tessellation's vertices, and whether it is differentiable."""
     if parameters.evaluator != "stabilized" or parameters.sample_offset:
         return partial(_sampled, table, parameters, float_type), False
     if float_type is None:
@@ -168,33 +167,33 @@ def _in_numpy(table: VertexTable, points: FloatBuffer) -> ConstantVertices:
 def _sampled(
     table: VertexTable, parameters: Parameters, float_type: type | None, points: FloatBuffer
 ) -> ConstantVertices:
-    """Vertices sample by sample in float32, by another evaluator, for comparison."""
+    """Evaluate each vertex as a sample in float32, by the evaluator of the parameters, for comparison."""
     cage = parameters.surface.cage
     surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), parameters.surface.scheme)
     positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
     # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
-    found = positions.ravel(), np.nan_to_num(normals).ravel()
-    return ConstantVertices(*(found if float_type is None else (mapped(float_type, each) for each in found)))
+    vertices = positions.ravel(), np.nan_to_num(normals).ravel()
+    return ConstantVertices(*(vertices if float_type is None else (mapped(float_type, array) for array in vertices)))
 
 
 def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
-    """Flat control points as ``(count, 3)``. Raises ValueError if their number is not `count`."""
-    found = np.array(points, dtype=np.float64)
-    if found.size != 3 * count:
+    """Reshape flat control points to ``(count, 3)``. Raises ValueError if their number is not ``count``."""
+    coordinates = np.array(points, dtype=np.float64)
+    if coordinates.size != 3 * count:
         from ..kernels.vertex_kernel import coordinates_expected
 
-        raise ValueError(coordinates_expected(found.size, count))
-    return found.reshape(-1, 3)
+        raise ValueError(coordinates_expected(coordinates.size, count))
+    return coordinates.reshape(-1, 3)
 
 
-# Kernels, shared by shapes of one table.
+# Kernels, shared by shapes with the same tessellation.
 _KERNELS: Shared[VertexKernel] = Shared()
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
-    """Check flat coordinates of so many control points, on any device, and move them to Dr.Jit's memory.
+    """Check flat coordinates of ``count`` control points on any device, and move them to Dr.Jit's memory.
 
-    Raises ValueError if there are more or fewer, or one is not a finite number.
+    Raises ValueError if their number differs, or a coordinate is not finite.
     """
     if len(control_points) != 3 * count:
         from ..kernels.vertex_kernel import coordinates_expected
@@ -206,46 +205,46 @@ def require_control_points(control_points: FloatBuffer, count: int) -> None:
     if dr.all(dr.isfinite(control_points)):
         return
     points = np.array(control_points)
-    bad = np.unique(np.flatnonzero(~np.isfinite(points)) // 3)
-    coordinates = tuple(points[3 * bad[0] : 3 * bad[0] + 3].tolist())
+    non_finite = np.unique(np.flatnonzero(~np.isfinite(points)) // 3)
+    coordinates = tuple(points[3 * non_finite[0] : 3 * non_finite[0] + 3].tolist())
     raise ValueError(
-        f"vertex {bad[0]} has the coordinates {coordinates}; expected finite numbers "
-        f"({len(bad)} such {'vertex' if len(bad) == 1 else 'vertices'} in all)"
+        f"vertex {non_finite[0]} has the coordinates {coordinates}; expected finite numbers "
+        f"({len(non_finite)} such {'vertex' if len(non_finite) == 1 else 'vertices'} in all)"
     )
 
 
 def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
-    """For each split vertex, the first split vertex in the same place; None where no vertices have copies."""
+    """For each split vertex, the first split vertex at the same point; None if no vertex has copies."""
     if attributes.surface_vertex is None and not table.copies.size:
         return None
     target = attributes.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
     vertices = np.arange(len(target), dtype=np.uint32)
-    # Of several split vertices of one target, the last that is assigned stays: the first one.
+    # In repeated assignments the last one counts, so assign in reverse order.
     first[target[::-1]] = vertices[::-1]
     return first[target]
 
 
 class Triangles:
-    """Triangles of a tessellation; arrays of Dr.Jit, or of NumPy in scalar variants."""
+    """Triangles of a tessellation as Dr.Jit arrays, or as NumPy arrays in scalar variants."""
 
     def __init__(
         self,
         variant: Variant,
         table: VertexTable,
-        attributes: AttributeTable,  # Its vertices, with copies along seams or without
-        kept: IntArray | None = None,  # (n,) int64: the triangles that the mesh has; by default all
+        attributes: AttributeTable,  # Vertices of the mesh, with or without copies along seams
+        kept: IntArray | None = None,  # (n,) int64: indices of the triangles of the mesh; None for all
     ) -> None:
         self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
         self._kept = slice(None) if kept is None else kept
         self._name = None if kept is None else Content(kept)
         self.table, self.layout, self._attributes = table, attributes.layout, attributes
         self.patch_count, self.has_texcoords = table.patch_count, "texcoords" in attributes.values
-        # Keeps shared arrays alive.
+        # References that keep shared arrays alive.
         self._held: dict[str, SharedArray] = {}
 
     def faces(self, *, are_turned: bool) -> IndexBuffer:
-        """Vertices of all triangles, flat; with reversed orientation on request."""
+        """Vertices of all triangles, flat; in reversed order if ``are_turned``."""
 
         def make() -> SharedArray:
             triangles = self.layout.triangles[self._kept]
@@ -268,11 +267,11 @@ class Triangles:
 
     @property
     def weld_target(self) -> IndexBuffer | None:
-        """See `split_weld_targets`; None where no vertices have copies."""
+        """See `split_weld_targets`; None if no vertex has copies."""
 
         def make() -> SharedArray:
-            found = split_weld_targets(self.table, self._attributes)
-            return SharedArray(None if found is None else mapped(self._variant.UInt32, found))
+            targets = split_weld_targets(self.table, self._attributes)
+            return SharedArray(None if targets is None else mapped(self._variant.UInt32, targets))
 
         return self._shared("weld_target", (self.table, self.layout, self._variant), make)
 

@@ -17,14 +17,14 @@ from ..schemes.scheme import Scheme
 if TYPE_CHECKING:
     from ..patches import PatchTable
 
-# Rounding may put a parameter outside its domain by this.
+# Distance by which rounding may put a parameter outside its domain.
 DOMAIN_TOLERANCE = 1e-12
 
 
 def checked_samples(
     patches: PatchTable, element: ArrayLike, uv: ArrayLike, corner: ArrayLike
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Half-edge of `PatchTable.elements` that the parameters of each sample are counted from, and the parameters."""
+    """Check samples. Returns the half-edge of `PatchTable.elements` at which each one's parameters start, and these."""
     try:
         uv = np.asarray(uv, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -43,7 +43,7 @@ def checked_samples(
 
 
 def checked_elements(patches: PatchTable, element: ArrayLike) -> NDArray[np.integer]:
-    """0-based elements, flat."""
+    """Check that elements have a surface. Returns them as a flat array, 0-based."""
     element, sizes = _integers(element, "element").ravel(), patches.elements.face_sizes
     _reject(element, (element < 0) | (element >= len(sizes)), "element", f"0 to {len(sizes) - 1}")
     _reject(element, sizes[element] == 0, "element", "one that has a surface: no hole, and no vertex on a boundary")
@@ -51,7 +51,7 @@ def checked_elements(patches: PatchTable, element: ArrayLike) -> NDArray[np.inte
 
 
 def checked_form(evaluator: Evaluator, dtype: DTypeLike) -> np.dtype:
-    """The type of an evaluation's arithmetic."""
+    """Check the evaluator and the type of its arithmetic, and return the latter."""
     if evaluator not in EVALUATORS:
         raise ValueError(f'unknown evaluator "{evaluator}"; expected one of {", ".join(EVALUATORS)}')
     try:
@@ -70,10 +70,10 @@ def require_derivatives(derivatives: int) -> None:
 
 
 def _integers(values: ArrayLike, name: str) -> NDArray[np.integer]:
-    found = np.asarray(values)
-    if not np.issubdtype(found.dtype, np.integer):
-        raise ValueError(f"{name} has type {found.dtype}; expected integers")
-    return found
+    integers = np.asarray(values)
+    if not np.issubdtype(integers.dtype, np.integer):
+        raise ValueError(f"{name} has type {integers.dtype}; expected integers")
+    return integers
 
 
 def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str) -> None:
@@ -84,23 +84,20 @@ def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str)
         )
 
 
-# Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Bases of their one-rings take 3 seconds.
+# Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Eigenbases of such one-rings take 3 seconds.
 MOST_FACES = 511
-# The same where each face around has a one-ring of its own, at the end of a crease and where something is semi-sharp:
-# then so many bases take as long.
+# Most faces around a vertex at the end of a crease, or with semi-sharp features: each face has a different one-ring,
+# and that many eigenbases take as long.
 MOST_DIFFERENT_FACES = 64
 
 
 def require_valences(cage: ControlCage, scheme: Scheme) -> None:
-    """Check that no vertex and no face of a cage has more neighbours than are evaluated.
-
-    Raises CageError, which names the vertex or the face, and the limit.
-    """
+    """Check valences of a cage. Raises a CageError that names a vertex or face above the limit, and the limit."""
     t = cage.cut_mesh.topology
     is_different = np.zeros(t.vertex_count, dtype=bool)
     if scheme.element == "face":
         is_dart = t.vertex_rules == VertexRule.DART
-        # Of a border only near faces matter, see `TaggedFan.near`.
+        # At a border only near faces matter, see `TaggedFan.near`.
         is_near = t.is_border_vertex & ~is_dart & scheme.has_local_borders
         is_different = t.is_semi_sharp_vertex | (t.is_border_vertex & ~is_near)
     else:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
 
-# Patches by the structure of the cage and the scheme.
+# Patch tables by the structure of the cage and the scheme.
 _PATCHES: Shared[PatchTable] = Shared()
 
 
@@ -91,7 +91,7 @@ class LimitSurface:
         vars(self).update(cage=cage, scheme=adapted_scheme(cage, scheme))
 
     def __reduce__(self) -> tuple[type[LimitSurface], tuple[ControlCage, Scheme]]:
-        # What is prepared for samples has locks, and is made again.
+        # The cached sampler holds locks, which cannot be pickled. A copy prepares its own.
         return LimitSurface, (self.cage, self.scheme)
 
     @cached_property
@@ -162,18 +162,18 @@ class LimitSurface:
     def _evaluate_from(
         self, half_edge: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
     ) -> SurfaceSamples:
-        """Evaluate parameters, each counted from a half-edge of `PatchTable.elements`."""
-        found = self._sampler.evaluate(half_edge, uv, evaluator, dtype, derivatives)
-        p, dp_du, dp_dv, *second = found.values
-        more = [*second, *found.curvature] if derivatives == 2 else []
-        return SurfaceSamples(p, dp_du, dp_dv, found.normal, found.level, *more)
+        """Evaluate samples whose parameters start at half-edges of `PatchTable.elements`."""
+        samples = self._sampler.evaluate(half_edge, uv, evaluator, dtype, derivatives)
+        p, dp_du, dp_dv, *second = samples.values
+        second_order = [*second, *samples.curvature] if derivatives == 2 else []
+        return SurfaceSamples(p, dp_du, dp_dv, samples.normal, samples.level, *second_order)
 
     @cached_property
     def _sampler(self) -> PatchSampler:
         return patches.PatchSampler(self.patches, self.cage.positions, self.cage.cut_mesh.vertex)
 
     def matrix(self, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0, derivatives: int = 1) -> StencilMatrices:
-        """Weights of control points in samples, as sparse matrices: `evaluate` as linear maps.
+        """Weights of the control points at samples, as sparse matrices: `evaluate` as linear maps.
 
         Parameters
         ----------
@@ -226,9 +226,9 @@ class LimitSurface:
         return {**({} if texcoords is None else {TEXCOORDS: texcoords}), **self.cage.attributes}
 
     def channel(self, name: str) -> Channel:
-        """How an attribute, or the texture coordinates by the name "texcoords", is interpolated over the elements.
+        """The interpolation of an attribute, or of the texture coordinates ("texcoords"), over the elements.
 
-        Each call returns the same object.
+        Repeated calls return the same object.
 
         Raises
         ------
@@ -238,12 +238,12 @@ class LimitSurface:
             If the scheme has no rules for it.
         """
         if name not in self._channels:
-            known = self._attributes
-            if name not in known:
-                expected = f"one of {', '.join(known)}" if known else "a cage with attributes"
+            attributes = self._attributes
+            if name not in attributes:
+                expected = f"one of {', '.join(attributes)}" if attributes else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
-            layout = patches.ChannelLayout.of(name, known[name], self.cage, self.scheme, self.patches)
-            self._channels[name] = layout.channel(known[name].values)
+            layout = patches.ChannelLayout.of(name, attributes[name], self.cage, self.scheme, self.patches)
+            self._channels[name] = layout.channel(attributes[name].values)
         return self._channels[name]
 
     @cached_property
@@ -251,22 +251,22 @@ class LimitSurface:
         return {}
 
     def bounds(self, element: ArrayLike | None = None) -> ElementBounds:
-        """Boxes with sides along the axes that contain the surface over each element, and what float32 makes of it.
+        """Axis-aligned bounding boxes of the surface over each element; they also contain its rounding to float32.
 
         Their diagonals are at most 5 % longer than those of the tight boxes.
 
         Parameters
         ----------
         element : (e,) int, optional
-            0-based, as for `evaluate`. All elements by default, but for holes and vertices without a surface.
+            0-based, as for `evaluate`. By default all elements that have a surface: no holes, no boundary vertices.
 
         Raises
         ------
         ValueError
             If an index is out of range.
         SchemeError
-            If the scheme's regular patches are no polynomials, or refinement does not separate irregularities, or
-            divides domains in a way of its own.
+            If the scheme's regular patches are no polynomials, or its refinement does not separate irregularities or
+            does not divide domains as the built-in schemes do.
         """
         sizes = self.patches.elements.face_sizes
         chosen = np.flatnonzero(sizes) if element is None else checked_elements(self.patches, element)
@@ -275,9 +275,9 @@ class LimitSurface:
     def area(self) -> float:
         """Area of the surface, in squared units of the cage's space.
 
-        By Gauss's quadrature of every polynomial piece until the area does not change, to 1e-12 of it; around
-        extraordinary points of all levels. Where the surface is folded along a curve inside an element, to some 1e-8 of
-        the parts there.
+        Computed by Gauss quadrature of every polynomial piece, at all levels around extraordinary points, to a relative
+        accuracy of 1e-12; where the surface is folded along a curve inside an element, to about 1e-8 of the pieces
+        there.
 
         Raises
         ------
@@ -290,14 +290,14 @@ class LimitSurface:
         """Stiffness matrix of the surface: Dirichlet's energy of functions that are subdivided as points are.
 
         Entry ``(i, j)`` is the integral over the limit surface of the product of the gradients, in the surface's own
-        metric, of the basis functions of control points i and j. It is the Laplace-Beltrami operator in weak form, and
-        times the control points it is the gradient of `area` by them. It does not change with the surface's size.
+        metric, of the basis functions of control points i and j. It is the Laplace-Beltrami operator in weak form. Its
+        product with the control points is the gradient of `area` by them. It does not depend on the surface's size.
 
         Parameters
         ----------
         order : int
-            Gauss's rule has so many nodes along each parameter of every polynomial piece. Around extraordinary points
-            levels are summed until a millionth is left.
+            Nodes of the Gauss rule along each parameter of a polynomial piece. Around extraordinary points, levels are
+            summed until a millionth of the energy there is left.
 
         Returns
         -------
@@ -319,8 +319,8 @@ class LimitSurface:
         Entry ``(i, j)`` is the integral over the limit surface of the inner product of the covariant second
         derivatives, in the surface's own metric, of the basis functions of control points i and j. For the control
         points themselves, the energy is the integral of the squares of both principal curvatures. Creases cost nothing.
-        It scales with one over the square of the surface's size. At a vertex with one face on a smooth border, and at
-        others where the energy would be infinite, the surface nearest to the point is left out.
+        The matrix is proportional to one over the square of the surface's size. The energy is infinite at some
+        vertices, such as one with a single face on a smooth border: the surface nearest to these is left out.
 
         Parameters
         ----------
@@ -330,7 +330,7 @@ class LimitSurface:
         Returns
         -------
         (n_v, n_v) CSR array of float64
-            Symmetric, positive semi-definite. Constants are in its null space; where the surface is flat, so are its
+            Symmetric, positive semi-definite. Constants are in its null space; for a flat surface, so are its
             coordinates.
 
         Raises
@@ -348,7 +348,7 @@ class LimitSurface:
         return patches.energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> AreaSamples:
-        """Draw random points, independent of each other, and uniform by area.
+        """Draw independent random points, uniform by area.
 
         Parameters
         ----------
@@ -370,14 +370,16 @@ class LimitSurface:
         half_edge, uv = patches.uniform_locations(
             self._all_pieces, self._areas, int(count), np.random.default_rng(seed)
         )
-        found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
-        return patches.AreaSamples(*self._element_and_corner(half_edge), uv, found.p, found.n, found.dp_du, found.dp_dv)
+        samples = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
+        return patches.AreaSamples(
+            *self._element_and_corner(half_edge), uv, samples.p, samples.n, samples.dp_du, samples.dp_dv
+        )
 
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
-        """Find the nearest point of the surface for each of some points; of several, one.
+        """Find the nearest point of the surface for each given point; where several are nearest, one of them.
 
-        It is the nearest of the whole surface, not only of those nearby. The first call prepares a search, which takes
-        some milliseconds for a hundred faces.
+        The result is the global minimum of the distance. The first call prepares a search, which takes some
+        milliseconds for a hundred faces.
 
         Parameters
         ----------
@@ -387,8 +389,8 @@ class LimitSurface:
         Returns
         -------
         ClosestPoints
-            The difference of a point and its nearest point is along the normal there, unless that lies on a border or a
-            crease, or at a vertex where the surface is not smooth.
+            The difference of a point and its nearest point is along the normal at the latter, unless that lies on a
+            border, on a crease, or at a vertex where the surface is not smooth.
 
         Raises
         ------
@@ -401,9 +403,9 @@ class LimitSurface:
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise ValueError(f"points of shape {points.shape}; expected (s, 3), all of them finite")
         half_edge, uv = self._closest_point_search.nearest(points)
-        found = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
-        distance = np.linalg.norm(points - found.p, axis=1)
-        return patches.ClosestPoints(*self._element_and_corner(half_edge), uv, found.p, found.n, distance)
+        samples = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
+        distance = np.linalg.norm(points - samples.p, axis=1)
+        return patches.ClosestPoints(*self._element_and_corner(half_edge), uv, samples.p, samples.n, distance)
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
@@ -431,19 +433,19 @@ class LimitSurface:
         return patches.ClosestPointSearch(self._surface_pieces)
 
     def _element_and_corner(self, half_edge: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Of half-edges of `PatchTable.elements`."""
+        """Element and corner of half-edges of `PatchTable.elements`."""
         element = self.patches.elements.face[half_edge].astype(np.int64)
         return element, half_edge - self.patches.elements.face_offsets[element]
 
     def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:
         """Prepare evaluation anywhere on a device: all data that does not depend on the control points' positions.
 
-        Surfaces of the same topology, tags and rules share the object while one of them exists that has called this.
+        Surfaces of the same topology, tags and rules share the object while a surface that called this method exists.
 
         Parameters
         ----------
         evaluator : "stabilized" | "stam"
-            For Stam's form, no level around an extraordinary point is a piece like others.
+            For Stam's form, levels around extraordinary points are not stored as polynomial pieces.
 
         Raises
         ------
@@ -466,7 +468,7 @@ class LimitSurface:
     def on_device(self, variant: ModuleType | str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and intersected by rays, in the variant's precision.
 
-        Where points are an extraordinary vertex by single precision, normals are those of the vertex in every variant.
+        Points that single precision cannot tell from an extraordinary vertex have its normal, in every variant.
 
         Parameters
         ----------
@@ -515,23 +517,22 @@ class LimitSurface:
         criterion : Criterion
         max_rate : int
             Most segments along an edge of the cage, 1 to 1,024; rounded down to a power of two. Around extraordinary
-            vertices, rings get as small as the criterion requires, with half as many segments at most along each.
+            vertices, rings get as small as the criterion requires, each with at most half as many segments along it.
         control_points : (n, 3) float64, optional
             Positions for the criterion; by default the cage's.
 
         Raises
         ------
         ValueError
-            If ``max_rate`` is anything else, or there are more or fewer control points than the cage's, or some that
-            are not finite.
+            If ``max_rate`` is out of range, or the control points are not finite or not as many as the cage's.
         MemoryError
             If the tessellation would not fit into memory.
 
         Warns
         -----
         CageWarning
-            If parts of the surface need more than ``max_rate`` for the criterion, and are coarser. A criterion for
-            outlines causes none.
+            If parts of the surface need more segments than ``max_rate`` for the criterion. A criterion for outlines
+            never warns.
         """
         points, shape = self.cage.positions, self.cage.positions.shape
         if control_points is not None:
@@ -556,7 +557,7 @@ class LimitSurface:
         rate : int
             Segments per edge of the cage, at least 1.
         evaluator : "power" | "stam" | "stabilized" | "limit"
-            As for `evaluate`; to show the errors of the other forms.
+            As for `evaluate`. Forms other than "stabilized" serve to show their errors.
         dtype : float64 or float32
             Precision of the evaluation.
         sample_offset : float
@@ -566,7 +567,7 @@ class LimitSurface:
         Raises
         ------
         ValueError
-            If the rate is no integer or below 1, or the offset is not in [0, 1) or is 0 for a form that needs one.
+            If the rate is no integer or below 1, or the offset is not in [0, 1), or 0 where the form needs another.
         MemoryError
             If the triangles would not fit into memory; the message names a rate that would.
         SchemeError
@@ -575,20 +576,20 @@ class LimitSurface:
         table = self.sampling(rate)
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
         mesh = self.attribute_table(table)
-        values = {name: found.copy() for name, found in mesh.values.items()}
+        values = {name: attribute_values.copy() for name, attribute_values in mesh.values.items()}
         texcoords = values.pop(TEXCOORDS, None)
         return tessellation.Tessellation(
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
     def tessellation_matrix(self, table: int | VertexTable = 8) -> VertexMatrices:
-        """Weights of control points in the vertices of a tessellation, as sparse matrices.
+        """Weights of the control points at the vertices of a tessellation, as sparse matrices.
 
         Parameters
         ----------
         table : int or VertexTable
-            A rate, or the result of `sampling` or `adaptive_sampling`. Vertices are in the order of its `apply`, which
-            is that of `tessellate` unless attributes have seams.
+            A rate, or the result of `sampling` or `adaptive_sampling`. Vertices are in the order of
+            `VertexTable.apply`, which is that of `tessellate` unless attributes have seams.
 
         Raises
         ------
@@ -631,7 +632,7 @@ class LimitSurface:
         corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
         level = self._evaluate_from(half_edge[corners], uv[corners], "stabilized", dtype).level
         moved = corners[level == AT_EXTRAORDINARY_POINT]
-        # From 0 to the offset; from 1, at the centre of a polygon, back by the offset.
+        # A parameter of 0 becomes the offset; one of 1, at the centre of a polygon, becomes 1 minus the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
         samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
         return samples.p[table.weld_target], samples.n
@@ -648,12 +649,12 @@ class SurfaceSamples(NamedTuple):
         Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
         tangents along the u and the v edge, of arbitrary length.
     n : (s, 3)
-        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. A surface without a
-        tangent plane at a vertex has a normal by convention there: beside many faces on a border, the limit along the
-        border; at the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero
-        where the tangents are parallel or zero but for rounding: on the fold between two faces glued back to back, at
-        sharp vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
-        The published forms "power" and "stam" return what they compute.
+        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. At a vertex without a
+        tangent plane, a convention defines the normal: beside many faces on a border, the limit along the border; at
+        the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero where the
+        tangents are parallel or zero up to rounding: on the fold between two faces glued back to back, at sharp
+        vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
+        "power" and "stam" follow the published formulas without these conventions.
     level : (s,) int64
         The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
         in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
@@ -661,8 +662,8 @@ class SurfaceSamples(NamedTuple):
         Second derivatives, if requested. Not a number at an extraordinary point itself.
     gaussian_curvature, mean_curvature : (s,) or None
         If requested. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
-        extraordinary point itself 0 where the curvature vanishes there (Catmull-Clark, valence 3), else not a number,
-        because the curvature is unbounded or depends on the direction. Also not a number where there is no normal.
+        extraordinary point itself, 0 where the curvature vanishes (Catmull-Clark, valence 3), else not a number,
+        because the curvature is unbounded or depends on the direction. Not a number where the normal is zero.
     """
 
     p: FloatArray

@@ -1,7 +1,7 @@
 """Test of the interaction hook on a triangle, before any other shape is hooked.
 
-It finds out whether this version of Mitsuba calls the virtual functions as `interaction_hook` expects. Nothing here
-waits for Dr.Jit: during a wait, Mitsuba may load another shape on the same stack.
+It tests whether this version of Mitsuba calls the virtual functions as `interaction_hook` expects. It must not wait for
+Dr.Jit: during a wait, Mitsuba may load another shape on the same stack.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import mitsuba as mi
 from ...kernels.array_types import Mask, Value
 from ...variants import Variant
 
+# Arguments of the tested functions.
 _ORIGIN, _DIRECTION, _DISTANCE, _UV = (1, 2, 3), (4, 5, 6), 7, (0.25, 0.5)
-# Results that the answers return.
+# Results of the overrides.
 _ANSWERED_UV, _VALUE = (8, 9), (10, 11, 12)
+# Names of the triangle's attributes, and their numbers of components.
 _ATTRIBUTES = {"face_one": 1, "face_three": 3}
 
 
@@ -32,11 +34,11 @@ class TriangleHit(NamedTuple):
 
 
 class TrialError(Exception):
-    """Raised by an answer on purpose."""
+    """Raised by the overrides on purpose."""
 
 
 class Trial:
-    """Answers that record their arguments."""
+    """Overrides that record their arguments."""
 
     def __init__(self, variant: Variant) -> None:
         self._variant = variant
@@ -44,14 +46,14 @@ class Trial:
         self.fails = False
 
     def complete(self, si: mi.SurfaceInteraction3f, hit: TriangleHit) -> None:
-        """Note the arguments, and answer."""
+        """Record the arguments, and return a known result."""
         if self.fails:
             raise TrialError
         self.asked = _asked(hit)
         si.uv = self._variant.Point2f(*_ANSWERED_UV)
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value:
-        """Note the arguments, and answer."""
+        """Record the arguments, and return a known result."""
         if self.fails:
             raise TrialError
         self.asked = [name, *_identity(si.t, active)]
@@ -60,37 +62,37 @@ class Trial:
 
 def trial_problem(
     variant: Variant,
-    attach: Callable[[mi.Mesh, Trial], None],  # Hooks a shape's functions
+    attach: Callable[[mi.Mesh, Trial], None],  # Hooks the functions of a shape
 ) -> str | None:
-    """Difference between Mitsuba's virtual functions and the expected ones; None if there is none."""
+    """Return how Mitsuba's virtual functions differ from the expected ones; None if they do not."""
     trial, shape = Trial(variant), _triangle(variant)
     attach(shape, trial)
     ray = variant.Ray3f(variant.Point3f(*_ORIGIN), variant.Vector3f(*_DIRECTION))
     preliminary = dr.zeros(variant.PreliminaryIntersection3f)
     preliminary.t, preliminary.prim_uv = variant.Float(_DISTANCE), variant.Point2f(*_UV)
-    active, answered = variant.Mask(True), variant.Point2f(*_ANSWERED_UV)
+    active, expected_uv = variant.Mask(True), variant.Point2f(*_ANSWERED_UV)
     hit = TriangleHit(ray, preliminary, int(mi.RayFlags.UV), active)
 
     def interaction() -> mi.SurfaceInteraction3f:
         return shape.compute_surface_interaction(*hit)
 
-    if _identity(interaction().uv) != _identity(answered) or trial.asked != _asked(hit):
+    if _identity(interaction().uv) != _identity(expected_uv) or trial.asked != _asked(hit):
         return "compute_surface_interaction does not pass on its arguments, or its result"
-    questions: list[Callable[[], Any]] = [interaction]
+    calls: list[Callable[[], Any]] = [interaction]
     si = dr.zeros(variant.SurfaceInteraction3f)
     si.t = variant.Float(_DISTANCE)
-    for function, name, answer in (
+    for function, name, expected in (
         (shape.eval_attribute, "face_one", variant.UnpolarizedSpectrum(_VALUE[0])),
         (shape.eval_attribute_1, "face_one", variant.Float(_VALUE[0])),
         (shape.eval_attribute_3, "face_three", variant.Color3f(*_VALUE)),
     ):
-        found = function(name, si, active)
-        if _identity(found) != _identity(answer) or trial.asked != [name, *_identity(si.t, active)]:
+        result = function(name, si, active)
+        if _identity(result) != _identity(expected) or trial.asked != [name, *_identity(si.t, active)]:
             return f"{function.__name__} does not pass on its arguments, or its result"
-        questions.append(partial(function, name, si, active))
+        calls.append(partial(function, name, si, active))
     trial.fails = True
-    raised = [_raises(ask) for ask in questions]
-    # Scenes call the functions of all existing shapes.
+    raised = [_raises(call) for call in calls]
+    # Reset it, because scenes may call the functions of any existing shape.
     trial.fails = False
     return None if all(raised) else "an error in an answer is lost"
 
@@ -107,7 +109,7 @@ def _triangle(variant: Variant) -> mi.Mesh:
     """A mesh of one triangle, with attributes."""
 
     class Corners(variant.TraversalCallback):
-        """Assigns corners; zeros would give an interaction of zeros."""
+        """Assigns the positions of the corners: zeros would result in an interaction of zeros."""
 
         def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
             if name == "vertex_positions":
@@ -132,7 +134,7 @@ def _asked(hit: TriangleHit) -> list[Any]:
 
 def _identity(*values: Any) -> list[Any]:
     """Dr.Jit variable indices of values."""
-    found: list[Any] = []
+    indices: list[Any] = []
     for value in values:
-        found += _identity(*value) if dr.depth_v(value) > 1 else [value.index]
-    return found
+        indices += _identity(*value) if dr.depth_v(value) > 1 else [value.index]
+    return indices

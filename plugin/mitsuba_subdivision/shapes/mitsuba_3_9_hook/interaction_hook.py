@@ -1,19 +1,19 @@
-"""Overrides, in Python, the virtual functions that Mitsuba calls on a mesh at every hit.
+"""Overrides in Python of the virtual functions that Mitsuba calls on a mesh at every hit.
 
-Mitsuba 3.9 asks a mesh for its surface interaction by a virtual function of C++ that Python cannot override: classes
-derived in Python may override ``to_string`` only (``src/render/python/shape_v.cpp``, ``PyMesh``). Python's other hooks
-run too late. A BSDF sees the interaction after the origin of the next ray is set, so that facets cast shadows on a
-smooth surface; and emitters, media and the ``aov`` integrator do not call the BSDF at all.
+In Mitsuba 3.9, a mesh computes its surface interaction in a virtual C++ function that Python cannot override: Python
+classes may only override ``to_string`` (``src/render/python/shape_v.cpp``, ``PyMesh``). Other hooks of Python run too
+late. A BSDF receives the interaction after the origin of the next ray is set, so facets would cast shadows on a smooth
+surface. Emitters, media and the ``aov`` integrator do not call the BSDF at all.
 
-So a shape gets a virtual function table of its own: a copy of its class's, with a `Trampoline` in place of each
-function that Python overrides. Inside an instance, Mitsuba calls the shapes of all groups. So that only the shapes of
-its own group answer, a `TaggingTrampoline` in the groups' table adds a tag to the flags that a group passes on.
+So a hooked shape gets another virtual function table: a copy of the table of its class, with a `Trampoline` in place of
+each function that Python overrides. Inside an instance, Mitsuba calls the shapes of all groups. A `TaggingTrampoline`
+in the table of groups adds a tag to the flags that a group passes on, so that only the shapes of this group respond.
 
-All symbols are looked up by name in the loaded libraries, functions by their names and arguments. Where one is not
-found, on other platforms or after a change of Mitsuba, nothing is changed. Before the first shape of a variant is
-changed, every function of a triangle is tried (`hook_trial`).
+All symbols are looked up by name in the loaded libraries, functions by name and argument types. If one is missing, on
+another platform or in another version of Mitsuba, nothing is modified. Before the first shape of a variant is modified,
+every function is tested on a triangle (`hook_trial`).
 
-Mitsuba 3.10 lets Python shapes override these functions (its pull request 1967), which makes this module obsolete.
+Mitsuba 3.10 allows Python shapes to override these functions (pull request 1967), which makes this module obsolete.
 """
 
 from __future__ import annotations
@@ -39,25 +39,26 @@ from ..device_state import paused_collection
 from .hook_trial import TriangleHit, trial_problem
 from .machine_code import TaggingTrampoline, Trampoline, bindings_library, replace_function, require_trampolines, tag_of
 
-# Functions of the library of Mitsuba's Python bindings: from a Python object to its C++ instance, and back; and the
-# size of the latter in bytes.
+# Functions of the library of Mitsuba's Python bindings: C++ instance of a Python object, Python object of a C++
+# instance, and size of a C++ type in bytes.
 _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 _OBJECT_AT = "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object"
 _SIZE_OF = "_ZN8nanobind6detail12nb_type_sizeEP7_object"
-# A virtual function table begins after two entries that identify its class [Itanium C++ ABI, 2.5.2].
+# Number of entries before the address of a virtual function table, which identify its class [Itanium C++ ABI, 2.5.2].
 _BEFORE = 2
-# That of Mitsuba's meshes has 66.
+# Upper bound of the number of entries of a table. The table of Mitsuba's meshes has 66.
 _MOST_ENTRIES = 96
 _WORD = ctypes.sizeof(ctypes.c_void_p)
-# Expected argument types, as C++ spells them. A mask is an object in JIT variants, and then passed by its address.
+# Regular expressions for argument types in demangled C++ names. In JIT variants, a mask is an object passed by address.
 _MASK = r"(bool|drjit::\w+<.*>)"
 _INTERACTION_ARGUMENTS = (
     rf"mitsuba::Ray<.*> const&, mitsuba::PreliminaryIntersection<.*> const&, unsigned int, unsigned int, {_MASK}"
 )
 _ATTRIBUTE_ARGUMENTS = rf"std::basic_string_view<.*>, mitsuba::SurfaceInteraction<.*> const&, {_MASK}"
+# Bits of the flags argument for the group's tag, and for Mitsuba's ray flags.
 _TAG, _FLAGS = 0xFFFF0000, 0x0000FFFF
 
-# Mitsuba makes the shapes of a scene in parallel.
+# Mitsuba constructs the shapes of a scene in parallel.
 _lock = threading.Lock()
 _LIBRARIES = ("mitsuba", "drjit")
 
@@ -92,25 +93,25 @@ class _Bindings:
         self._symbol_at.argtypes = [ctypes.c_void_p, ctypes.POINTER(_Symbol)]
 
     def name_at(self, address: int) -> str:
-        """Name of the function or object that begins at an address; empty if there is none."""
+        """Mangled name of the function or object that begins at an address; empty if there is none."""
         symbol = _Symbol()
         if not address or not self._symbol_at(address, ctypes.byref(symbol)) or symbol.address != address:
             return ""
         return symbol.name.decode()
 
     def declaration_at(self, address: int) -> str:
-        """Declaration of the function that begins at an address, as C++ spells it; empty if there is none."""
-        found = self._demangle(self.name_at(address).encode(), None, None, None)
-        if not found:
+        """Demangled declaration of the function that begins at an address; empty if there is none."""
+        demangled = self._demangle(self.name_at(address).encode(), None, None, None)
+        if not demangled:
             return ""
-        text = ctypes.string_at(found).decode()
-        self._free(found)
+        text = ctypes.string_at(demangled).decode()
+        self._free(demangled)
         return text
 
 
 @lru_cache(maxsize=1)
 def hook_problem() -> str | None:
-    """Why shapes cannot be hooked here; None if they can."""
+    """Reason for which shapes cannot be hooked on this system; None if they can."""
     if not (sys.platform == "linux" and platform.machine() == "x86_64" and sys.implementation.name == "cpython"):
         return f"needs CPython on Linux on x86-64, until Mitsuba 3.10; this is {platform.platform(terse=True)}"
     try:
@@ -124,15 +125,15 @@ def hook_problem() -> str | None:
 
 
 class Answers(Protocol):
-    """Python's overrides of a shape's functions.
+    """Overrides of a shape's functions.
 
-    An error is raised where Python called Mitsuba. Arguments lie in memory of C++ and must not be kept.
+    Errors propagate to the Python code that called Mitsuba. Arguments are in memory of C++ and must not be kept.
     """
 
     def complete(self, si: mi.SurfaceInteraction3f, hit: TriangleHit) -> None:
-        """Complete a surface interaction.
+        """Complete a surface interaction in place.
 
-        Called after Mitsuba has filled in that of the triangle, while a kernel is traced.
+        Called while a kernel is traced, after Mitsuba has computed the interaction with the triangle.
         """
         ...
 
@@ -142,7 +143,7 @@ class Answers(Protocol):
 
 
 class InteractionHook:
-    """Overrides functions of a variant's shapes in Python; see the module.
+    """Overrides functions of a variant's shapes in Python, see the module.
 
     Raises RuntimeError if there is a `hook_problem`, or the class lacks one of the functions.
     """
@@ -150,14 +151,14 @@ class InteractionHook:
     def __init__(
         self,
         variant: Variant,  # Such as `mitsuba.llvm_ad_rgb`
-        example: mi.Mesh,  # Of the class whose shapes are to be hooked
+        example: mi.Mesh,  # Any shape of the class to hook
     ) -> None:
         problem = hook_problem()
         if problem is not None:
             raise RuntimeError(problem)
         self._variant, self._bindings = variant, _Bindings()
         self._answers: WeakValueDictionary[int, Answers] = WeakValueDictionary()
-        # Tags of the groups that a shape has been found in.
+        # Tags of the groups that contain each shape, as far as known.
         self._tags: WeakKeyDictionary[Answers, set[int]] = WeakKeyDictionary()
         entries = _virtual_functions(self._bindings, self._table_of(example).value or 0)
         self._answer_interaction(entries)
@@ -172,25 +173,25 @@ class InteractionHook:
         self._tag_groups()
 
     def attach(self, shape: mi.Mesh, answers: Answers) -> None:
-        """Override a shape's functions. The shape keeps the answers alive."""
+        """Override a shape's functions. The shape must keep ``answers`` alive."""
         self._answers[self._bindings.pointer_of(shape)] = answers
         self._tags[answers] = set()
         self._table_of(shape).value = ctypes.addressof(self._table) + _BEFORE * _WORD
 
     def _table_of(self, shape: object) -> ctypes.c_void_p:
-        """Location of a shape's pointer to its virtual function table."""
+        """The shape's pointer to its virtual function table, in place."""
         return ctypes.c_void_p.from_address(self._bindings.pointer_of(shape))
 
     def _object_at(self, kind: type, address: int) -> Any:
         return self._bindings.object_at(kind, address, None)
 
     def _offsets(self, structure: Any, *names: str) -> tuple[int, ...]:
-        """Of members in a structure of C++."""
-        begin, size = self._bindings.pointer_of(structure), self._bindings.size_of(type(structure))
-        found = tuple(self._bindings.pointer_of(getattr(structure, name)) - begin for name in names)
-        if not all(0 <= offset < size for offset in found):
+        """Offsets of members in a C++ structure."""
+        address, size = self._bindings.pointer_of(structure), self._bindings.size_of(type(structure))
+        offsets = tuple(self._bindings.pointer_of(getattr(structure, name)) - address for name in names)
+        if not all(0 <= offset < size for offset in offsets):
             raise RuntimeError(f"{names} of {type(structure).__name__} are not where it is")
-        return found
+        return offsets
 
     def _mask_at(self, value: int) -> Mask:
         return self._object_at(self._variant.Mask, value)
@@ -200,10 +201,10 @@ class InteractionHook:
 
         def answer(result: int, this: int, ray: int, preliminary: int, flags: int, _depth: int, active: int) -> None:
             answers, tag = self._answers.get(this), flags & _TAG
-            # The result is unused inside an instance of a group that the shape is not in.
+            # Inside an instance of a group without this shape, Mitsuba ignores the result.
             if answers is None or (tag and tag not in self._tags[answers]):
                 return
-            # A scene that is collected while a function is being frozen ends the process.
+            # Freeing a scene while a frozen function is recorded ends the process.
             with paused_collection():
                 hit = TriangleHit(
                     self._object_at(variant.Ray3f, ray),
@@ -213,16 +214,17 @@ class InteractionHook:
                 )
                 answers.complete(self._object_at(result_type, result), hit)
 
-        # Shapes outside every group are called inside all instances, and return zeros, which are one variable. Other
-        # shapes set a point, and leave the time zero.
+        # Shapes outside of groups are called inside all instances, and return zeros, which are one Dr.Jit variable.
+        # Other shapes set the point, and leave the time zero. So equal variables mean that there is nothing to
+        # complete.
         equal = self._offsets(dr.zeros(result_type), "p", "time")
         self._put(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS, result_type, answer, equal)
 
     def _tag_groups(self) -> None:
-        """Have groups pass on their tag, see `_TAG`."""
+        """Make groups add their tag to the flags that they pass on."""
         members_of = _member_finder(self._variant)
 
-        def note(_result: int, this: int, *_: int) -> None:
+        def add_tag(_result: int, this: int, *_: int) -> None:
             for member in members_of(self._object_at(self._variant.Shape, this)):
                 answers = self._answers.get(self._bindings.pointer_of(member))
                 if answers is not None:
@@ -232,31 +234,33 @@ class InteractionHook:
         table = self._table_of(group).value or 0
         entries = _virtual_functions(self._bindings, table)
         index = self._index_of(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS)
-        trampoline = TaggingTrampoline(entries[index], note, _fail)
+        trampoline = TaggingTrampoline(entries[index], add_tag, _fail)
         replace_function(table + _WORD * (index - _BEFORE), trampoline.address)
 
     def _answer_attribute(self, entries: list[int], suffix: str, result_type: type, sizes: Container[int]) -> None:
-        """Override a function that evaluates an attribute; for values of other sizes, it keeps Mitsuba's result."""
+        """Override a function that evaluates an attribute, for values whose number of components is in ``sizes``."""
         variant = self._variant
 
         def answer(result: int, this: int, length: int, text: int, si: int, active: int, _: int) -> None:
             answers = self._answers.get(this)
             if answers is None:
                 return
-            given = self._object_at(variant.SurfaceInteraction3f, si)
+            interaction = self._object_at(variant.SurfaceInteraction3f, si)
             with paused_collection():
-                value = answers.attribute(ctypes.string_at(text, length).decode(), given, self._mask_at(active))
+                value = answers.attribute(ctypes.string_at(text, length).decode(), interaction, self._mask_at(active))
             size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
             if size == 3 and result_type is variant.UnpolarizedSpectrum:
                 if variant.is_monochromatic:
                     value, size = variant.luminance(variant.Color3f(value)), 1
                 elif variant.is_spectral:
-                    value, size = variant.srgb_model_eval(value, given.wavelengths), dr.size_v(result_type)
+                    value, size = variant.srgb_model_eval(value, interaction.wavelengths), dr.size_v(result_type)
             if value is not None and size in sizes:
-                own = self._object_at(result_type, result)
-                # In instances, points are in another space than the shape.
-                is_own = dr.reinterpret_array(variant.UInt32, given.instance) == 0
-                variant.set_property(own, dr.select(is_own, result_type(value), result_type(own)))
+                mitsuba_value = self._object_at(result_type, result)
+                # Keep Mitsuba's result in instances, whose points are in another space than the shape.
+                is_in_shape_space = dr.reinterpret_array(variant.UInt32, interaction.instance) == 0
+                variant.set_property(
+                    mitsuba_value, dr.select(is_in_shape_space, result_type(value), result_type(mitsuba_value))
+                )
 
         self._put(entries, f"eval_attribute{suffix}", _ATTRIBUTE_ARGUMENTS, result_type, answer)
 
@@ -269,30 +273,30 @@ class InteractionHook:
         answer: Callable[..., None],
         equal: tuple[int, ...] | None = None,
     ) -> None:
-        """Replace a virtual function by a trampoline."""
+        """Replace a virtual function by a trampoline; ``equal`` as for `Trampoline`."""
         index = self._index_of(entries, function, arguments)
         entries[index] = Trampoline(entries[index], result_type, answer, _fail, equal).address
 
     def _index_of(self, entries: list[int], function: str, arguments: str) -> int:
         """Index of a function in a table."""
         declaration = re.compile(rf"mitsuba::.*::{function}\({arguments}\) const")
-        # Mangled names rule out most functions before any is demangled.
-        spelled = f"{len(function)}{function}E"
-        found = [
+        # Compare mangled names first, so that few are demangled.
+        mangled = f"{len(function)}{function}E"
+        indices = [
             index
             for index, entry in enumerate(entries)
-            if spelled in self._bindings.name_at(entry) and declaration.fullmatch(self._bindings.declaration_at(entry))
+            if mangled in self._bindings.name_at(entry) and declaration.fullmatch(self._bindings.declaration_at(entry))
         ]
-        if len(found) != 1:
-            raise RuntimeError(f"{len(found)} virtual functions {function} of the known arguments; expected one")
-        return found[0]
+        if len(indices) != 1:
+            raise RuntimeError(f"{len(indices)} virtual functions {function} of the known arguments; expected one")
+        return indices[0]
 
 
 def _member_finder(variant: Variant) -> Callable[[mi.Shape], list[mi.Shape]]:
-    """Function that finds the shapes of a group."""
+    """Return a function that returns the shapes of a group."""
 
     class Members(variant.TraversalCallback):
-        """Collects what a group shows."""
+        """Collects the objects that a group exposes."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -310,22 +314,22 @@ def _member_finder(variant: Variant) -> Callable[[mi.Shape], list[mi.Shape]]:
 
 
 def _fail(error: BaseException, trace: TracebackType) -> NoReturn:
-    """Raise an error of a Python override in the form that Mitsuba's caller is to see."""
-    own = origin(error.with_traceback(trace))
-    # Its frames refer to C++ memory that will be freed.
+    """Raise an error of an override so that the caller of Mitsuba receives the original error."""
+    original = origin(error.with_traceback(trace))
+    # Frames of the error refer to C++ memory that will be freed.
     clear_frames(error)
-    raise_itself(own, sys._getframe().f_back)
+    raise_itself(original, sys._getframe().f_back)
     try:
-        raise own from own.__cause__
+        raise original from original.__cause__
     finally:
-        # Its traceback has this frame.
-        del own, error, trace
+        # Break the reference cycle with the traceback, which contains this frame.
+        del original, error, trace
 
 
 def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
-    """Entries of a table of virtual functions, with those before it, up to where another class begins.
+    """Entries of a virtual function table, with those before its address, up to the table of the next class.
 
-    If that end is not recognised, the result has more entries than the class, which are never used.
+    If the end is not recognised, there are additional entries, which are never used.
     """
     entries = [ctypes.c_void_p.from_address(table - _WORD * (_BEFORE - i)).value or 0 for i in range(_BEFORE)]
     while len(entries) < _MOST_ENTRIES:
@@ -336,15 +340,15 @@ def _virtual_functions(bindings: _Bindings, table: int) -> list[int]:
     return entries
 
 
-# Never emptied: shapes need their functions for their whole lifetime.
+# Hooks by variant. Never removed, because shapes use the functions for their whole lifetime.
 _hooks: dict[Variant, InteractionHook] = {}
 
 
 def interaction_hook(variant: Variant, example: mi.Mesh) -> InteractionHook:
-    """The hook of a variant's shapes, built for the first of them.
+    """Return the hook of a variant's shapes, created for the first of them.
 
-    Raises RuntimeError if there is none yet, and another variant is set, in which Mitsuba would make the group that is
-    built upon.
+    Raises RuntimeError if the hook does not exist yet and another variant is set: Mitsuba would create the shape group
+    that the hook needs in that variant.
     """
     with _lock:
         if variant not in _hooks:
@@ -382,7 +386,7 @@ def _trial_problem(variant: Variant) -> str | None:
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and its chain of causes."""
+    """Iterate over an error and its chain of causes."""
     seen: list[BaseException] = []
     while error is not None and error not in seen:
         seen.append(error)
@@ -391,25 +395,25 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def origin(error: BaseException) -> BaseException:
-    """The error that Dr.Jit has raised ``RuntimeError`` from; the error itself if Dr.Jit did not raise it."""
+    """The cause of a ``RuntimeError`` that Dr.Jit has raised; any other error itself."""
     while type(error) is RuntimeError and error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def clear_frames(error: BaseException) -> None:
-    """Forget the local variables of the functions that an error has ended."""
-    for each in _causes(error):
-        traceback.clear_frames(each.__traceback__)
+    """Clear the local variables in the tracebacks of an error and its causes."""
+    for cause in _causes(error):
+        traceback.clear_frames(cause.__traceback__)
 
 
 def raise_itself(
-    error: BaseException,  # About to be raised through C++
+    error: BaseException,  # Error that will be raised through C++
     frame: FrameType | None,  # Frame that called C++; None in threads that Python did not start
 ) -> None:
-    """Raise an error itself in the user's code that called Mitsuba, instead of one that was raised from it.
+    """Raise an error in the user's code that called Mitsuba, instead of the error that C++ raises from it.
 
-    This uses the trace function: under a debugger, which needs it too, the other error is raised.
+    Uses Python's trace function. Under a debugger, which needs this function, the error of C++ is raised.
     """
     caller = _caller(frame)
     if caller is None or sys.gettrace() is not None:
@@ -418,7 +422,7 @@ def raise_itself(
     errors = [error]
 
     def look(_: FrameType, event: str, argument: Any) -> None:
-        # Called for the error, or for the next line if the caller has handled it.
+        # Called for the error of C++, or for the next line if the caller has handled it.
         sys.settrace(None)
         caller.f_trace = None
         error = errors.pop()
@@ -426,7 +430,7 @@ def raise_itself(
             if event == "exception" and argument[1] is not error and error in _causes(argument[1]):
                 raise error
         finally:
-            # Its traceback has this frame.
+            # Break the reference cycle with the traceback, which contains this frame.
             del error, argument
 
     caller.f_trace = look
@@ -434,7 +438,7 @@ def raise_itself(
 
 
 def _caller(frame: FrameType | None) -> FrameType | None:
-    """The frame outside all those of Mitsuba and Dr.Jit."""
+    """The innermost frame outside of all frames of Mitsuba and Dr.Jit."""
     caller = frame
     while frame is not None:
         if frame.f_globals.get("__name__", "").partition(".")[0] in _LIBRARIES:

@@ -1,10 +1,10 @@
-"""Machine code that calls Python before or after a virtual function of Mitsuba, and passes errors through C++.
+"""Machine code that calls Python before or after a virtual function of Mitsuba, and propagates errors through C++.
 
-Compiled bindings have trampolines for this: C++ that calls Python, and throws a Python error as a C++ exception, which
-the next call from Python to C++ converts back. Nothing less is safe. A ctypes callback prints an error raised in it,
-an interruption before its first line included, and returns a number that C++ takes for an address; and a C++ exception
-ends the process if it meets frames of the interpreter. So this module emits such a trampoline as machine code for Linux
-on x86-64 [System V ABI, AMD64 supplement], with its unwind information [DWARF 5, 6.4].
+Compiled bindings use trampolines for this: C++ functions that call Python, and throw a Python error as a C++ exception,
+which the bindings convert back when the call from Python to C++ returns. A ctypes callback is no safe replacement. It
+prints errors, even an interruption before its first line, and returns a number that C++ interprets as an address. And a
+C++ exception ends the process if it reaches frames of the interpreter. So this module generates a trampoline as machine
+code for Linux on x86-64 [System V ABI, AMD64 supplement], with unwind information [DWARF 5, 6.4].
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from typing import Any, NoReturn
 
 import mitsuba as mi
 
-# Of nanobind, which Mitsuba's bindings are made with: the exception of C++ that carries an error of Python.
+# Constructor, destructor and type of the C++ exception that contains a Python error, in nanobind, the library of
+# Mitsuba's bindings.
 _ERROR, _NO_ERROR, _ERROR_TYPE = (
     "_ZN8nanobind12python_errorC1Ev",
     "_ZN8nanobind12python_errorD1Ev",
@@ -33,28 +34,30 @@ _OBJECT_AT, _SET_STATE, _DESTRUCT = (
     "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
     "_ZN8nanobind6detail16nb_inst_destructEP7_object",
 )
-# Objects of C++ lie at multiples of 16 bytes.
+# Lowest bit of an address that differs between C++ objects, which are aligned to 16 bytes; used by `tag_of`.
 _LOWEST_BIT = 4
-# Bytes, more than the size of such an exception.
+# Upper bound of the size of this exception, in bytes.
 _ERROR_SIZE = 128
-# Arguments of Python's functions: numbers of 64 bits, and objects.
+# Format strings of `PyObject_CallFunction`: seven 64-bit numbers, and two objects.
 _NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"OO")
-# Signals of which C++ has handlers during a render. They allocate memory, and must not meet an allocation of Python's.
+# Signals that C++ handles during a render. The handlers allocate memory, so they must not interrupt an allocation of
+# Python: these signals are blocked while Python runs.
 _SIGNALS = (signal.SIGINT,)
 _SIGNAL_SET = ctypes.create_string_buffer(128)
 
-# Machine code, for functions whose arguments are kept in a frame: `rbp` - 0x18 has the first, - 0x40 the sixth, + 0x10
-# the seventh, which lies on the stack.
+# Machine code for functions that store their arguments in the frame: the first at `rbp` - 0x18, the sixth at `rbp` -
+# 0x40. The seventh is passed on the stack, at `rbp` + 0x10.
 _ENTER = bytes.fromhex("f30f1efa 55 4889e5 53 4154 4881ece0000000")  # endbr64; push rbp; ...; sub rsp, 0xe0
 _KEEP = bytes.fromhex("48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0")  # mov [rbp - 0x18], rdi; ...
 _PUSH_SEVENTH = bytes.fromhex("4883ec08 ff7510")  # sub rsp, 8; push [rbp + 0x10]
 _PUSH_FIFTH_AND_SIXTH = bytes.fromhex("ff75c0 ff75c8")  # push [rbp - 0x40]; push [rbp - 0x38]
 _DROP_2, _DROP_4 = bytes.fromhex("4883c410"), bytes.fromhex("4883c420")  # add rsp, 16; add rsp, 32
-_LOAD = bytes.fromhex("488b45e8 488b88")  # mov rax, [rbp - 0x18]; mov rcx, [rax + ...], by an offset of 32 bits
-_COMPARE = bytes.fromhex("483b88")  # cmp rcx, [rax + ...], by an offset of 32 bits
-_JUMP_IF_EQUAL = bytes.fromhex("0f84")  # je, by a distance of 32 bits
+_LOAD = bytes.fromhex("488b45e8 488b88")  # mov rax, [rbp - 0x18]; mov rcx, [rax + ...], a 32-bit offset
+_COMPARE = bytes.fromhex("483b88")  # cmp rcx, [rax + ...], a 32-bit offset
+_JUMP_IF_EQUAL = bytes.fromhex("0f84")  # je, a 32-bit distance
 _FIRST_FOUR = bytes.fromhex("488b55e8 488b4de0 4c8b45d8 4c8b4dd0")  # mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
-# mov eax, [rbp - 0x20]; shl eax, 12; and eax, 0xffff0000; or [rbp - 0x38], eax: `tag_of` the second into the fifth.
+# mov eax, [rbp - 0x20]; shl eax, 12; and eax, 0xffff0000; or [rbp - 0x38], eax: add `tag_of` the second argument to the
+# fifth.
 _TAG_FIFTH = bytes.fromhex("8b45e0 c1e00c 250000ffff 0945c8")
 _LOAD_SIX = bytes.fromhex("488b7de8 488b75e0 488b55d8 488b4dd0 4c8b45c8 4c8b4dc0")  # mov rdi, [rbp - 0x18]; ...
 _NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
@@ -62,7 +65,7 @@ _IS_NULL = bytes.fromhex("4885c0")  # test rax, rax
 _STATE_OF_RESULT, _STATE = bytes.fromhex("89c3"), bytes.fromhex("89df")  # mov ebx, eax; mov edi, ebx
 _RESULT = bytes.fromhex("4889c7")  # mov rdi, rax
 _MADE, _KEEP_OBJECT = bytes.fromhex("488b75e8"), bytes.fromhex("48898528ffffff")  # mov rsi, [rbp - 0x18]; mov ..., rax
-# lea rdi, [rbp - 0xd8]; lea rsi, [rbp - 0xe0]; lea rdx, [rbp - 0xe8]: a type, an error and its traceback.
+# lea rdi, [rbp - 0xd8]; lea rsi, [rbp - 0xe0]; lea rdx, [rbp - 0xe8]: addresses of a type, an error and its traceback.
 _RAISED = bytes.fromhex("488dbd28ffffff 488db520ffffff 488d9518ffffff")
 _FAILED = bytes.fromhex("488b9520ffffff 488b8d18ffffff")  # mov rdx, [rbp - 0xe0]; mov rcx, [rbp - 0xe8]
 _KEPT = [bytes.fromhex(f"488bbd{low}ffffff") for low in ("28", "20", "18")]  # mov rdi, [rbp - 0xd8]; ...
@@ -72,51 +75,50 @@ _UNBLOCK = bytes.fromhex("bf02000000 488db530ffffff 31d2")  # mov edi, 2; lea rs
 _LEAVE = bytes.fromhex("488b45e8 488d65f0 415c 5b 5d c3")  # mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; ...; ret
 _NEVER = bytes.fromhex("0f0b")  # ud2
 
-# Unwind information. The frame's address is the stack pointer before the call; the return address lies below.
+# Unwind information. The canonical frame address is the stack pointer before the call; the return address is below it.
 _COMMON = bytes.fromhex("00000000 01 00 01 78 10 0c0708 9001 0000")
-# After `push rbp`, and after `mov rbp, rsp`; then where `rbx` and `r12` are.
+# Rules after `push rbp` and after `mov rbp, rsp`, and the locations of `rbx` and `r12`.
 _FRAME = bytes.fromhex("45 0e10 8602 43 0d06 8303 8c04 00000000")
 
 
 def bindings_library() -> ctypes.PyDLL:
-    """The library that Mitsuba's bindings share."""
+    """Load the library that Mitsuba's bindings share."""
     return ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so"))
 
 
 class Trampoline:
-    """A virtual function that calls the original one, and then Python.
+    """A virtual function that calls the original function, and then Python.
 
-    Raises OSError if the system allows no executable memory. Raises AttributeError if the libraries lack a function
-    that is needed.
+    Raises OSError if the system allows no executable memory. Raises AttributeError if the libraries lack a required
+    function.
     """
 
     def __init__(
         self,
-        # Address of a function that returns an object, with up to six arguments besides the object's address:
-        # numbers and addresses
+        # Address of a function that returns an object through its address, the first argument, and has up to six more
+        # arguments, numbers or addresses
         original: int,
-        kind: type,  # Python's, of the object
-        # Called with the object's address and the six arguments. The upper bits of smaller arguments are
-        # arbitrary.
+        kind: type,  # Python type of the object
+        # Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
         function: Callable[..., None],
-        # Called with an error of the function, even one before its first line, and its traceback. It has to
-        # raise an error, which C++ throws. The object has been destructed.
+        # Called with an error of ``function``, even one before its first line, and its traceback, after the object has
+        # been destructed. It must raise an error, which is thrown as a C++ exception.
         fail: Callable[[BaseException, TracebackType], NoReturn],
-        # (2,) tuple of int: offsets of two words of the object. If they are equal, Python is not called.
+        # (2,) tuple of int: offsets of two words of the object. If the words are equal, Python is not called.
         equal: tuple[int, ...] | None = None,
     ) -> None:
         self.address = _installed(_code_after(original, kind, function, fail, equal), kind, function, fail)
 
 
 class TaggingTrampoline:
-    """A virtual function that calls Python, and then the original one.
+    """A virtual function that calls Python, and then the original function.
 
-    It adds the object's tag to the original's third argument besides the object's address, a number below 2¹⁶.
+    It adds the tag of the second argument, a C++ object, to the fifth argument, a number below 2¹⁶.
     """
 
     def __init__(
         self,
-        # As for `Trampoline`; when Python is called, no object exists yet
+        # As for `Trampoline`, but no object exists yet when Python is called
         original: int,
         function: Callable[..., None],
         fail: Callable[[BaseException, TracebackType], NoReturn],
@@ -125,17 +127,17 @@ class TaggingTrampoline:
 
 
 def tag_of(address: int) -> int:
-    """The tag of a C++ object: bits of its address, in the upper half of 32 bits. Few objects share a tag."""
+    """The tag of a C++ object: bits of its address, in the upper half of 32 bits. Objects rarely share a tag."""
     return address >> _LOWEST_BIT << 16 & 0xFFFF0000
 
 
 def replace_function(
     entry: int,  # Address of the entry in the table
-    address: int,  # Of the function
+    address: int,  # Address of the function
 ) -> None:
     """Replace an entry of a write-protected virtual function table.
 
-    Raises OSError if the system does not allow it to be written.
+    Raises OSError if the system does not allow the table to be written.
     """
     page = entry - entry % mmap.PAGESIZE
     _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
@@ -146,8 +148,8 @@ def replace_function(
 def require_trampolines() -> None:
     """Check that trampolines work on this system.
 
-    Raises OSError if the system does not allow memory to be executed that a program has written. Raises AttributeError
-    if the libraries lack a function that is needed.
+    Raises OSError if the system does not allow memory that was written to be executed. Raises AttributeError if the
+    libraries lack a required function.
     """
     _code_after(0, object, print, sys.exit, None)
     _protect(_writable_page(), mmap.PROT_READ | mmap.PROT_EXEC)
@@ -156,24 +158,24 @@ def require_trampolines() -> None:
 def _installed(code: bytes, *used: Any) -> int:
     """Copy machine code to executable memory, and return its address.
 
-    The memory is never freed: virtual function tables refer to the code, and the code to Python objects.
+    The memory is never freed: virtual function tables refer to the code, and the code refers to Python objects.
 
     Raises OSError if the code and its unwind information are longer than a page.
     """
     address = _writable_page()
-    written = code + _frame_description(address, len(code))
-    if len(written) > mmap.PAGESIZE:
-        raise OSError(f"machine code of {len(written)} bytes; expected at most a page of {mmap.PAGESIZE}")
-    for each in used:
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
-    ctypes.memmove(address, written, len(written))
+    code_and_unwind_info = code + _frame_description(address, len(code))
+    if len(code_and_unwind_info) > mmap.PAGESIZE:
+        raise OSError(f"machine code of {len(code_and_unwind_info)} bytes; expected at most a page of {mmap.PAGESIZE}")
+    for reference in used:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(reference))
+    ctypes.memmove(address, code_and_unwind_info, len(code_and_unwind_info))
     _protect(address, mmap.PROT_READ | mmap.PROT_EXEC)
     bindings_library()["__register_frame"](ctypes.c_void_p(address + len(code)))
     return address
 
 
 def _writable_page() -> int:
-    """Address of a page of memory that is never freed."""
+    """Allocate a page of memory, never freed, and return its address."""
     allocate = ctypes.CDLL(None, use_errno=True).mmap
     allocate.restype = ctypes.c_void_p
     allocate.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
@@ -201,20 +203,20 @@ def _code_after(
     """Machine code of a `Trampoline`."""
     library = bindings_library()
     set_state, destruct = _call(_address(library[_SET_STATE])), _call(_address(library[_DESTRUCT]))
-    failed = [
-        # To C++, the object does not exist. One state says whether to destruct it and to free its memory.
+    on_error = [
+        # After an exception, the object does not exist for C++: destruct it, without freeing its memory.
         _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(_address(library[_OBJECT_AT])) + _KEEP_OBJECT,
         _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
         _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _forget(),
         _raise(fail),
     ]
-    rest = _ask(function) + _jump_if_equal(len(_answered() + _LEAVE)) + _answered()
-    skip = b""
+    call_python = _ask(function) + _jump_if_equal(len(_answered() + _LEAVE)) + _answered()
+    skip_python = b""
     if equal is not None:
         first, second = (struct.pack("<i", offset) for offset in equal)
-        skip = _LOAD + first + _COMPARE + second + _jump_if_equal(len(rest))
-    begin = _ENTER + _KEEP + _PUSH_SEVENTH + _call(original) + _DROP_2
-    return begin + skip + rest + _LEAVE + b"".join(failed)
+        skip_python = _LOAD + first + _COMPARE + second + _jump_if_equal(len(call_python))
+    call_original = _ENTER + _KEEP + _PUSH_SEVENTH + _call(original) + _DROP_2
+    return call_original + skip_python + call_python + _LEAVE + b"".join(on_error)
 
 
 def _code_before(original: int, function: Callable[..., None], fail: Callable[..., NoReturn]) -> bytes:
@@ -224,7 +226,7 @@ def _code_before(original: int, function: Callable[..., None], fail: Callable[..
 
 
 def _ask(function: Callable[..., None]) -> bytes:
-    """Call Python with all arguments, and compare what it returns with zero."""
+    """Call Python with all arguments, and compare its result with NULL."""
     library, python = bindings_library(), ctypes.pythonapi
     for number in _SIGNALS:
         ctypes.CDLL(None).sigaddset(_SIGNAL_SET, int(number))
@@ -236,12 +238,12 @@ def _ask(function: Callable[..., None]) -> bytes:
 
 
 def _answered() -> bytes:
-    """Leave Python after it has returned."""
+    """Release the result of Python and the interpreter."""
     return _RESULT + _forget() + _release()
 
 
 def _raise(fail: Callable[..., NoReturn]) -> bytes:
-    """Throw the error that Python has raised."""
+    """Throw the error that Python has raised as a C++ exception."""
     library, python = bindings_library(), ctypes.pythonapi
     return b"".join(
         [
@@ -263,16 +265,16 @@ def _forget() -> bytes:
 
 
 def _release() -> bytes:
-    """Leave Python and unblock signals."""
+    """Release the interpreter and unblock signals."""
     release = _STATE + _call(_address(ctypes.pythonapi.PyGILState_Release))
     return release + _UNBLOCK + _call(_address(bindings_library()["pthread_sigmask"]))
 
 
 def _frame_description(address: int, size: int) -> bytes:
-    """Unwind information of a function: a common entry, its own entry, and a terminator."""
+    """Unwind information of a function: common information entry, frame description entry, and terminator."""
     common = struct.pack("<I", len(_COMMON)) + _COMMON
-    own = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
-    return common + struct.pack("<I", len(own)) + own + bytes(4)
+    description = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
+    return common + struct.pack("<I", len(description)) + description + bytes(4)
 
 
 def _address(function: Any) -> int:
