@@ -8,9 +8,8 @@ import warnings
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.errors import CageError, CageWarning, in_digits, warn
+from mitsuba_subdivision.cage.errors import CageError, CageSource, CageWarning, in_digits, warn
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.cage.source import CageSource
 from mitsuba_subdivision.files.formats import warn_of_losses
 
 

@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage.errors import CageSource
 from mitsuba_subdivision.cage.named_cages import tetrahedron
-from mitsuba_subdivision.cage.source import CageSource
 
 POINTS = np.random.default_rng(1).random((9, 3))
 NAN, INF = float("nan"), float("inf")

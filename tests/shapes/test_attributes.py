@@ -9,7 +9,7 @@ import pytest
 from mitsuba_subdivision import Attribute, CageWarning, LimitSurface, upload
 from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
-from mitsuba_subdivision.shapes.attribute_parameters import mesh_attributes
+from mitsuba_subdivision.shapes.cage_attributes import mesh_attributes
 from reference.refined_cages import tagged
 from shapes.cages import ISLANDS, cube, described, load, textured
 from shapes.scenes import SINGLE, WIDTHS, buffer, film, hit, perspective, vertices

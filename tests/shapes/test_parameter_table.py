@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.rules import RULES
 from mitsuba_subdivision.shapes import register_variant
-from mitsuba_subdivision.shapes.attribute_parameters import is_attribute_parameter
 from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
+from mitsuba_subdivision.shapes.parameters import is_attribute_parameter
 from mitsuba_subdivision.shapes.tessellation_parameters import LIMITS
 from mitsuba_subdivision.tessellation import HIGHEST_RATE
 from shapes.cages import cube, load

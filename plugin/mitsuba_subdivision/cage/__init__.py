@@ -3,8 +3,7 @@
 from .attributes import Attribute
 from .contents import CageContents, same, same_topology
 from .control_cage import ControlCage
-from .errors import CageError, CageWarning, in_digits, shortened, warn
-from .source import CageSource
+from .errors import CageError, CageSource, CageWarning, in_digits, shortened, warn
 from .validation import require_range
 
 __all__ = [

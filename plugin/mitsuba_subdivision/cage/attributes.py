@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from .errors import CageError, number_of_such, shortened
-from .source import CageSource
+from .errors import CageError, CageSource, number_of_such, shortened
 
 Interpolation = Literal["vertex", "varying", "face_varying"]
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")

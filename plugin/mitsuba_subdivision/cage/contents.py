@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from .attributes import Attribute
-from .source import CageSource
+from .errors import CageSource
 
 
 @dataclass(frozen=True, eq=False)

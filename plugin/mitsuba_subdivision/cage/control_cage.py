@@ -18,9 +18,8 @@ from ..mesh.sharpness import CreaseMethod
 from ..variants import variant_module
 from .attributes import Attribute, validated_attributes, validated_texcoords
 from .contents import CageContents
-from .errors import CageError
+from .errors import CageError, CageSource
 from .rules import RULES
-from .source import CageSource
 from .structure import CageStructure
 from .tags import validated_tags
 from .validation import flattened_faces, validated_face_indices, validated_faces, validated_holes, validated_positions

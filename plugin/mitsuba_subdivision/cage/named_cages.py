@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from .control_cage import ControlCage
-from .errors import CageError
-from .source import CageSource
+from .errors import CageError, CageSource
 
 # Number of quads along each side of a sector of `extraordinary`, and across its band; quads are nearly square for
 # valences 4 to 8.

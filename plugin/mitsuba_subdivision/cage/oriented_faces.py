@@ -6,8 +6,7 @@ import numpy as np
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.manifold import NonManifold, fan_counts, fan_labels, is_manifold, is_repeated, runs_with_twin, separated
-from .errors import number_of, warn
-from .source import CageSource
+from .errors import CageSource, number_of, warn
 
 # Maximum number of items of a kind that a message names.
 SHOWN = 3

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.cuts import Sharpness
 from ..mesh.sharpness import INFINITE
-from .errors import CageError, in_digits, number_of_such, warn
-from .source import CageSource
+from .errors import CageError, CageSource, in_digits, number_of_such, warn
 from .validation import read_only
 
 # float64 represents all integers up to this exactly.

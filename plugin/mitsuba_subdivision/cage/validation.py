@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.manifold import NonManifold
-from .errors import CageError, number_of_such, warn
+from .errors import CageError, CageSource, number_of_such, warn
 from .oriented_faces import oriented_faces
-from .source import CageSource
 
 # Vertices and half-edges of the cage, and of the cage refined once, must fit into 31 bits.
 MOST_FACE_CORNERS = MOST_VERTICES = (1 << 29) - 1

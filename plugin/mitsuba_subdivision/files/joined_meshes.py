@@ -10,9 +10,8 @@ import numpy as np
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, shortened, warn
+from ..cage.errors import CageError, CageSource, shortened, warn
 from ..cage.rules import RULES
-from ..cage.source import CageSource
 from ..cage.validation import require_range
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, warn
-from ..cage.source import CageSource
+from ..cage.errors import CageError, CageSource, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .obj_text import SPACE, Arguments, ObjText, parsed, require_text, run_starts

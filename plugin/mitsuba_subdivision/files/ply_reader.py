@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, shortened, warn
-from ..cage.source import CageSource
+from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh.connectivity import IntArray
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
-from ..cage.errors import CageError, shortened
-from ..cage.source import CageSource
+from ..cage.errors import CageError, CageSource, shortened
 from ..cage.validation import require_range
 from ..mesh.connectivity import IntArray, Topology
 from .usd_values import INTERPOLATIONS, TEXCOORDS

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
-from ..cage.errors import CageError, number_of_such, shortened, warn
+from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
 from ..cage.rules import RULES
-from ..cage.source import CageSource
 from ..cage.tags import require_sharpness
 from ..cage.validation import require_range, validated_face_indices
 from ..mesh import ragged

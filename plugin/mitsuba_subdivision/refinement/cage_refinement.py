@@ -16,9 +16,8 @@ import numpy as np
 
 from ..cage.contents import CageContents
 from ..cage.control_cage import ControlCage
-from ..cage.errors import CageError, CageWarning
+from ..cage.errors import CageError, CageSource, CageWarning
 from ..cage.rules import RULES
-from ..cage.source import CageSource
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.cuts import Sharpness

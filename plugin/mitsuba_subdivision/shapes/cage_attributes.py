@@ -1,6 +1,6 @@
 """Texture coordinates and attributes of the cage as differentiable parameters of the shape.
 
-    attribute_parameters.py  reads them from a scene
+    parameters.py            reads them from a scene
     cage_attributes.py       exposes them to `traverse` and fills the mesh's buffers: this module
     exact_shading.py         evaluates them at hits
     displacement.py          uses them as heights
@@ -20,22 +20,27 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.errors import warn
 from ..device_arrays import take_over
 from ..kernels.array_types import FloatBuffer
 from ..mesh.shared import SharedArray
 from ..variants import Variant
-from .attribute_parameters import mesh_name
 from .device_state import is_recording
 from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
 from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
+    from ..cage import ControlCage
     from ..patches import Channel
     from ..surface import LimitSurface
     from ..tessellation import AttributeTable, VertexTable
 
 PREFIX = "cage_"
+# Names of attributes whose buffers would be those of every Mitsuba mesh.
+RESERVED = ("positions", "normals")
+# Numbers of components that Mitsuba's attribute lookups support.
+WIDTHS = (1, 3)
 
 # Callback for an attribute's name and the gradient by its values, after reverse mode has reached these.
 OnBackward = Callable[[str, FloatBuffer], None]
@@ -190,3 +195,25 @@ class CageAttributes:
         if not dr.all(dr.isfinite(values)):
             invalid = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
             raise ValueError(f"number {invalid[0]} is not finite; expected finite numbers ({len(invalid)} such in all)")
+
+
+def mesh_name(name: str) -> str:
+    """Name of the mesh attribute for an attribute of the cage."""
+    return f"vertex_{name}"
+
+
+def mesh_attributes(cage: ControlCage) -> dict[str, int]:
+    """Attributes of a cage that a Mitsuba mesh can store, with their numbers of components. Warns about others."""
+    sizes = {}
+    for name, attribute in cage.attributes.items():
+        size = attribute.values.shape[1]
+        if name in RESERVED:
+            warn(f'{cage.source.name}: attribute "{name}" is left out; every Mitsuba mesh has "{name}" already')
+        elif size not in WIDTHS:
+            warn(
+                f'{cage.source.name}: attribute "{name}" has {size} numbers per value and is left out; '
+                "Mitsuba evaluates attributes of 1 or 3"
+            )
+        else:
+            sizes[name] = size
+    return sizes

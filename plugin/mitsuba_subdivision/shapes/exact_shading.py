@@ -29,7 +29,7 @@ from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
 from ..variants import Variant
-from .attribute_parameters import WIDTHS, mesh_name
+from .cage_attributes import WIDTHS, mesh_name
 from .placement import Placement
 from .spectral_colors import SpectralUpsampling, holds_spectra
 

@@ -15,17 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..cage.attributes import Attribute
-from ..cage.errors import noting_warnings, warn, without_warnings
+from ..cage.attributes import Attribute, Interpolation
+from ..cage.errors import CageSource, noting_warnings, warn, without_warnings
 from ..cage.rules import RULES
-from ..cage.source import CageSource
 
 # Needed at run time: Dr.Jit resolves the annotations of dataclasses that a shape refers to.
 from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
 from ..mesh.shared import Shared
 from ..surface import LimitSurface
-from .attribute_parameters import is_attribute_parameter, read_attributes
+from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
 from .tessellation_parameters import Tessellation, read_tessellation
@@ -33,6 +32,8 @@ from .tessellation_parameters import Tessellation, read_tessellation
 if TYPE_CHECKING:
     from ..cage import ControlCage
 
+TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
+INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
 # Parameters of a cage in memory, and their shapes, with -1 for any size.
 ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
 TAGS = {"creases": (-1, 3), "corners": (-1, 2), "holes": (-1,)}
@@ -273,3 +274,44 @@ def _shared(key: Hashable, make: Callable[[], ControlCage]) -> ControlCage:
     for message in () if is_new else _WARNINGS[cage]:
         warn(message)
     return cage
+
+
+# Function of the properties, a parameter's name and a shape, with -1 for any size, which returns the tensor as an
+# array.
+Reader = Callable[[Any, str, tuple[int, ...]], NDArray]
+
+
+def is_attribute_parameter(name: str) -> bool:
+    """Whether a parameter of the shape contains texture coordinates, an attribute, or their indices."""
+    return name in (TEXCOORDS, TEXCOORD_INDICES) or name.startswith(tuple(f"{kind}_" for kind in INTERPOLATIONS))
+
+
+def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
+    """Read texture coordinates and attributes, and return them as options of a `ControlCage`.
+
+    Raises ValueError if a parameter has a wrong shape, indices come without values, or an attribute is given twice.
+    """
+    names = [name for name in props.keys() if is_attribute_parameter(name)]  # noqa: SIM118
+    indices_of = {name: TEXCOORD_INDICES if name == TEXCOORDS else f"{name}_indices" for name in names}
+    attributes: dict[str, Attribute] = {}
+    for name in names:
+        if name in indices_of.values():
+            continue
+        interpolation: Interpolation
+        if name == TEXCOORDS:
+            interpolation, key = "face_varying" if TEXCOORD_INDICES in names else "vertex", TEXCOORDS
+        elif name == TEXCOORD_INDICES:
+            raise ValueError(f'parameter "{name}" needs "{TEXCOORDS}"')
+        else:
+            interpolation = next(kind for kind in INTERPOLATIONS if name.startswith(f"{kind}_"))
+            key = name.removeprefix(f"{interpolation}_")
+        if key in ("", *RESERVED):
+            raise ValueError(
+                f'parameter "{name}" names an attribute "{key}"; expected another name, as every Mitsuba mesh has '
+                f"{' and '.join(RESERVED)}"
+            )
+        if key in attributes:
+            raise ValueError(f'parameter "{name}" gives "{key}" a second time; expected one interpolation only')
+        indices = read(props, indices_of[name], (-1,)) if indices_of[name] in names else None
+        attributes[key] = Attribute(read(props, name, (-1, 2 if key == TEXCOORDS else -1)), interpolation, indices)
+    return {"texcoords": attributes.pop(TEXCOORDS, None), "attributes": attributes}

@@ -15,14 +15,13 @@ from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, 
 from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
-from .attribute_parameters import mesh_attributes, mesh_name
-from .cage_attributes import PREFIX, CageAttributes
+from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
 from .device_state import DeviceState, is_recording, paused_collection
 from .moving_vertices import MovingVertices, on_backward_of
-from .nesting import on_shallow_stack
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
+from .registration import on_shallow_stack
 from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .vertices import Triangles, require_control_points, vertices_of
 

@@ -20,7 +20,7 @@ from ..cage.contents import CageContents, same_topology
 from ..cage.errors import warn
 from ..files.formats import read_file
 from ..regression.scene import LoadedScene
-from ..shapes.attribute_parameters import mesh_name
+from ..shapes.cage_attributes import mesh_name
 from ..variants import SceneNode
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .camera import DEFAULT_VIEW, View

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, ControlCage, named_cages
 from ..cage.contents import CageContents
-from ..cage.errors import shortened, warn
-from ..cage.source import CageSource
+from ..cage.errors import CageSource, shortened, warn
 from ..files.formats import FORMATS
 from ..surface import LimitSurface
 from ..tessellation import VertexTable

@@ -19,7 +19,7 @@ from ..cage.contents import CageContents
 from ..cage.rules import RULES
 from ..files import ply_reader, usd_values
 from ..files.formats import write_file
-from ..shapes.attribute_parameters import is_attribute_parameter, read_attributes
+from ..shapes.parameters import is_attribute_parameter, read_attributes
 from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..cage import ControlCage
-from ..cage.errors import in_digits, warn
-from ..cage.source import CageSource
+from ..cage.errors import CageSource, in_digits, warn
 from ..variants import SceneNode
 from .camera import DEFAULT_VIEW, FIELD_OF_VIEW, Camera, View, angles_of, framed, studio_axes, turned
 from .polygon_mesh import box_corners
