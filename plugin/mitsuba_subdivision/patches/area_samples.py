@@ -1,4 +1,4 @@
-"""Areas of a surface, and random points that are uniform by area."""
+"""Area of a surface, and random points that are uniform by area."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces
 
-# Tolerance of the area, relative to it. Each piece gets its share, and the rounding error of its own area.
+# Tolerance of the area of the surface, divided evenly among the pieces; and rounding error of a piece's area. Both are
+# relative.
 TOLERANCE, ROUNDED = 1e-12, 1e-14
-# Points along each parameter: the change by the larger number is the error of the smaller one. A piece for which no
-# pair is accurate is halved. Along the edge of a fold, where areas have a kink, this ends after so many times; it
-# leaves some 10^-8 of the area of the pieces there.
+# Pairs of numbers of Gauss nodes along each parameter. The difference of the two areas is the error estimate. A piece
+# for which no pair is accurate is halved, at most MOST_HALVINGS times: along a fold, where area elements have a kink,
+# this leaves an error of about 1e-8 of the area of the pieces there.
 ORDERS = ((2, 3), (3, 5), (5, 8))
 MOST_HALVINGS = 10
-# Around extraordinary points levels are measured until their areas have shrunk to this. From there on each level is
-# smaller than the one before by the same factor: what this leaves is below the tolerance.
+# Area of a level around an extraordinary point, relative to the first, down to which levels are measured. The areas of
+# later levels form a geometric series with an error below the tolerance.
 TAIL = 2.0**-36
-# Pieces are measured in runs of this many points, whose arrays stay in a processor's cache; bounds of area elements are
-# found in runs of this many pieces, which bounds temporary memory to some tens of megabytes.
+# Points per run when measuring areas, whose arrays stay in a processor's cache; and pieces per run when bounding area
+# elements, which bounds temporary memory to some tens of megabytes.
 MOST_POINTS, CHUNK = 1 << 14, 2048
-# The bound of a piece's area elements is raised by this against rounding.
+# Factor that protects the bound of area elements from rounding.
 BOUND_ROUNDED = 1 + 1e-9
-# Pieces are halved until their area elements are nowhere larger than this, in means of the piece; but no more often.
+# Largest area element of a sampling cell, relative to its mean, above which pieces are halved; and most halvings.
 UNEVEN, CELL_HALVINGS = 1.25, 3
-# Around extraordinary points this many levels are cells of their own.
+# Levels around extraordinary points whose pieces are sampling cells. One more cell covers the deeper levels of a tip.
 TIP_LEVELS = 2
 
 
@@ -38,10 +39,10 @@ TIP_LEVELS = 2
 class SurfaceAreas:
     """Areas of a surface's pieces."""
 
-    regular: FloatArray  # (n,) float64: of `SurfacePieces.regular`
-    # tuple of (levels, 3, t) float64: for each of `SurfacePieces.tips`, of its levels and their regular pieces
+    regular: FloatArray  # (n,) float64: areas of `SurfacePieces.regular`
+    # tuple of (levels, 3, t) float64: areas of the pieces of the levels, for each of `SurfacePieces.tips`
     tips: tuple[FloatArray, ...]
-    rest: float  # Of the surface beyond these levels
+    rest: float  # Area of the levels beyond these
 
     @classmethod
     def of(cls, pieces: SurfacePieces) -> SurfaceAreas:
@@ -50,80 +51,81 @@ class SurfaceAreas:
         rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)
         count = len(pieces.regular) + sum(3 * _level_count(tips.patch) * len(tips) for tips in pieces.tips)
         tolerance = TOLERANCE * rough / count
-        found, rest = [], 0.0
+        tip_areas, rest = [], 0.0
         for tips in pieces.tips:
             levels = range(_level_count(tips.patch))
             areas = np.stack([piece_areas(tips.level(level), tolerance) for level in levels])
-            found.append(areas.reshape(len(levels), 3, -1))
-            last, before = (found[-1][k].sum(axis=0) for k in (-1, -2))
+            tip_areas.append(areas.reshape(len(levels), 3, -1))
+            last, before = (tip_areas[-1][k].sum(axis=0) for k in (-1, -2))
             factor = np.divide(last, before, out=np.zeros_like(last), where=before > 0)
             rest += float((last * factor / (1 - np.minimum(factor, 1 / 2))).sum())
-        return cls(piece_areas(pieces.regular, tolerance), tuple(found), rest)
+        return cls(piece_areas(pieces.regular, tolerance), tuple(tip_areas), rest)
 
     @property
     def total(self) -> float:
         """The area of the surface."""
-        return float(self.regular.sum() + sum(each.sum() for each in self.tips) + self.rest)
+        return float(self.regular.sum() + sum(areas.sum() for areas in self.tips) + self.rest)
 
 
 def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
-    """``(n,)`` areas, each within a tolerance."""
-    found = np.zeros(len(pieces))
+    """``(n,)`` areas, each within ``tolerance``."""
+    areas = np.zeros(len(pieces))
     owner = np.arange(len(pieces))
     for halving in range(MOST_HALVINGS + 1):
         left = np.ones(len(pieces), dtype=bool)
         for orders in ORDERS:
-            of_left = np.flatnonzero(left)
-            rough, area = _measured(pieces if left.all() else pieces.chosen(of_left), orders)
-            # Areas that are no number, of points beyond all measure, get no better.
+            left_indices = np.flatnonzero(left)
+            rough, area = _measured(pieces if left.all() else pieces.chosen(left_indices), orders)
+            # Written so that areas that are not a number, by overflow, are accepted: halving does not improve them.
             is_good = ~(np.abs(area - rough) > np.maximum(tolerance, ROUNDED * area))
             if halving == MOST_HALVINGS and orders == ORDERS[-1]:
                 is_good[:] = True
-            np.add.at(found, owner[of_left[is_good]], area[is_good])
-            left[of_left[is_good]] = False
+            np.add.at(areas, owner[left_indices[is_good]], area[is_good])
+            left[left_indices[is_good]] = False
         if not left.any():
             break
         pieces, owner, tolerance = pieces.chosen(left).halved(), np.tile(owner[left], 4), tolerance / 4
-    return found
+    return areas
 
 
 def _area_elements(du: FloatArray, dv: FloatArray) -> FloatArray:
     """``(g, n)`` lengths of the cross products of vectors ``(g, 3, n)``."""
-    # In units of the largest, so that squares neither overflow nor vanish.
+    # Relative to the largest component, so that squares neither overflow nor underflow.
     unit = max(np.abs(du).max(initial=0), np.abs(dv).max(initial=0)) or 1.0
     (a, b, c), (d, e, f) = (du / unit).swapaxes(0, 1), (dv / unit).swapaxes(0, 1)
     return unit * unit * np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
 
 
 def _level_count(patch: IrregularPatch) -> int:
-    """Number of levels that are measured."""
+    """Number of levels whose areas are measured, see `TAIL`."""
     return int(np.ceil(np.log(TAIL) / np.log(patch.basis.moduli[1] * patch.basis.moduli[2])))
 
 
 def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
-    """``(2, n)`` areas by fewer and by more points along each parameter."""
-    (fewer, of_fewer), (more, of_more) = (pieces.basis.domain.quadrature(order) for order in orders)
-    weights = np.zeros((2, len(fewer) + len(more)))
-    weights[0, : len(fewer)], weights[1, len(fewer) :] = of_fewer, of_more
-    du, dv = pieces.basis.values(np.concatenate([fewer, more])) @ pieces.basis.derivatives
-    found = np.empty((2, len(pieces)))
-    for at, columns in pieces.runs(MOST_POINTS // len(du)):
-        found[:, at] = weights @ _area_elements(times(du, columns), times(dv, columns))
-    return found
+    """``(2, n)`` areas by Gauss rules of the two orders."""
+    (coarse, coarse_weights), (fine, fine_weights) = (pieces.basis.domain.quadrature(order) for order in orders)
+    weights = np.zeros((2, len(coarse) + len(fine)))
+    weights[0, : len(coarse)], weights[1, len(coarse) :] = coarse_weights, fine_weights
+    du, dv = pieces.basis.values(np.concatenate([coarse, fine])) @ pieces.basis.derivatives
+    areas = np.empty((2, len(pieces)))
+    for run, columns in pieces.runs(MOST_POINTS // len(du)):
+        areas[:, run] = weights @ _area_elements(times(du, columns), times(dv, columns))
+    return areas
 
 
 def largest_area_elements(pieces: PolynomialPieces) -> FloatArray:
-    """``(n,)`` bounds of `area_elements` over all of each piece.
+    """``(n,)`` upper bounds of the area elements of each piece.
 
-    The cross product of the derivatives is a polynomial, and no longer than its longest Bernstein coefficient.
+    The cross product of the derivatives is a polynomial, whose length is at most that of its longest Bernstein
+    coefficient.
     """
     basis = BernsteinBasis(pieces.basis.domain, 2 * pieces.basis.degree)
     values = pieces.basis.values(basis.indices / basis.degree)
-    found = np.empty(len(pieces))
-    for at in np.split(np.arange(len(pieces)), range(CHUNK, len(pieces), CHUNK)):
-        du, dv = ((values @ each) @ pieces.coefficients[at] for each in pieces.basis.derivatives)
-        found[at] = np.linalg.norm(basis.coefficients(np.cross(du, dv)), axis=2).max(axis=1)
-    return found
+    bounds = np.empty(len(pieces))
+    for run in np.split(np.arange(len(pieces)), range(CHUNK, len(pieces), CHUNK)):
+        du, dv = ((values @ derivative) @ pieces.coefficients[run] for derivative in pieces.basis.derivatives)
+        bounds[run] = np.linalg.norm(basis.coefficients(np.cross(du, dv)), axis=2).max(axis=1)
+    return bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,93 +154,94 @@ class AreaSamples:
 def uniform_locations(
     pieces: SurfacePieces, areas: SurfaceAreas, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Random locations on a surface, uniform by area.
+    """Draw random locations on a surface, uniform by area.
 
-    A piece is chosen with a probability in proportion to its area. In the piece, samples that are uniform in parameters
-    are accepted with the ratio of the area element to its bound. The surface beyond the measured levels around
-    extraordinary points, some 10^-11 of it, is left out.
+    A piece is chosen with a probability proportional to its area. Within the piece, rejection sampling accepts uniform
+    parameters with the ratio of the area element to its bound. The levels around extraordinary points that are not
+    measured, about 1e-11 of the surface, are left out.
 
-    Returns ``half_edge``, (count,) int64: the corner of an element where parameters begin, a half-edge of
+    Returns ``half_edge``, (count,) int64: the corner of an element at which parameters start, a half-edge of
     `PatchTable.elements`; and ``uv``, (count, 2) float64.
     """
-    flat = [areas.regular, *(each.ravel() for each in areas.tips)]
-    until = np.cumsum(np.concatenate(flat))
-    chosen = np.searchsorted(until, rng.random(count) * until[-1], side="right")
+    flat_areas = [areas.regular, *(tip_areas.ravel() for tip_areas in areas.tips)]
+    cumulative = np.cumsum(np.concatenate(flat_areas))
+    chosen = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
     half_edge, uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
-    for which, of_level, numbers in _chosen_pieces(pieces, areas, chosen):
-        number, own = np.unique(numbers, return_inverse=True)
-        used_pieces = of_level.chosen(number)
-        local = _uniform_in_pieces(used_pieces, own, rng)
-        half_edge[which] = used_pieces.half_edge[own]
-        uv[which] = used_pieces.chosen(own).parameters(local)
+    for samples, level_pieces, piece in _chosen_pieces(pieces, areas, chosen):
+        used, used_index = np.unique(piece, return_inverse=True)
+        used_pieces = level_pieces.chosen(used)
+        uv_in_piece = _uniform_in_pieces(used_pieces, used_index, rng)
+        half_edge[samples] = used_pieces.half_edge[used_index]
+        uv[samples] = used_pieces.chosen(used_index).parameters(uv_in_piece)
     return half_edge, uv
 
 
 def _chosen_pieces(
     pieces: SurfacePieces, areas: SurfaceAreas, chosen: IntArray
 ) -> list[tuple[IntArray, PolynomialPieces, IntArray]]:
-    """Samples in the regular pieces, and at every level around extraordinary points; the pieces, and which of these."""
-    at: IntArray = np.flatnonzero(chosen < len(pieces.regular))
-    found: list[tuple[IntArray, PolynomialPieces, IntArray]] = [(at, pieces.regular, chosen[at])]
+    """Group samples by regular pieces and by levels of tips. Returns samples, pieces, and each sample's piece."""
+    in_regular: IntArray = np.flatnonzero(chosen < len(pieces.regular))
+    groups: list[tuple[IntArray, PolynomialPieces, IntArray]] = [(in_regular, pieces.regular, chosen[in_regular])]
     begin = len(pieces.regular)
-    for tips, of_tips in zip(pieces.tips, areas.tips, strict=True):
-        within = np.flatnonzero((chosen >= begin) & (chosen < begin + of_tips.size))
-        level, number = np.divmod(chosen[within] - begin, of_tips[0].size)
-        for each in np.unique(level).tolist():
-            of_level = level == each
-            found.append((within[of_level], tips.level(each), number[of_level]))
-        begin += of_tips.size
-    return found
+    for tips, tip_areas in zip(pieces.tips, areas.tips, strict=True):
+        in_tips = np.flatnonzero((chosen >= begin) & (chosen < begin + tip_areas.size))
+        sample_level, piece = np.divmod(chosen[in_tips] - begin, tip_areas[0].size)
+        for level in np.unique(sample_level).tolist():
+            in_level = sample_level == level
+            groups.append((in_tips[in_level], tips.level(level), piece[in_level]))
+        begin += tip_areas.size
+    return groups
 
 
 def _uniform_in_pieces(pieces: PolynomialPieces, which: IntArray, rng: np.random.Generator) -> FloatArray:
-    """``(s, 2)`` parameters in pieces, uniform by area."""
+    """``(s, 2)`` parameters in pieces, uniform by area, by rejection sampling."""
     bound = BOUND_ROUNDED * largest_area_elements(pieces)
-    found, left = np.empty((len(which), 2)), np.arange(len(which))
+    accepted_uv, left = np.empty((len(which), 2)), np.arange(len(which))
     while len(left):
         uv = pieces.basis.domain.from_square(rng.random((len(left), 2)))
-        own = which[left]
-        keep = rng.random(len(left)) * bound[own] < _area_elements_at(pieces, own, uv)
-        found[left[keep]] = uv[keep]
-        left = left[~keep]
-    return found
+        piece = which[left]
+        is_accepted = rng.random(len(left)) * bound[piece] < _area_elements_at(pieces, piece, uv)
+        accepted_uv[left[is_accepted]] = uv[is_accepted]
+        left = left[~is_accepted]
+    return accepted_uv
 
 
-def _area_elements_at(pieces: PolynomialPieces, which: IntArray, uv: FloatArray) -> FloatArray:
-    """``(s,)`` area elements, each at one location in one piece."""
+def _area_elements_at(pieces: PolynomialPieces, piece: IntArray, uv: FloatArray) -> FloatArray:
+    """``(s,)`` area elements at parameters ``uv`` of pieces ``which``."""
     values = pieces.basis.values(uv)
-    rows = np.stack([values @ each for each in pieces.basis.derivatives], axis=1)
-    du, dv = (rows @ pieces.coefficients[which]).swapaxes(0, 1)
+    rows = np.stack([values @ derivative for derivative in pieces.basis.derivatives], axis=1)
+    du, dv = (rows @ pieces.coefficients[piece]).swapaxes(0, 1)
     return np.linalg.norm(np.cross(du, dv), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingCells:
-    """Parallelograms, or triangles, of parameters that cover a surface."""
+    """Parallelograms, or triangles, of the parameter domains that together cover a surface."""
 
-    # (n,) int64: the corner of an element where parameters begin, a half-edge of `PatchTable.elements`
+    # (n,) int64: the corner of an element at which parameters start, a half-edge of `PatchTable.elements`
     half_edge: IntArray
-    # (n, 2, 2), (n, 2) float64: from the whole domain to the cell, in the element's parameters
+    # (n, 2, 2), (n, 2) float64: affine maps from the whole domain to the cell, in the element's parameters
     matrices: FloatArray
     offsets: FloatArray
-    areas: FloatArray  # (n,) float64: of the surface there
+    areas: FloatArray  # (n,) float64: area of the surface over each cell
 
     @classmethod
     def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplingCells:
-        """Cover a surface; around each extraordinary point beyond some levels with one cell."""
+        """Cover a surface with cells; one cell covers all levels from `TIP_LEVELS` on around an extraordinary point."""
         parts = _even_parts(pieces.regular, areas.regular)
-        for tips, of_tips in zip(pieces.tips, areas.tips, strict=True):
+        for tips, tip_areas in zip(pieces.tips, areas.tips, strict=True):
             for level in range(TIP_LEVELS):
-                parts += _even_parts(tips.level(level), of_tips[level].ravel())
+                parts += _even_parts(tips.level(level), tip_areas[level].ravel())
             scale = 2.0**-TIP_LEVELS
-            parts.append((tips.half_edge, scale * tips.matrices, tips.offsets, of_tips[TIP_LEVELS:].sum(axis=(0, 1))))
+            deeper_areas = tip_areas[TIP_LEVELS:].sum(axis=(0, 1))
+            parts.append((tips.half_edge, scale * tips.matrices, tips.offsets, deeper_areas))
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _even_parts(
     pieces: PolynomialPieces, areas: FloatArray
 ) -> list[tuple[IntArray, FloatArray, FloatArray, FloatArray]]:
-    """Columns of cells whose area elements vary little."""
+    """Halve pieces into cells whose area elements vary little. Returns lists of fields of `SamplingCells`."""
     tolerance, parts = 1e-9 * float(areas.mean()) if len(areas) else 0.0, []
     for halving in range(CELL_HALVINGS + 1):
         is_even = pieces.basis.domain.area * largest_area_elements(pieces) <= UNEVEN * areas

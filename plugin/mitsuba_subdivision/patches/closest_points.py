@@ -154,7 +154,7 @@ class ClosestPointSearch:
 class _Best:
     """The nearest locations found so far for the points of a query.
 
-    The methods take pairs of a point and a piece (tip, part) as two index arrays, ``point`` and ``which``.
+    The methods take pairs of a point and a piece (tip, part) as two index arrays.
     """
 
     def __init__(
@@ -179,96 +179,94 @@ class _Best:
         rounded = ROUNDED * self._size
         return rounded * (2 * np.sqrt(squared_distance) + rounded)
 
-    def descend(self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes) -> None:
+    def descend(self, point: IntArray, pieces: PolynomialPieces, piece: IntArray, boxes: TurnedBoxes) -> None:
         """Descend to a minimum of the distance in pieces, as if each piece had only one."""
         if not len(point):
             return
         points = self._points[point]
-        begin = boxes.starts(points, which)
-        uv, squared_distance, slope = nearest_in_pieces(pieces, which, points, begin, self._size)
-        self._take(point, squared_distance, slope, pieces.half_edge[which], pieces.chosen(which).parameters(uv))
+        begin = boxes.starts(points, piece)
+        uv, squared_distance, slope = nearest_in_pieces(pieces, piece, points, begin, self._size)
+        self._take(point, squared_distance, slope, pieces.half_edge[piece], pieces.chosen(piece).parameters(uv))
 
     def try_pieces(
-        self, point: IntArray, pieces: PolynomialPieces, which: IntArray, boxes: TurnedBoxes | None = None
+        self, point: IntArray, pieces: PolynomialPieces, piece: IntArray, boxes: TurnedBoxes | None = None
     ) -> None:
         """Find the least distance in pieces; without ``boxes``, compute those around the pieces."""
         for halving in range(MOST_CONVEX_HALVINGS + 1):
             if boxes is None:
-                point, pieces, which = self._near(point, pieces, which)
+                point, pieces, piece = self._near(point, pieces, piece)
                 boxes = TurnedBoxes.around(pieces)
             points = self._points.take(point, axis=0)
-            near, squared_distance, away = boxes.near(points, which, self.reach.take(point))
-            point, which = point[near], which[near]
-            is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[which]
-            is_convex = boxes.are_convex(away, which) | is_tiny | (halving == MOST_CONVEX_HALVINGS)
+            near, squared_distance, away = boxes.near(points, piece, self.reach.take(point))
+            point, piece = point[near], piece[near]
+            is_tiny = (boxes.halves.max(axis=1) <= ROUNDED * self._size)[piece]
+            is_convex = boxes.are_convex(away, piece) | is_tiny | (halving == MOST_CONVEX_HALVINGS)
             is_last = is_convex.copy()
             # If the nearest location so far lies in a convex piece and is a minimum, the piece has no other.
-            is_last[is_last] = ~self._are_minima(point[is_last], pieces, which[is_last])
-            self.descend(point[is_last], pieces, which[is_last], boxes)
+            is_last[is_last] = ~self._are_minima(point[is_last], pieces, piece[is_last])
+            self.descend(point[is_last], pieces, piece[is_last], boxes)
             left = ~is_convex & (squared_distance <= self.reach[point])
             if not left.any():
                 return
-            used, which_used = _numbered(which[left], len(pieces))
+            used, used_index = _numbered(piece[left], len(pieces))
             pieces, boxes = pieces.chosen(used).halved(), None
-            point, which = np.tile(point[left], 4), (which_used + len(used) * np.arange(4)[:, None]).ravel()
+            point, piece = np.tile(point[left], 4), (used_index + len(used) * np.arange(4)[:, None]).ravel()
 
-    def _near(self, point: IntArray, parts: _Boxed, which: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
+    def _near(self, point: IntArray, parts: _Boxed, part: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
         """Pairs whose axis-aligned box is within reach. Returns points, the parts in use, and indices into these."""
         lower, upper = parts.box()
-        gaps = squared_gaps(self._points.take(point, axis=0), lower.take(which, axis=0), upper.take(which, axis=0))
+        gaps = squared_gaps(self._points.take(point, axis=0), lower.take(part, axis=0), upper.take(part, axis=0))
         is_near = gaps <= self.reach.take(point)
-        used, which_used = _numbered(which[is_near], len(parts))
-        return point[is_near], parts.chosen(used), which_used
+        used, used_index = _numbered(part[is_near], len(parts))
+        return point[is_near], parts.chosen(used), used_index
 
-    def _are_minima(self, point: IntArray, pieces: PolynomialPieces, which: IntArray) -> NDArray[np.bool_]:
+    def _are_minima(self, point: IntArray, pieces: PolynomialPieces, piece: IntArray) -> NDArray[np.bool_]:
         """Whether the nearest locations so far lie in their pieces and are minima along the surface."""
-        away = self.uv[point] - pieces.offsets[which]
-        (a, b), (c, d) = pieces.matrices[which].transpose(1, 2, 0)
+        away = self.uv[point] - pieces.offsets[piece]
+        (a, b), (c, d) = pieces.matrices[piece].transpose(1, 2, 0)
         uv_in_piece = np.stack([d * away[:, 0] - b * away[:, 1], a * away[:, 1] - c * away[:, 0]], axis=1)
         uv_in_piece /= (a * d - b * c)[:, None]
-        is_inside = (self.half_edge[point] == pieces.half_edge[which]) & (pieces.basis.domain.inside(uv_in_piece) >= 0)
+        is_inside = (self.half_edge[point] == pieces.half_edge[piece]) & (pieces.basis.domain.inside(uv_in_piece) >= 0)
         return is_inside & (self._slope[point] <= FLAT_SLOPE * np.sqrt(self._squared_distance[point]))
 
-    def try_tips(self, point: IntArray, tips: Tips, which: IntArray, first_level: int) -> None:
+    def try_tips(self, point: IntArray, tips: Tips, tip: IntArray, first_level: int) -> None:
         """Find the least distance in tips, from level ``first_level`` on."""
         if not len(point):
             return
-        difference = self._points[point] - tips.points[which]
+        difference = self._points[point] - tips.points[tip]
         squared = np.einsum("nx,nx->n", difference, difference)
-        slope = slopes(tips.tangents[which], difference)
-        self._take(point, squared, slope, tips.half_edge[which], tips.offsets[which])
-        used, which = _numbered(which, len(tips))
+        slope = slopes(tips.tangents[tip], difference)
+        self._take(point, squared, slope, tips.half_edge[tip], tips.offsets[tip])
+        used, tip = _numbered(tip, len(tips))
         tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
             reach = tips.reach(level)
-            lower, upper = (side.take(which, axis=0) for side in (tips.points - reach, tips.points + reach))
+            lower, upper = (side.take(tip, axis=0) for side in (tips.points - reach, tips.points + reach))
             is_near = squared_gaps(self._points[point], lower, upper) <= self.reach[point]
-            point, which = point[is_near], which[is_near]
+            point, tip = point[is_near], tip[is_near]
             if not len(point):
                 return
-            used, which = _numbered(which, len(tips))
+            used, tip = _numbered(tip, len(tips))
             tips = tips.chosen(used)
             pieces = tips.level(level)
             count = len(pieces) // len(tips)
-            which_piece = (which + len(tips) * np.arange(count)[:, None]).ravel()
-            self.try_pieces(np.tile(point, count), pieces, which_piece)
+            piece = (tip + len(tips) * np.arange(count)[:, None]).ravel()
+            self.try_pieces(np.tile(point, count), pieces, piece)
 
     def try_undivided(self, pairs: list[tuple[IntArray, ElementParts, IntArray]]) -> None:
         """Find the least distance in undivided parts: divide those within reach, all together, until none is left."""
         while pairs:
             child_pairs: list[tuple[IntArray, Any, IntArray]] = []
-            for point, parts, which in pairs:
-                near_point, near_parts, which_near = self._near(point, parts, which)
+            for point, parts, part in pairs:
+                near_point, near_parts, near_part = self._near(point, parts, part)
                 if len(near_point):
-                    child_pairs += [(near_point, child, which_near) for child in near_parts.children()]
-            for point, pieces, which in _joined_pairs(
+                    child_pairs += [(near_point, child, near_part) for child in near_parts.children()]
+            for point, pieces, piece in _joined_pairs(
                 [pair for pair in child_pairs if isinstance(pair[1], PolynomialPieces)]
             ):
-                self.try_pieces(point, pieces, which)
-            for point, tips, which in _joined_pairs(
-                [pair for pair in child_pairs if isinstance(pair[1], Tips)], "patch"
-            ):
-                self.try_tips(point, tips, which, 0)
+                self.try_pieces(point, pieces, piece)
+            for point, tips, tip in _joined_pairs([pair for pair in child_pairs if isinstance(pair[1], Tips)], "patch"):
+                self.try_tips(point, tips, tip, 0)
             pairs = _joined_pairs([pair for pair in child_pairs if isinstance(pair[1], ElementParts)], "element")
 
     def _take(

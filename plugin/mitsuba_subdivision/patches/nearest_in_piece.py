@@ -177,7 +177,7 @@ class _Descent:
 
 
 def _values(
-    pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray
+    pieces: PolynomialPieces, piece: IntArray, points: FloatArray, uv: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """`_Descent.difference`, `_Descent.tangents` and `_Descent.second` at parameters."""
     powers, degree = pieces.basis.indices, pieces.basis.degree
@@ -195,8 +195,8 @@ def _values(
     rows = np.empty((len(uv), 6, len(powers)))
     for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
         np.multiply(along_u, along_v, out=rows[:, number])
-    jet = rows @ pieces.monomials[which]
-    difference = jet[:, 0] + (pieces.origins[which] - points)
+    jet = rows @ pieces.monomials[piece]
+    difference = jet[:, 0] + (pieces.origins[piece] - points)
     return difference, jet[:, 1:3], np.einsum("sdx,sx->sd", jet[:, 3:], difference)
 
 

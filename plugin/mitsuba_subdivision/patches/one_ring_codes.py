@@ -1,9 +1,9 @@
-"""Numbers for one-rings: elements of equal signatures get equal numbers, by whole-array operations.
+"""Integer codes of one-rings, equal for elements of equal signatures, computed by whole-array operations.
 
-A one-ring consists of the fans of faces around the vertices of an element. Every fan gets a number first, its code,
-which stands for all that a `Signature` has of it: the number of faces, their sizes, the positions of borders and sharp
-edges, all as seen from one of the faces. The codes of an element's fans, in order, determine its one-ring. No
-`Signature` is made for a single element: a cage may have millions of elements, and they have few classes.
+A one-ring consists of the fans of faces around the vertices of an element. Each fan first gets a code for all that a
+`Signature` records of it: the number of faces, their sizes, and the positions of borders and sharp edges, all as seen
+from one of the faces. The codes of an element's fans, in order, determine its one-ring. No `Signature` is made per
+element, as a cage may have millions of elements, but has few classes.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.signature import NEAR_FACES, near_behind
 from ..schemes.domain import FloatArray
 
-# Up to this many codes are not renumbered: they fit into two bytes, which sort fast.
+# Range of codes up to which they are not renumbered: they fit into two bytes, which sort fast.
 FEW_CODES = 1 << 16
 
 
 def fan_codes(
     topology: Topology,
     *,
-    near: bool = False,  # Whether the codes are those of fans that have the faces of `TaggedFan.near` only
+    near: bool = False,  # Whether fans consist of the faces of `TaggedFan.near` only
 ) -> IntArray:
-    """``(n_h,)`` code of the fan around the vertex where each half-edge begins, seen from the half-edge's face."""
+    """``(n_h,)`` code of the fan around the vertex at which each half-edge begins, seen from the half-edge's face."""
     t = topology
     far_vertices = _has_far_faces(t) if near else np.zeros(0, dtype=bool)
     face_count = np.where(far_vertices, NEAR_FACES, t.vertex_face_count) if far_vertices.any() else t.vertex_face_count
@@ -49,9 +49,9 @@ def fan_codes(
 def row_codes(
     columns: Sequence[IntArray],  # sequence of (n,) int: the first column counts most in the order
 ) -> IntArray:
-    """Number the rows of a table: equal rows get equal numbers, and lesser rows lesser ones.
+    """Number the rows of a table: equal rows get equal codes, in lexicographic order.
 
-    Returns (n,) unsigned int: of a type of few bytes, where few are enough.
+    Returns (n,) unsigned integers of a type of few bytes, where these suffice.
     """
     codes: IntArray = np.zeros(len(columns[0]), dtype=np.uint8)
     count = 1
@@ -59,7 +59,7 @@ def row_codes(
         low, high = int(column.min(initial=0)), int(column.max(initial=0))
         if low == high:
             continue
-        # Column by column the codes stay few, and their product with a column's range small.
+        # Renumbering after every column keeps the product of the number of codes and the range of a column small.
         width = high - low + 1
         codes = codes.astype(np.min_scalar_type(count * width))
         codes *= width
@@ -77,7 +77,7 @@ def row_codes(
 
 
 def _vertex_codes(topology: Topology) -> IntArray:
-    """``(n_v,)`` code of each vertex's rule and sharpness, and of the semi-sharp edges beyond a crease there."""
+    """``(n_v,)`` code of each vertex's rule and sharpness, and of semi-sharp edges across a crease at the vertex."""
     t, semi = topology, topology.semi_sharpness
     if semi is None:
         return t.vertex_rules
@@ -85,14 +85,14 @@ def _vertex_codes(topology: Topology) -> IntArray:
     rows = np.stack([semi.across_sharpness, semi.across_refined, semi.across_sharpens], axis=1)
     order = np.lexsort((*rows.T[::-1], vertex))
     count = np.bincount(vertex, minlength=t.vertex_count)
-    beyond = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
-    beyond[vertex[order], ragged.index_in_row(count)] = rows[order]
-    columns = [semi.vertices, *beyond.reshape(t.vertex_count, -1).T]
+    across = np.zeros((t.vertex_count, int(count.max(initial=0)), 3))
+    across[vertex[order], ragged.index_in_row(count)] = rows[order]
+    columns = [semi.vertices, *across.reshape(t.vertex_count, -1).T]
     return row_codes([t.vertex_rules, *map(_value_codes, columns)])
 
 
 def _face_codes(topology: Topology) -> IntArray:
-    """``(n_h,)`` code of each half-edge's face as its vertex sees it: its size, and how sharp the half-edge is."""
+    """``(n_h,)`` code of each half-edge's face and edge: the size of the face, the sharpness of the edge."""
     t, semi = topology, topology.semi_sharpness
     size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
     if semi is None:
@@ -103,38 +103,37 @@ def _face_codes(topology: Topology) -> IntArray:
 
 
 def _faces_clockwise(topology: Topology) -> IntArray:
-    """``(n_h,)`` number of faces clockwise of each half-edge's own up to the border; -1 around inner vertices."""
+    """``(n_h,)`` number of faces clockwise of each half-edge's face up to the border; -1 around inner vertices."""
     t = topology
-    found = np.full(t.half_edge_count, -1, dtype=np.int64)
+    behind = np.full(t.half_edge_count, -1, dtype=np.int64)
     current, face_count = t.open_fan_start[t.open_fan_start >= 0], 0
     while len(current):
-        found[current] = face_count
+        behind[current] = face_count
         current = t.turn(current)
         current, face_count = current[current >= 0], face_count + 1
-    return found
+    return behind
 
 
 def _has_far_faces(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_v,)`` vertices some of whose faces do not see all others, as `TaggedFan.near` says."""
+    """``(n_v,)`` whether `TaggedFan.near` leaves out faces of the fan around each vertex."""
     t = topology
-    found = t.is_border_vertex & (t.vertex_face_count > NEAR_FACES)
-    return found & (t.vertex_rules != VertexRule.DART) & ~t.is_semi_sharp_vertex if found.any() else found
+    is_large = t.is_border_vertex & (t.vertex_face_count > NEAR_FACES)
+    return is_large & (t.vertex_rules != VertexRule.DART) & ~t.is_semi_sharp_vertex if is_large.any() else is_large
 
 
 def _codes_around(
     topology: Topology,
-    # (n_h,) int: code of each half-edge's face; number of faces that it sees around its vertex
-    face_codes: IntArray,
-    face_count: IntArray,
-    # ((m,) int, (m,) int): half-edges that see `NEAR_FACES` of their fan only, and how many of them clockwise of
-    # their own
+    face_codes: IntArray,  # (n_h,) int: code of each half-edge's face
+    face_count: IntArray,  # (n_h,) int: number of faces of the fan around the half-edge's vertex
+    # ((m,) int, (m,) int): half-edges whose fans are cut to `NEAR_FACES`, and how many of these faces lie clockwise of
+    # the half-edge's face
     cut: tuple[IntArray, IntArray] | None,
 ) -> tuple[IntArray, IntArray]:
-    """Two columns that encode which faces lie around the vertex of each half-edge, in which order.
+    """Two columns that encode the sequence of faces around the vertex of each half-edge.
 
     Around a vertex whose faces all have the same code, the first column is that code, and the second is 0. Around any
-    other, the first column is 0, and the second numbers the whole sequence of codes, from 1 on, counter-clockwise from
-    the half-edge's own face.
+    other, the first column is 0, and the second is a code, from 1 on, of the sequence of face codes, counter-clockwise
+    from the half-edge's face.
     """
     t = topology
     common, sequence = face_codes.astype(np.int64), np.zeros(t.half_edge_count, dtype=np.int64)
@@ -155,8 +154,9 @@ def _codes_around(
             following = t.turn(current)
             current = np.where((following < 0) | (step == ahead[half_edges]), restart[half_edges], following)
         differ = np.any([column != columns[0] for column in columns], axis=0)
-        found = 1 + row_codes(columns).astype(np.int64)
-        common[half_edges], sequence[half_edges] = np.where(differ, 0, columns[0]), np.where(differ, found, 0)
+        sequence_codes = 1 + row_codes(columns).astype(np.int64)
+        common[half_edges] = np.where(differ, 0, columns[0])
+        sequence[half_edges] = np.where(differ, sequence_codes, 0)
     return common, sequence
 
 
@@ -171,5 +171,5 @@ def _sees_different_faces(topology: Topology, face_codes: IntArray) -> NDArray[n
 
 
 def _value_codes(values: FloatArray) -> IntArray:
-    """Number values, equal for equal values, in their order."""
+    """Number distinct values in ascending order."""
     return np.unique(values, return_inverse=True)[1].ravel()

@@ -60,8 +60,8 @@ class PieceTable:
     # times the levels plus `CONTROL` times the number of control points in the one-ring
     nodes: NDArray[np.uint32]
     trees: tuple[TreeArrays, ...]  # Of each class
-    # (c, 7) uint32, for each class: index of its first entry in `controls`; numbers of controls per patch and of
-    # patches; first piece; number of pieces per patch; first packet of control points; number of these per patch
+    # (c, 7) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
+    # patch; first piece; number of pieces per patch; first packet of control points; number of these per patch
     classes: NDArray[np.uint32]
     # (n,) uint32: `PatchTable.controls` as indices of control values, or of refined ones if there is a `refinement`
     controls: NDArray[np.uint32]

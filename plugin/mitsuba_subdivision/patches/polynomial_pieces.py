@@ -232,7 +232,7 @@ class SurfacePieces:
         empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.basis.indices), 3))]
         regular, tips, undivided = [PolynomialPieces(form.basis, np.empty(0, dtype=np.int64), *empty)], [], []
         sizes = np.zeros((len(patches.elements.face_sizes), 3))
-        elements = patch_trees(table.scheme, [each.signature for each in table.classes])
+        elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
         known: dict[PatchTree, FloatArray] = {}
         pairs = zip(table.classes, elements, strict=True)
         for patch_class, whole in counted(list(pairs), "Pieces of patch classes"):
@@ -297,7 +297,7 @@ def _seen(
     patches: PatchTable,
     corners: IntArray,  # (p,) int: corners of elements at which the patches begin
     domain: AffineMap,  # From the part's parameters to the patch's
-    near: FloatArray,  # (2,) float64: parameters in the patch of a point whose nearest corner is chosen
+    near_uv: FloatArray,  # (2,) float64: parameters in the patch of a point whose nearest corner is chosen
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """`half_edge`, `matrices` and `offsets` of the same part of all patches of a class.
 
@@ -308,7 +308,7 @@ def _seen(
     # A patch of the refined cage is a quarter of a whole element of the cage.
     scale = np.where(is_whole, 0.5, 1.0) if patches.refined is not None else np.ones(len(corners))
     if patches.refined is None and is_whole.all():
-        extents = [shape.extent(shape.rotation(turn).inverse()(near)) for turn in range(shape.corner_count)]
+        extents = [shape.extent(shape.rotation(turn).inverse()(near_uv)) for turn in range(shape.corner_count)]
         turn = int(np.argmin(extents))
         domain = shape.rotation(turn).inverse() @ domain
         for _ in range(turn):

@@ -1,20 +1,20 @@
-"""Tessellation of patches into triangles: sample locations, shared vertices, and the polynomials that they lie on.
+"""Tessellation of patches into triangles: sample locations, shared vertices, and the polynomials on which they lie.
 
-`uniform_table` and `adaptive_table` both build a `VertexTable`: a vertex is a point of a polynomial, whose coefficients
-are weights of a class of patches times the control points of one of these. Their grids (`Grid`) number and locate
+`uniform_table` and `adaptive_table` both build a `VertexTable`: a vertex is a point on a polynomial, whose coefficients
+are the weights of a class of patches times the control points of one patch. Their grids (`Grid`) number and locate
 vertices and triangles.
 
 This package, `kernels` and `shapes` distinguish five kinds of points:
 
 =================  ====================================================================================================
 control point      A vertex of the cage, which may move. If the patches are those of the cage refined once, refined
-                   control points follow from these.
+                   control points are computed from these.
 mesh vertex        A vertex of `PatchTable.topology`: the cage cut along its creases, where a control point has a copy
-                   on each side. Attributes have meshes of their own, cut along their seams as well.
+                   on each side. Attributes have separate meshes, cut along their seams as well.
 sample             A point of a patch's grid. All patches of a class have the same samples.
-vertex             A vertex of the tessellation. Neighbouring patches share vertices, and one of them evaluates these.
-split vertex       A vertex of the tessellation with attributes (`AttributeTable`), and so of Mitsuba's mesh: vertices
-                   on seams are split into a copy for each side.
+vertex             A vertex of the tessellation. Neighbouring patches share vertices; one of the patches evaluates them.
+split vertex       A vertex of the tessellation with attributes (`AttributeTable`), and of Mitsuba's mesh: vertices on
+                   seams are split into a copy for each side.
 =================  ====================================================================================================
 
 These maps convert between them:
@@ -22,12 +22,12 @@ These maps convert between them:
 ===================  ==================================================================================================
 `control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.
 `controls`           From a patch to the control points of its one-ring.
-`weld_target`        From a vertex to the vertex whose position it has: another one, if it is a copy along a crease.
-`surface_vertex`     From a split vertex to the vertex that it is a copy of.
+`weld_target`        From a vertex to the vertex whose position it takes: another one, if it is a copy along a crease.
+`surface_vertex`     From a split vertex to the vertex of which it is a copy.
 ===================  ==================================================================================================
 
-A patch belongs to a class (`PatchClass`), whose weights (`VertexPolynomials`) are made once for all its patches. The
-corner of an element is named by the half-edge of `PatchTable.elements` that begins there.
+A patch belongs to a class (`PatchClass`), whose weights (`VertexPolynomials`) are computed once for all its patches.
+The corner of an element is identified by the half-edge of `PatchTable.elements` that begins there.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Adaptive tessellations, refined until an error criterion holds: their numbering, locations and triangles.
 
-Tiles of different sizes and rates meet along lines: edges of elements, spokes of polygons, and lines inside patches. A
-side of a tile asks for a power of two of segments, so that of two rows of samples on a line one contains the other.
-Each tile has all samples that lie on its sides, whichever tiles they come from: there are no cracks.
+Tiles of different sizes and rates meet along lines: edges of elements, spokes of polygons, and lines inside patches.
+The segments that a tile needs along a side are rounded up to a power of two, so that one of two rows of samples on a
+line contains the other. A tile's triangles use all samples on its sides, of its neighbours too: there are no cracks.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from .vertex_table import VertexTable
 def adaptive_table(
     patches: PatchTable,
     control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
-    # (n, 3) float64: control points for which the criterion is met. The table can be applied to others.
+    # (n, 3) float64: control points at which the criterion holds. The table can be applied to others.
     control_points: FloatArray,
     criterion: Criterion,
     max_rate: int,  # Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`
-    cage_name: str,  # For a warning
+    cage_name: str,  # For warnings
 ) -> VertexTable:
     """Prepare the adaptive tessellation of a cage's patches.
 
-    Raises ValueError if ``max_rate`` is anything else. Raises MemoryError, and warns, as `choose_tiles` does.
+    Raises ValueError if ``max_rate`` is out of range. Raises MemoryError, and warns, as `choose_tiles` does.
     """
     max_rate = checked_rate(max_rate, "max_rate")
     if max_rate > HIGHEST_RATE:
@@ -53,7 +53,7 @@ def adaptive_table(
 
 
 def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynomials, ...]:
-    """What the vertices lie on. Vertices of patches of a class at the same parameters are one sample."""
+    """The polynomials on which vertices lie. Vertices at equal parameters of patches of one class share a sample."""
     refined = patches.refined
     table = patches if refined is None else refined.table
     tile, parameters = grid.vertex_parameters()
@@ -64,17 +64,17 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     order = np.lexsort((*uv, patch_class))
     is_new = np.ones(len(order), dtype=bool)
     is_new[1:] = (np.diff(uv[:, order]) != 0).any(axis=0) | (np.diff(patch_class[order]) != 0)
-    different = order[is_new]
-    counts = np.bincount(patch_class[different], minlength=len(table.classes))
-    own_uv = np.split(np.ascontiguousarray(uv[:, different].T), np.cumsum(counts)[:-1])
+    distinct = order[is_new]
+    counts = np.bincount(patch_class[distinct], minlength=len(table.classes))
+    uv_of_class = np.split(np.ascontiguousarray(uv[:, distinct].T), np.cumsum(counts)[:-1])
     # Runs of one vertex each.
     kind = np.cumsum(is_new) - 1
-    samples, ones = ragged.index_in_row(counts), np.ones_like(different)
-    runs = VertexRuns(patch_class[different], ones, samples, kind, patch[order], order)
-    return vertex_polynomials(table.scheme, table.classes, own_uv, runs)
+    samples, ones = ragged.index_in_row(counts), np.ones_like(distinct)
+    runs = VertexRuns(patch_class[distinct], ones, samples, kind, patch[order], order)
+    return vertex_polynomials(table.scheme, table.classes, uv_of_class, runs)
 
 
-# Bits of positions along lines, and of numbers.
+# Bits of a position along an edge, in parts of `UNIT`, and of a sort key.
 BITS, MOST_BITS = EDGE.bit_length(), 63
 
 
@@ -84,30 +84,30 @@ class AdaptiveGrid:
 
     frames: PatchFrames
     tiles: Tiles  # In the order of the elements
-    side: IndexArray  # (n,) int32: ``m`` times the tile, plus the corner at which its side begins, of each sample
+    side: IndexArray  # (n,) int32: side of each sample: ``m`` times the tile, plus the corner at which the side begins
     along: FloatArray  # (n,) float64: position of each sample along its side, in [0, 1): exact, as a dyadic fraction
-    topology: Topology  # Of the elements; its edges and vertices identify the tessellation's vertices
+    topology: Topology  # Of the elements. Samples on the same edges and vertices of it are one vertex.
     keeps_corner: NDArray[np.bool_] | None  # (t, m) bool or None: as for `stitched`
 
     @classmethod
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
-        """The grid of some tiles; tiles of elements that meet more than once get more segments."""
+        """The grid of tiles. Tiles of two elements that meet more than once get more segments."""
         t, m = frames.topology, frames.domain.corner_count
-        is_pair = (t.vertex_face_count > 0) & (t.vertex_face_count <= 2) & ~t.is_border_vertex
+        is_valence_two = (t.vertex_face_count > 0) & (t.vertex_face_count <= 2) & ~t.is_border_vertex
         # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and both
         # would have the same triangle.
-        keeps = _at_vertices(is_pair, tiles, frames) if is_pair.any() else None
-        has_more = (tiles["depth"] == 0) & frames.meets_twice[t.face[tiles["corner"]]]
-        if keeps is not None:
-            has_more |= keeps.any(axis=1)
-        if has_more.any():
-            # Enough segments that no inner edge joins two points of the sides, but for those that cut corners off.
-            least = np.where(has_more, 3 if m == 3 else 2, 1).astype(np.int32)
+        keeps_corner = _at_vertices(is_valence_two, tiles, frames) if is_valence_two.any() else None
+        needs_inner = (tiles["depth"] == 0) & frames.meets_twice[t.face[tiles["corner"]]]
+        if keeps_corner is not None:
+            needs_inner |= keeps_corner.any(axis=1)
+        if needs_inner.any():
+            # With inner samples, the only inner edges that join two points of the sides cut off a corner.
+            least = np.where(needs_inner, 3 if m == 3 else 2, 1).astype(np.int32)
             tiles = tiles.copy()
             tiles["rates"] = np.maximum(tiles["rates"], least[:, None])
         else:
-            keeps = None
-        return cls(frames, tiles, *_samples_on_sides(tiles, frames), t, keeps)
+            keeps_corner = None
+        return cls(frames, tiles, *_samples_on_sides(tiles, frames), t, keeps_corner)
 
     def cut(self, topology: Topology) -> AdaptiveGrid:
         """See `Grid.cut`."""
@@ -115,26 +115,29 @@ class AdaptiveGrid:
 
     def vertices_of(self, other: AdaptiveGrid) -> IntArray:
         """See `Grid.vertices_of`."""
-        found = np.empty(self.vertex_count, dtype=np.int64)
-        found[self._sample_vertices()] = other._sample_vertices()
-        return found
+        vertices = np.empty(self.vertex_count, dtype=np.int64)
+        vertices[self._sample_vertices()] = other._sample_vertices()
+        return vertices
 
     @property
     def _corner_count(self) -> int:
         return self.frames.domain.corner_count
 
     def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Numbers of the samples on sides, and the first of each number; of the same points, as `PatchFrames.names`."""
-        name, at = np.empty(len(self.side), dtype=np.int64), np.empty((2, len(self.side)), dtype=np.int32)
+        """Number the samples on sides, equal points alike, as `PatchFrames.names` identifies them.
+
+        Returns the number of each sample, and the first sample of each number.
+        """
+        name, position = np.empty(len(self.side), dtype=np.int64), np.empty((2, len(self.side)), dtype=np.int32)
         corners = self._corners()
         for block in chunks_of(len(self.side)):
             side = self.side[block]
             points = self._on_sides(corners, side, self.along[block]).astype(np.int32)
             corner = self.tiles["corner"][side // self._corner_count]
-            name[block], at[:, block] = self.frames.names(corner, points, edge, vertex)
+            name[block], position[:, block] = self.frames.names(corner, points, edge, vertex)
         del corners
-        shift = _unused_bits(at)
-        (x, y), bits = at >> shift, BITS - shift
+        shift = _unused_bits(position)
+        (x, y), bits = position >> shift, BITS - shift
         return _ranked(_joined(name, x.astype(np.int64) << bits | y, 2 * bits))
 
     @cached_property
@@ -151,7 +154,7 @@ class AdaptiveGrid:
         return len(self._numbers[1]) + int(self._inner_counts.sum())
 
     def copies(self) -> IntArray:
-        """`VertexTable.copies`: vertices on the second side of each crease, and those on the first."""
+        """`VertexTable.copies`: vertices on the second side of each crease, and the same vertices on the first side."""
         frames = self.frames
         if not frames.has_copies:
             return np.empty((2, 0), dtype=np.int64)
@@ -162,7 +165,7 @@ class AdaptiveGrid:
         return pairs[:, pairs[0] != pairs[1]]
 
     def _sample_vertices(self) -> IndexArray:
-        """Vertices of all samples, those along sides and then those inside tiles."""
+        """The vertex of each sample, of the samples on sides and then of those inside tiles."""
         number, first = self._numbers
         return np.concatenate([number, np.arange(len(first), self.vertex_count, dtype=np.int32)])
 
@@ -182,38 +185,39 @@ class AdaptiveGrid:
 
     def _triangle_counts(self) -> IntArray:
         """``(t,)`` triangles of each tile, by Euler's formula."""
-        found: IntArray = self._side_counts.sum(axis=1) + 2 * self._inner_counts - 2
-        return found
+        counts: IntArray = self._side_counts.sum(axis=1) + 2 * self._inner_counts - 2
+        return counts
 
     def _tile(self) -> IndexArray:
         """``(n,)`` tile of each triangle, in ascending order."""
         return np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._triangle_counts())
 
     def _sample_triangles(self) -> IndexArray:
-        """``(n, 3)`` samples of each triangle: those along the sides of all tiles come first, then those inside tiles.
+        """``(n, 3)`` samples of each triangle. Samples on the sides of all tiles come first, then those inside tiles.
 
-        Made at each call: few ask for them more than once, and they would take memory as long as the grid lives.
+        Computed at each call: the result is rarely needed twice, and would take memory as long as the grid exists.
         """
         m = self._corner_count
         on_sides = ragged.offsets(self._side_counts.sum(axis=1))
         inside, begin = (ragged.offsets(counts) for counts in (self._inner_counts, self._triangle_counts()))
-        found = np.empty((int(begin[-1]), 3), dtype=np.int32)
-        for own in chunks_of(len(self.tiles), m):
-            along = self.along[on_sides[own.start] : on_sides[own.stop]]
-            keeps = None if self.keeps_corner is None else self.keeps_corner[own]
-            triangles = stitched(self.tiles["rates"][own], SideSamples(self._side_counts[own], along), keeps)
-            is_inner = triangles >= len(along)
-            first_inner = len(self.side) - len(along) + inside[own.start]
-            triangles += np.where(is_inner, first_inner, on_sides[own.start]).astype(np.int32)
-            found[begin[own.start] : begin[own.stop]] = triangles
-        return found
+        triangles = np.empty((int(begin[-1]), 3), dtype=np.int32)
+        for block in chunks_of(len(self.tiles), m):
+            along = self.along[on_sides[block.start] : on_sides[block.stop]]
+            keeps_corner = None if self.keeps_corner is None else self.keeps_corner[block]
+            sides = SideSamples(self._side_counts[block], along)
+            block_triangles = stitched(self.tiles["rates"][block], sides, keeps_corner)
+            is_inner = block_triangles >= len(along)
+            first_inner = len(self.side) - len(along) + inside[block.start]
+            block_triangles += np.where(is_inner, first_inner, on_sides[block.start]).astype(np.int32)
+            triangles[begin[block.start] : begin[block.stop]] = block_triangles
+        return triangles
 
     def _corners(self) -> IndexArray:
-        """``(2, m t)`` where the sides of all tiles begin, in their patches, in parts of `UNIT`."""
+        """``(2, m t)`` points at which the sides of all tiles begin, in their patches, in parts of `UNIT`."""
         return corner_points(self.tiles, self.frames.domain).reshape(2, -1)
 
     def _on_sides(self, corners: IndexArray, side: IntArray, along: FloatArray) -> FloatArray:
-        """``(2, n)`` points on sides of tiles with these `_corners`, in their patches, in parts of `UNIT`."""
+        """``(2, n)`` points at positions along sides, in their patches, in parts of `UNIT`; for `_corners`."""
         m = self._corner_count
         begin, end = corners[:, side], corners[:, side + np.where(side % m == m - 1, 1 - m, 1)]
         return begin + (end - begin) * along
@@ -226,13 +230,13 @@ class AdaptiveGrid:
 
     def _in_patch(self, tile: IntArray, uv: FloatArray) -> FloatArray:
         """``(2, n)`` parameters in patches, in parts of `UNIT`, from parameters in tiles."""
-        found = np.where(self.tiles["is_flipped"][tile], 1 - uv, uv)
-        found += self.tiles["origin"][tile].T
-        found *= sizes(self.tiles)[tile]
-        return found
+        parameters = np.where(self.tiles["is_flipped"][tile], 1 - uv, uv)
+        parameters += self.tiles["origin"][tile].T
+        parameters *= sizes(self.tiles)[tile]
+        return parameters
 
     def vertex_parameters(self) -> tuple[IndexArray, FloatArray]:
-        """Parameters of vertices, each in one of its tiles.
+        """Locate each vertex in one of its tiles.
 
         Returns
         -------
@@ -248,22 +252,22 @@ class AdaptiveGrid:
         return tile, np.concatenate([on_sides, parameters], axis=1)
 
     def _seen(self, tile: IntArray, turn: IntArray, parameters: FloatArray) -> FloatArray:
-        """``(n, 2)`` parameters in elements, seen from the corner after so many turns; of patches that are whole."""
+        """``(n, 2)`` parameters in elements, starting ``turn`` corners after the patch's first one."""
         uv: FloatArray = np.ascontiguousarray(parameters.T) / UNIT
         domain = self.frames.domain
         for corner in range(1, domain.corner_count):
-            at = np.flatnonzero(turn == corner)
-            if len(at):
-                uv[at] = domain.rotation(corner).inverse()(uv[at])
+            turned = np.flatnonzero(turn == corner)
+            if len(turned):
+                uv[turned] = domain.rotation(corner).inverse()(uv[turned])
         return uv * self.frames.scale[self.frames.topology.face[self.tiles["corner"][tile]]][:, None]
 
     def _nearest_corner(self, tile: IntArray, parameters: FloatArray) -> tuple[IntArray, IntArray]:
-        """The turn to the nearest corner of each patch, and the half-edge that begins there."""
+        """Find the nearest corner of each patch. Returns its turn, see `_seen`, and the half-edge that begins there."""
         t, domain = self.frames.topology, self.frames.domain
         is_whole = self.frames.is_whole[t.face[self.tiles["corner"][tile]]]
         corners = domain.corners * UNIT
-        far = [np.maximum(*np.abs(parameters - corner[:, None])) for corner in corners]
-        turn = np.where(is_whole, np.argmin(far, axis=0), 0)
+        distances = [np.maximum(*np.abs(parameters - corner[:, None])) for corner in corners]
+        turn = np.where(is_whole, np.argmin(distances, axis=0), 0)
         corner = self.tiles["corner"][tile]
         for step in range(1, domain.corner_count):
             corner = np.where(turn >= step, t.next[corner], corner)
@@ -271,14 +275,14 @@ class AdaptiveGrid:
 
     @property
     def triangle_locations(self) -> tuple[IntArray, FloatArray]:
-        """Locations of the corners of triangles; computed at each call, as kernels keep them.
+        """Locate the corners of triangles; computed at each call, as kernels keep the result.
 
         Returns
         -------
         corner : (m,) int32
             Corner of an element, a half-edge of `PatchTable.elements`.
         uv : (m, 3, 2) float64
-            Parameters in the element, seen from there.
+            Parameters in the element, starting at that corner.
         """
         tile, triangles = self._tile(), self._sample_triangles()
         middle = self._in_patch(tile, np.full((2, len(tile)), 1 / self._corner_count))
@@ -297,7 +301,7 @@ class AdaptiveGrid:
 
 
 def _at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) -> NDArray[np.bool_]:
-    """``(t, m)`` whether corners of tiles lie at vertices that are marked."""
+    """``(t, m)`` whether corners of tiles lie at marked vertices."""
     t, m = frames.topology, frames.domain.corner_count
     points = corner_points(tiles, frames.domain).reshape(2, -1)
     name, _ = frames.names(np.repeat(tiles["corner"], m), points, t.edge, t.face_vertices)
@@ -307,48 +311,51 @@ def _at_vertices(marked: NDArray[np.bool_], tiles: Tiles, frames: PatchFrames) -
 
 
 def _samples_on_sides(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, FloatArray]:
-    """Samples on the sides of all tiles: `AdaptiveGrid.side` and `AdaptiveGrid.along`."""
-    line, begin, way = _lines(tiles, frames)
-    wanted = np.maximum(
+    """Choose the samples on the sides of all tiles. Returns `AdaptiveGrid.side` and `AdaptiveGrid.along`."""
+    line, begin, length = _lines(tiles, frames)
+    needed = np.maximum(
         tiles["rates"][:, [0, 1, 0, 1] if frames.domain.corner_count == 4 else [0, 0, 0]], tiles["sides"]
     )
-    # Powers of two, rounded up.
-    counts = 1 << np.frexp(wanted.ravel() - 0.5)[1]
-    step = way // counts
+    # Rounded up to powers of two.
+    counts = 1 << np.frexp(needed.ravel() - 0.5)[1]
+    step = length // counts
     shift = _unused_bits(begin | step)
     keys = np.left_shift(line, BITS - shift, dtype=np.int64)
     keys |= begin >> shift
     points = ragged.index_in_row(counts + 1)
     points *= np.repeat(step >> shift, counts + 1)
     points += np.repeat(keys, counts + 1)
-    del line, begin, step, wanted
-    # Where the samples of each side begin and end in those of its line.
+    del line, begin, step, needed
+    # First and last sample of each side among the sorted samples of all lines.
     number, first = _ranked(points)
     end = np.cumsum(counts + 1, dtype=np.int32) - 1
     begin, end, points = number[end - counts], number[end], points[first]
     del number, first
     counts = np.abs(end - begin)
     side = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-    at = ragged.index_in_row(counts)
-    at *= np.sign(way)[side]
-    at += begin[side]
-    along = points[at]
+    sample = ragged.index_in_row(counts)
+    sample *= np.sign(length)[side]
+    sample += begin[side]
+    along = points[sample]
     along -= keys[side]
-    del at, keys, points
-    return side, along / (way >> shift)[side]
+    del sample, keys, points
+    return side, along / (length >> shift)[side]
 
 
 def _unused_bits(positions: IndexArray) -> int:
-    """How many of the lowest bits are zero in all positions: most tessellations use few."""
+    """Number of lowest bits that are zero in all positions: most tessellations use few of the bits."""
     used = int(np.bitwise_or.reduce(positions, axis=None)) | EDGE
     return (used & -used).bit_length() - 1
 
 
 def _lines(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, IndexArray, IndexArray]:
-    """On which lines the sides of tiles lie: their numbers, the positions where sides begin, and how far they lead."""
+    """Find the lines on which the sides of tiles lie, numbered such that equal lines have equal numbers.
+
+    Returns the line of each side, the position on it at which the side begins, and the side's signed length.
+    """
     m = frames.domain.corner_count
     name = np.empty(m * len(tiles), dtype=np.int64)
-    level, begin, way = np.empty((3, m * len(tiles)), dtype=np.int32)
+    level, begin, length = np.empty((3, m * len(tiles)), dtype=np.int32)
     for block in chunks_of(len(tiles), m):
         corners = corner_points(tiles[block], frames.domain)
         quarter = (np.roll(corners, -1, axis=2) - corners) // 4
@@ -356,19 +363,19 @@ def _lines(tiles: Tiles, frames: PatchFrames) -> tuple[IndexArray, IndexArray, I
         axis = np.tile([0, 1, 2] if m == 3 else [0, 1, 0, 1], len(corners[0]))
         for steps in (1, 2):
             names, (x, y) = frames.names(corner, (corners + steps * quarter).reshape(2, -1), frames.edge, frames.vertex)
-            # Lines inside are along u, along v or, in triangles, along the diagonal. Others have a name of their own.
+            # Lines inside a patch run along u, along v or, in triangles, along the diagonal. Other lines have names.
             axis = np.where(names >= frames.first_inside, axis, 0)
             positions.append(np.where(axis == 0, x, y))
-        own = slice(m * block.start, m * block.stop)
-        name[own], way[own] = 3 * names + axis, 4 * (positions[1] - positions[0])
-        begin[own] = 2 * positions[0] - positions[1]
-        level[own] = np.select([axis == 0, axis == 2], [y, x], x + y if m == 3 else x)
+        block_sides = slice(m * block.start, m * block.stop)
+        name[block_sides], length[block_sides] = 3 * names + axis, 4 * (positions[1] - positions[0])
+        begin[block_sides] = 2 * positions[0] - positions[1]
+        level[block_sides] = np.select([axis == 0, axis == 2], [y, x], x + y if m == 3 else x)
     shift = _unused_bits(level)
-    return _ranked(_joined(name, level >> shift, BITS - shift))[0], begin, way
+    return _ranked(_joined(name, level >> shift, BITS - shift))[0], begin, length
 
 
 def _ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
-    """Number integers from 0 on, in their order and equal ones alike; and the first index of each number."""
+    """Rank integers from 0 on, equal ones alike. Returns the ranks, and the first index of each rank."""
     order, begins = ragged.sorted_order(keys)
     number = np.empty(len(keys), dtype=np.int32)
     number[order] = np.cumsum(begins, dtype=np.int32) - 1
@@ -376,8 +383,8 @@ def _ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
 
 
 def _joined(high: IntArray, low: IntArray, bits: int) -> NDArray[np.int64]:
-    """``(n,)`` integers ordered and equal as pairs are; `low` has `bits` bits."""
+    """``(n,)`` sort keys of pairs of integers, of which ``low`` has ``bits`` bits."""
     if int(high.max(initial=0)).bit_length() + bits > MOST_BITS:
-        # There are fewer of them than numbers of 31 bits.
+        # Ranks need 31 bits at most.
         high, low, bits = _ranked(high)[0], _ranked(low)[0], 31
     return high.astype(np.int64) << bits | low

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 class AttributeLayout:
     """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values."""
 
-    # (n,) int64 or None: for each split vertex, the vertex of the `VertexTable` whose position and normal it has.
-    # None without seams, when both tables have the same vertices.
+    # (n,) int64 or None: the vertex of the `VertexTable` whose position and normal each split vertex has. None without
+    # seams, when both tables have the same vertices.
     surface_vertex: IntArray | None
     find_triangles: Callable[[], NDArray[np.uint32]]  # Computes `triangles` on demand
-    # Each computes the values at the vertices, ``(n, k)`` float64, of a channel of one layout
+    # For each channel layout, the function that evaluates a channel at the vertices: ``(n, k)`` float64
     evaluate: tuple[Callable[[Channel], FloatArray], ...] = ()
-    # Finds the locations of split vertices, each on its own side of seams, as `Grid.locations`. None if both tables
-    # have the same vertices.
+    # Computes the locations of split vertices, on the vertices' sides of seams, as `Grid.locations`. None without
+    # seams.
     locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
 
     @cached_property
@@ -47,11 +47,11 @@ _LAYOUTS: Shared[AttributeLayout] = Shared()
 
 @dataclass(frozen=True, eq=False)
 class AttributeTable:
-    """A tessellation whose vertices have attributes."""
+    """Attributes of a tessellation, evaluated at its vertices."""
 
-    layout: AttributeLayout  # Tables of the same tessellation, with attributes of the same layouts, share it
-    # dict of str to (n, k) float64: at the vertices, by the name of the attribute; read-only, as tables of the same
-    # values share them
+    layout: AttributeLayout  # Shared by tables of the same tessellation and the same channel layouts
+    # dict of str to (n, k) float64: values at the vertices by the name of the attribute; read-only, as tables with
+    # equal values share them
     values: Mapping[str, FloatArray]
 
     @classmethod
@@ -108,7 +108,7 @@ _VALUES: Shared[FloatArray] = Shared()
 def _layout(
     table: VertexTable, patches: PatchTable, control_of_vertex: IntArray, layouts: tuple[ChannelLayout, ...]
 ) -> AttributeLayout:
-    """Attributes of some layouts at the vertices of a tessellation."""
+    """The layout of attributes with the given channel layouts at the vertices of a tessellation."""
     if not layouts:
         return AttributeLayout(None, lambda: table.triangles)
     from ..patches import LinearChannel
@@ -131,9 +131,9 @@ def _layout(
             return lambda channel: _chosen(_on_surface(table, control_of_vertex, channel), surface_vertex)
         if not isinstance(table.grid, UniformGrid):
             return lambda channel: channel.evaluate(*locate())
-        own = uniform_table(layout.patches, table.grid.rate)
-        vertices = grid.vertices_of(own.grid)
-        return lambda channel: own.interpolated(channel.values[channel.value_index])[vertices]
+        channel_table = uniform_table(layout.patches, table.grid.rate)
+        vertices = grid.vertices_of(channel_table.grid)
+        return lambda channel: channel_table.interpolated(channel.values[channel.value_index])[vertices]
 
     triangles = grid.triangles if seams else lambda: table.triangles
     return AttributeLayout(surface_vertex, triangles, tuple(map(evaluate, layouts)), locate if seams else None)
@@ -144,9 +144,9 @@ def _chosen(values: FloatArray, rows: IntArray | None) -> FloatArray:
 
 
 def _on_surface(table: VertexTable, control_of_vertex: IntArray, channel: Channel) -> FloatArray:
-    """Values at the table's vertices, of a channel without seams that is subdivided on the surface's own mesh."""
-    at_control_points = np.zeros((table.control_count, channel.values.shape[1]))
-    at_control_points[control_of_vertex] = channel.values[channel.value_index]
-    found = table.interpolated(at_control_points)
-    found[table.copies[0]] = found[table.copies[1]]
-    return found
+    """Values at the table's vertices of a channel without seams that is subdivided on the surface's mesh."""
+    control_values = np.zeros((table.control_count, channel.values.shape[1]))
+    control_values[control_of_vertex] = channel.values[channel.value_index]
+    vertex_values = table.interpolated(control_values)
+    vertex_values[table.copies[0]] = vertex_values[table.copies[1]]
+    return vertex_values

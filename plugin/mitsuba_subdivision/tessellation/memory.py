@@ -14,20 +14,19 @@ if TYPE_CHECKING:
     from ..patches import PatchTable
     from .uniform_grid import UniformGrid
 
-# What a tessellation takes at once, as measured: bytes for each vertex, with its point, normal and two triangles; bytes
-# for each weight of a point and two tangents; and how many copies of the largest class's weights there are while these
-# are made.
+# Measured peak memory of a uniform tessellation: bytes per vertex, with its point, normal and two triangles; bytes per
+# weight of a point and two tangents; and temporary copies of the weights of the largest class.
 VERTEX_BYTES = 90
 WEIGHT_BYTES = 3 * 8
 LARGEST_CLASS_COPIES = 3
-# Bytes for each triangle of an adaptive tessellation, with its vertices and their weights, during its construction.
+# Peak bytes per triangle of an adaptive tessellation, with its vertices and their weights.
 ADAPTIVE_TRIANGLE_BYTES = 400
-# Bytes that are assumed to be available: a query takes half as long as the weights of a small cage.
+# Bytes that are assumed to be available, because a query takes half as long as computing a small cage's weights.
 SMALL = 1 << 24
 
 
 def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
-    """Estimate of a tessellation's peak memory."""
+    """Estimate of a uniform tessellation's peak memory."""
     rate, refined = grid.rate, patches.refined
     in_whole = (rate + 1) ** 2 if patches.scheme.domain.corner_count == 4 else (rate + 1) * (rate + 2) // 2
     # A patch at a corner of an element has half the segments along each side.
@@ -40,7 +39,7 @@ def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
 
 
 def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
-    """Check that a tessellation fits into memory. Raises MemoryError if not; says which rate would."""
+    """Check that a uniform tessellation fits into memory. Raises a MemoryError that names a rate that would."""
     needed = bytes_of_tessellation(patches, grid)
     available = exceeded_limit(needed)
     if available is None:
@@ -66,19 +65,20 @@ def require_memory_for_triangles(count: int) -> None:
 
 
 def exceeded_limit(needed: float, most: int | None = None) -> int | None:
-    """The bytes that are available, or the most to be used, if these are fewer than are needed; else None."""
+    """The smaller of the available bytes and ``most``, if less than ``needed``; else None."""
     if needed <= SMALL:
         return None
-    limit = min((each for each in (available_memory(), most) if each is not None), default=None)
+    limits = [limit for limit in (available_memory(), most) if limit is not None]
+    limit = min(limits, default=None)
     return None if limit is None or needed <= limit else limit
 
 
 def available_memory(
     root: str | Path = "/",  # Parent of the folders `proc` and `sys`
 ) -> int | None:
-    """Bytes that the process can still allocate: the minimum over the machine, its control groups and its own limit.
+    """Bytes that the process can still allocate: the least of the machine's, its control groups' and its own limit.
 
-    Returns int or None: None if the system does not report it.
+    None if the system does not report it.
     """
     from pathlib import Path
 
@@ -88,9 +88,9 @@ def available_memory(
 
 def _of_machine(root: Path) -> Iterator[int]:
     lines = _lines(root / "proc/meminfo")
-    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    available = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
     try:
-        yield found[0] if found else os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        yield available[0] if available else os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return
 
@@ -106,14 +106,15 @@ def _of_groups(root: Path) -> Iterator[int]:
             usage, cache = "memory.usage_in_bytes", "total_inactive_file"
         else:
             continue
-        # In a container, the path may be one outside of it.
-        own = folder / path.lstrip("/")
-        for group in (own, *own.parents):
+        # In a container, the path may be that of the host. Its parents up to the folder are tried as well.
+        innermost = folder / path.lstrip("/")
+        for group in (innermost, *innermost.parents):
             allowed, used = (_number(group / name) for name in (limit, usage))
             if allowed is not None and used is not None:
-                # Files that were read are dropped when memory is needed.
-                dropped = [int(v.split()[1]) for v in _lines(group / "memory.stat") if v.startswith(f"{cache} ")]
-                yield allowed - used + sum(dropped)
+                # The file cache counts as used, but is dropped when memory is needed.
+                stat = _lines(group / "memory.stat")
+                cached = [int(line.split()[1]) for line in stat if line.startswith(f"{cache} ")]
+                yield allowed - used + sum(cached)
             if group == folder:
                 break
 
@@ -136,6 +137,6 @@ def _lines(path: Path) -> list[str]:
 
 
 def _number(path: Path) -> int | None:
-    """Number in a file; None if there is no such file, or no limit."""
+    """The number in a file; None if there is no such file, or if it contains no number."""
     lines = _lines(path)
     return int(lines[0]) if lines and lines[0].isdigit() else None

@@ -18,16 +18,16 @@ class QuadGrid(UniformGrid):
     """Numbering of a tessellation over unit squares, see `UniformGrid`.
 
     A quadrilateral is one grid of ``rate x rate`` cells. Any other polygon has a grid at each of its corners, which
-    reaches half way along the corner's two edges. For an even rate these grids meet along spokes, which run from the
-    middles of the edges to the polygon's centre. For an odd rate they do not meet: strips of triangles join them, and a
-    fan of triangles closes the middle.
+    reaches half way along the corner's two edges. For an even rate, these grids meet along spokes, which run from the
+    midpoints of the edges to the polygon's centre. For an odd rate, strips of triangles join them, and a fan of
+    triangles closes the middle.
     """
 
     whole_size = 4
 
     @property
     def half(self) -> int:
-        """Whole cells from a corner of a polygon to the middle of its edges."""
+        """Whole cells from a corner of a polygon to the midpoints of its edges."""
         return self.rate // 2
 
     @property
@@ -38,12 +38,12 @@ class QuadGrid(UniformGrid):
     def _inner_counts(self) -> IntArray:
         """``(n_f,)`` vertices strictly inside each face."""
         sizes = self.topology.face_sizes
-        # With rate 1, the grids of a polygon's corners have no samples of their own, and only the centre is left.
+        # At rate 1, the grids of a polygon's corners have no inner samples, and only the centre is left.
         per_corner = self.half**2 if self.is_odd else self.half * (self.half - 1)
         return np.where(sizes == 4, (self.rate - 1) ** 2, sizes * per_corner + (sizes > 0))
 
     def _inner_start(self, faces: IntArray) -> IntArray:
-        """Number of the first vertex inside some faces."""
+        """Number of the first vertex inside each of the faces."""
         if self.topology.common_size == 4:
             return self.inner_begin + faces.astype(np.int64) * (self.rate - 1) ** 2
         return self.inner_begin + self._inner_counts_before[faces]
@@ -61,15 +61,16 @@ class QuadGrid(UniformGrid):
     def quad_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
         t, r = self.topology, self.rate
-        # Faces come last here, so that NumPy's loops over them are long.
+        # Faces are the last axis, so that NumPy's inner loops are long.
         numbers = np.empty((r + 1, r + 1, len(faces)), dtype=np.uint32)
         inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
         np.add(inner[..., None], self._inner_start(faces).astype(np.uint32), out=numbers[1:-1, 1:-1])
         corners = np.add.outer(np.arange(4, dtype=np.int32), t.face_offsets[faces])
         # Each side ends where the next one begins.
         sides = self.along(corners, np.arange(r)).transpose(0, 2, 1)
-        for side, place in zip(sides, (numbers[0], numbers[:, -1], numbers[-1, ::-1], numbers[::-1, 0]), strict=True):
-            place[:-1] = side
+        targets = numbers[0], numbers[:, -1], numbers[-1, ::-1], numbers[::-1, 0]
+        for side, target in zip(sides, targets, strict=True):
+            target[:-1] = side
         return np.ascontiguousarray(numbers.reshape(-1, len(faces)).T).reshape(-1, r + 1, r + 1)
 
     def corner_vertices(self, corners: IntArray) -> NDArray[np.uint32]:
@@ -77,12 +78,12 @@ class QuadGrid(UniformGrid):
         t, h = self.topology, self.half
         numbers = np.empty((len(corners), h + 1, h + 1), dtype=np.uint32)
         steps = np.arange(h + 1)
-        own = self._corner_start(corners)
+        inner = self._corner_start(corners)
         if self.is_odd:
-            numbers[:, 1:, 1:] = own[:, None, None] + np.arange(h**2).reshape(h, h)
+            numbers[:, 1:, 1:] = inner[:, None, None] + np.arange(h**2).reshape(h, h)
         else:
-            numbers[:, 1:-1, 1:-1] = own[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
-            # Two corners share a spoke.
+            numbers[:, 1:-1, 1:-1] = inner[:, None, None] + np.arange((h - 1) ** 2).reshape(h - 1, h - 1)
+            # Two adjacent corners share a spoke.
             numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(h - 1)
             numbers[:, -1, 1:-1] = self._spoke_start(t.prev[corners])[:, None] + np.arange(h - 1)
             numbers[:, -1, -1] = self.centre_vertices(corners)
@@ -95,15 +96,15 @@ class QuadGrid(UniformGrid):
         return self._inner_start(self.topology.face[corners])
 
     def _corner_start(self, corners: IntArray) -> IntArray:
-        """First vertex inside the grid of each polygon corner; the polygon's centre comes before all of these."""
+        """First vertex inside the grid of each polygon corner. The polygon's centre comes before all grids."""
         t, size = self.topology, self.half if self.is_odd else self.half - 1
         return self.centre_vertices(corners) + 1 + (corners - t.face_offsets[t.face[corners]]) * size**2
 
     def _spoke_start(self, corners: IntArray) -> IntArray:
-        """First vertex inside the spoke from the middle of the edge at each polygon corner, for an even rate."""
+        """First vertex inside the spoke from the midpoint of the edge at each polygon corner, for an even rate."""
         t, inside = self.topology, self.half - 1
         face = t.face[corners]
-        # After the centre and all grids.
+        # Spokes come after the centre and all grids.
         return self._inner_start(face) + 1 + t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
 
     @cached_property
@@ -122,55 +123,55 @@ class QuadGrid(UniformGrid):
         t = self.topology
         counts = self.triangle_counts
         start = ragged.starts(counts)
-        found = np.empty((int(counts.sum()), 3), dtype=np.uint32)
+        triangles = np.empty((int(counts.sum()), 3), dtype=np.uint32)
         cells = _cut_cells(self.rate + 1, self.rate + 1)
         for faces in slices_of(np.flatnonzero(t.face_sizes == 4), self.rate**2):
             numbers = self.quad_vertices(faces).reshape(len(faces), -1)
             if faces[-1] - faces[0] + 1 == len(faces):
-                # Neighbours in memory, as on a cage of quadrilaterals only.
-                target = found[start[faces[0]] :][: len(faces) * len(cells)].reshape(len(faces), -1)
+                # The faces' triangles are contiguous in memory, as on a cage of quadrilaterals only.
+                target = triangles[start[faces[0]] :][: len(faces) * len(cells)].reshape(len(faces), -1)
                 np.take(numbers, cells.ravel(), axis=1, out=target, mode="clip")
             else:
-                found[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
+                triangles[start[faces][:, None] + np.arange(len(cells))] = numbers[:, cells]
         for corners in slices_of(t.half_edges_of(t.face_sizes != 4), self.half**2 + 1):
             face = t.face[corners]
-            at = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
-            found[at[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
-        return found
+            first = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
+            triangles[first[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
+        return triangles
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
         """Parameters at the corners of triangles, see `UniformGrid.triangle_parameters`."""
         count, whole = self.half + 1, _lattice(self.rate + 1, 1, self.rate)
         grid = _lattice(count, 2, self.rate)
-        found = [grid[_cut_cells(count, count)]]
+        parts = [grid[_cut_cells(count, count)]]
         if self.is_odd:
-            # Seen from here, the last row of the next corner's grid is a column beyond the spoke between them.
-            along = grid.reshape(count, count, 2)
-            beyond = np.stack([2 - along[-1, :, 1], along[-1, :, 0]], axis=1)
-            strip = np.stack([along[:, -1], beyond], axis=1).reshape(-1, 2)
-            found += [strip[_cut_cells(count, 2)], np.stack([along[-1, -1], beyond[-1], np.ones(2)])[None]]
-        return whole[_cut_cells(self.rate + 1, self.rate + 1)], np.concatenate(found)
+            # In this corner's parameters, the last row of the next corner's grid is a column beyond u = 1.
+            rows = grid.reshape(count, count, 2)
+            beyond = np.stack([2 - rows[-1, :, 1], rows[-1, :, 0]], axis=1)
+            strip = np.stack([rows[:, -1], beyond], axis=1).reshape(-1, 2)
+            parts += [strip[_cut_cells(count, 2)], np.stack([rows[-1, -1], beyond[-1], np.ones(2)])[None]]
+        return whole[_cut_cells(self.rate + 1, self.rate + 1)], np.concatenate(parts)
 
     def _triangles_of_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         """Triangles of each polygon corner: ``(e, n, 3)``."""
         grids = self.corner_vertices(corners)
         count = self.half + 1
-        found = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
+        parts = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
         if self.is_odd:
-            # The next corner's grid meets this one's across the middle of their common edge.
+            # A strip across the midpoint of the common edge joins the next corner's grid.
             following = self.corner_vertices(self.topology.next[corners])[:, -1, :]
             strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
             centre = self.centre_vertices(corners).astype(np.uint32)
-            found.append(strip[:, _cut_cells(count, 2)])
-            found.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
-        return np.concatenate(found, axis=1)
+            parts.append(strip[:, _cut_cells(count, 2)])
+            parts.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
+        return np.concatenate(parts, axis=1)
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` face of each triangle."""
         counts = self.triangle_counts
-        # One count for all repeats faster than one for each.
-        equal = counts[0] if (counts == counts[0]).all() else counts
-        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), equal)
+        # `repeat` is faster with a scalar.
+        repeats = counts[0] if (counts == counts[0]).all() else counts
+        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
 
     def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
         """Grids of patches, see `UniformGrid.layout`: one for a quadrilateral, one at each corner of others."""
@@ -185,19 +186,19 @@ class QuadGrid(UniformGrid):
         parts = []
         face = t.face[corners]
         turns = corners - t.face_offsets[face]
-        # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
+        # Inner vertices are numbered from the face's first corner, whichever corner the patch begins at.
         for turn in range(4):
             patches = np.flatnonzero(turns == turn)
             if not len(patches):
                 continue
-            own = face[patches]
+            faces = face[patches]
             turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
-            parts.append(GridPart.of(turned, patches, self._inner_start(own), t.face_offsets[own], uv[inner]))
+            parts.append(GridPart.of(turned, patches, self._inner_start(faces), t.face_offsets[faces], uv[inner]))
         sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
         return uv, parts + self.side_parts(corners, sides, uv[:count, 0])
 
     def corner_layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
-        """Grids of patches that lie at single corners of elements: of quadrilaterals, too, but then of no others.
+        """Grids of patches that lie at single corners of elements, which are all quadrilaterals or all not.
 
         A patch reaches half way along its corner's two edges, and to the element's centre, which is (1, 1).
         """
@@ -208,13 +209,13 @@ class QuadGrid(UniformGrid):
         owns_previous = np.flatnonzero(self.owns_edge[previous])
         owns_vertex = np.flatnonzero(self.owns_vertex[corners])
 
-        # The element's centre is one sample more, after the grid. For an even rate some samples of the grid belong to
-        # another part: its last row to the preceding corner's patch, with the middle of the preceding edge, and the
-        # last sample of all is the centre itself.
+        # The element's centre is an additional sample after the grid. For an even rate, some samples of the grid are
+        # evaluated otherwise: the last row, with the midpoint of the preceding edge, by the preceding corner's patch,
+        # and the last sample of the grid is the centre itself.
         uv = np.concatenate([_lattice(count, 2, self.rate), [[1.0, 1.0]]])
         index = np.arange(count**2).reshape(count, count)
         edge = index[0, 1:]
-        # Along the preceding edge, numbers rise towards the corner.
+        # Along the preceding edge, vertex numbers increase towards the corner.
         back = index[self._inside, 0][::-1]
         before_corner = self.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
         parts = [
@@ -224,28 +225,28 @@ class QuadGrid(UniformGrid):
         ]
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
-            # The patch's parameters reach 1 at the centre, those of the quadrilateral 1/2.
+            # The centre has parameters of 1 in a patch, and of 1/2 in the quadrilateral.
             parts = [replace(part, uv=part.uv / 2) for part in parts]
         return uv, parts
 
     @property
     def _inside(self) -> slice:
-        """Steps from a corner that are neither on the element's edge nor, for an even rate, where patches meet."""
+        """Steps from a corner without those on the element's edge and, for an even rate, on the border of patches."""
         return slice(1, None) if self.is_odd else slice(1, -1)
 
     def _parts_inside_polygons(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
         """Parts inside polygons, of patches at their corners."""
         t, count = self.topology, self.half + 1
         index = np.arange(count**2).reshape(count, count)
-        every = np.arange(len(corners))
-        is_first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
+        patches = np.arange(len(corners))
+        first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
         grid, spoke, centre = index[self._inside, self._inside].ravel(), index[self._inside, -1], np.array([count**2])
         parts = [
-            GridPart.of(grid, every, self._corner_start(corners), corners, uv[grid]),
-            GridPart.of(centre, is_first, self.centre_vertices(corners[is_first]), corners[is_first], uv[centre]),
+            GridPart.of(grid, patches, self._corner_start(corners), corners, uv[grid]),
+            GridPart.of(centre, first, self.centre_vertices(corners[first]), corners[first], uv[centre]),
         ]
         if not self.is_odd:
-            parts.append(GridPart.of(spoke, every, self._spoke_start(corners), corners, uv[spoke]))
+            parts.append(GridPart.of(spoke, patches, self._spoke_start(corners), corners, uv[spoke]))
         return parts
 
     def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
@@ -254,9 +255,9 @@ class QuadGrid(UniformGrid):
         face = t.face[corners]
         turns = corners - t.face_offsets[face]
         index = np.arange((self.half + 1) ** 2).reshape(self.half + 1, self.half + 1)
-        # A patch evaluates the samples that are nearer to its corner than to others and, for an even rate, those on its
-        # spoke; the first corner's patch evaluates the centre. Numbers run along the rows of the quadrilateral, which
-        # are columns of the patches at every other corner: each row is a part.
+        # A patch evaluates the samples that are nearest to its corner and, for an even rate, those on its spoke; the
+        # first corner's patch evaluates the centre. Vertices are numbered along the rows of the quadrilateral, which
+        # are columns of the patches at every other corner. Each row is a part.
         samples = index[self._inside, 1:].ravel()
         v, u = np.divmod(samples, self.half + 1)
         parts = []
@@ -277,8 +278,8 @@ class QuadGrid(UniformGrid):
 def _cut_cells(rows: int, columns: int) -> IntArray:
     """Triangles of a grid of ``rows x columns`` vertices, as indices into it: ``(cells * 2, 3)``.
 
-    Diagonals run from the grid's corners, not across them. At a vertex of valence 2, two grids meet in two edges, and
-    both would cut off the same triangle there.
+    Diagonals start at the grid's corners and do not cut these off: two grids that meet in two edges, at a vertex of
+    valence 2, would both have the same triangle there.
     """
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))

@@ -16,7 +16,7 @@ from .uniform_grid import GridPart, UniformGrid, slices_of
 class TriangleGrid(UniformGrid):
     """Numbering of a tessellation over unit triangles, see `UniformGrid`.
 
-    Each element is cut into ``rate^2`` triangles. The samples of an element are ordered by v, then by u.
+    Each element is divided into ``rate^2`` triangles. The samples of an element are ordered by v, then by u.
     """
 
     whole_size = 3
@@ -38,24 +38,24 @@ class TriangleGrid(UniformGrid):
 
     @cached_property
     def _steps(self) -> tuple[IntArray, IntArray]:
-        """Segments along u and along v of each sample: ``(S,)``."""
+        """``(S,)`` grid indices along u and along v of each sample."""
         v, u = np.indices((self.rate + 1, self.rate + 1)).reshape(2, -1)
         inside = u + v <= self.rate
         return u[inside], v[inside]
 
     def _index(self, u: IntArray, v: IntArray) -> IntArray:
-        """The sample after so many steps along u and v."""
+        """The sample with given grid indices along u and v."""
         return v * (self.rate + 1) - v * (v - 1) // 2 + u
 
     @cached_property
     def _sides(self) -> list[IntArray]:
         along = np.arange(self.rate + 1)
-        back, nought = along[::-1], np.zeros_like(along)
-        return [self._index(along, nought), self._index(back, along), self._index(nought, back)]
+        back, zero = along[::-1], np.zeros_like(along)
+        return [self._index(along, zero), self._index(back, along), self._index(zero, back)]
 
     @cached_property
     def _inner(self) -> IntArray:
-        """Samples strictly inside."""
+        """Samples strictly inside an element."""
         u, v = self._steps
         return np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
 
@@ -69,17 +69,17 @@ class TriangleGrid(UniformGrid):
         face = t.face[corners]
         turns = corners - t.face_offsets[face]
         parts = []
-        # Inside, numbers follow the face's own first corner, whichever corner the patch begins at.
+        # Inner vertices are numbered from the face's first corner, whichever corner the patch begins at.
         for turn, (along_u, along_v) in enumerate(((u, v), (v, w), (w, u))):
             patches = np.flatnonzero(turns == turn)
-            own = face[patches]
+            faces = face[patches]
             turned = self._index(along_u, along_v)
-            parts.append(GridPart.of(turned, patches, self._inner_start[own], t.face_offsets[own], uv[self._inner]))
+            parts.append(GridPart.of(turned, patches, self._inner_start[faces], t.face_offsets[faces], uv[self._inner]))
         along = np.arange(self.rate + 1) / self.rate
         return uv, parts + self.side_parts(corners, self._sides, along)
 
     def _vertices(self, faces: IntArray) -> NDArray[np.uint32]:
-        """Vertices of all samples of some faces: ``(e, S)``."""
+        """``(e, S)`` vertices of all samples of the faces."""
         numbers = np.empty((len(faces), len(self._steps[0])), dtype=np.uint32)
         numbers[:, self._inner] = self._inner_start[faces][:, None] + np.arange(self._inner_count)
         steps = np.arange(self.rate + 1)
@@ -89,7 +89,7 @@ class TriangleGrid(UniformGrid):
 
     @cached_property
     def _cells(self) -> IntArray:
-        """Samples at the corners of each triangle: ``(rate^2, 3)``."""
+        """``(rate^2, 3)`` samples at the corners of each triangle."""
         u, v = self._steps
         up = np.flatnonzero(u + v < self.rate)
         down = np.flatnonzero(u + v < self.rate - 1)
@@ -114,13 +114,13 @@ class TriangleGrid(UniformGrid):
         """``(m, 3)`` counter-clockwise from outside, in the order of the faces."""
         cells = self._cells
         elements = np.flatnonzero(self.topology.face_sizes)
-        found = np.empty((len(elements), cells.size), dtype=np.uint32)
+        triangles = np.empty((len(elements), cells.size), dtype=np.uint32)
         begin = 0
         for faces in slices_of(elements, self.rate**2):
-            target = found[begin : begin + len(faces)]
+            target = triangles[begin : begin + len(faces)]
             np.take(self._vertices(faces), cells.ravel(), axis=1, out=target, mode="clip")
             begin += len(faces)
-        return found.reshape(-1, 3)
+        return triangles.reshape(-1, 3)
 
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` face of each triangle."""

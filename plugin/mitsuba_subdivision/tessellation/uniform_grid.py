@@ -1,8 +1,8 @@
-"""Numbering of uniform tessellations: what grids over squares and over triangles have in common.
+"""Numbering of uniform tessellations: the common base of grids over squares and over triangles.
 
-Every edge carries the same samples seen from both sides, and each vertex of the tessellation has one number, so that
-nothing can crack. Corners of the elements are numbered first, then samples inside edges, then samples inside elements.
-The samples inside one edge, and those inside one element, have successive numbers.
+The two elements at an edge share the samples on it, so there are no cracks. Corners of the elements are numbered first,
+then samples inside edges, then samples inside elements. The samples inside an edge, and those inside an element, have
+consecutive numbers.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
-# Triangles are made in slices of about this many vertices, which stay in a core's cache.
+# Vertices per slice when computing triangles, so that arrays stay in a core's cache.
 VERTICES_AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class GridPart:
-    """A part of the grids of some patches, such as their inside or one of their sides.
+    """A part of the grids of several patches, such as their inside or one of their sides.
 
-    In every patch, the samples of the part are successive vertices. Where patches share samples, at corners and along
-    edges, only one of the patches is in the part: the one that evaluates them.
+    In every patch, the samples of the part are consecutive vertices. Where patches share samples, at corners and along
+    edges, only the patch that evaluates them is in the part.
     """
 
     samples: IntArray  # (S,) int64: indices into the parameters of `UniformGrid.layout`
-    patches: IntArray  # (P,) int32: ascending
+    patches: IntArray  # (P,) int32: patches in ascending order
     # (P,) uint32: vertex of the first sample in each patch; sample ``samples[i]`` is vertex ``first_vertex + i``
     first_vertex: IntArray
-    corners: IntArray  # (P,) int32: A corner of each patch's element, not always the one that the patch begins at
-    uv: FloatArray  # (S, 2) float64: the samples' parameters, seen from these corners
+    corners: IntArray  # (P,) int32: a corner of each patch's element, not always the one at which the patch begins
+    uv: FloatArray  # (S, 2) float64: parameters of the samples, starting at `corners`
 
     @classmethod
     def of(
         cls, samples: IntArray, patches: IntArray, first_vertex: IntArray, corners: IntArray, uv: FloatArray
     ) -> GridPart:
-        """A part of these samples, with 32 bits for each of the numbers of which there are as many as patches."""
+        """A part with arrays over patches converted to 32 bits."""
         return cls(
             samples,
             patches.astype(np.int32, copy=False),
@@ -52,7 +52,7 @@ class GridPart:
 
     @property
     def vertices(self) -> IntArray:
-        """``(P, S)`` the vertices of all samples of each patch."""
+        """``(P, S)`` vertices of the samples of each patch."""
         return self.first_vertex.astype(np.int64)[:, None] + np.arange(len(self.samples))
 
 
@@ -64,8 +64,8 @@ class UniformGrid(ABC):
 
     def __init__(
         self,
-        # Of the elements: each face is an element, and a half-edge stands for the corner where it begins.
-        # Faces without corners are left out.
+        # Of the elements: each face with corners is an element, and a half-edge represents the corner at which it
+        # begins
         topology: Topology,
         rate: int,  # Segments on every edge
     ) -> None:
@@ -83,14 +83,15 @@ class UniformGrid(ABC):
 
     @abstractmethod
     def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
-        """Grids of the patches that begin at these corners, numbered from 0; all of them whole elements, or none.
+        """The grids of the patches that begin at ``corners``, which are all whole elements or all not.
 
         Returns
         -------
         uv : (S, 2) float64
-            Parameters of the samples of any patch, seen from the corner that it begins at.
+            Parameters of the samples of a patch, starting at the corner at which the patch begins.
         parts : list of GridPart
-            Together they hold every vertex once that these patches evaluate, and not others.
+            Parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in
+            the order of ``corners``.
         """
 
     @abstractmethod
@@ -100,10 +101,10 @@ class UniformGrid(ABC):
         Returns
         -------
         whole : (T, 3, 2) float64
-            Of an element that fits the domain, seen from its first corner.
+            Triangles of a whole element; parameters start at its first corner.
         corner : (T, 3, 2) float64
-            Of a corner of any other element, to which so many triangles belong for each; seen from that corner. Some
-            may reach beyond u = 1, into the next corner.
+            Triangles of one corner of any other element; parameters start at that corner. Some triangles may reach
+            beyond u = 1, into the patch of the next corner.
         """
 
     @abstractmethod
@@ -115,7 +116,7 @@ class UniformGrid(ABC):
         """``(m,)`` element of each triangle."""
 
     def at_rate(self, rate: int) -> UniformGrid:
-        """The grid of another rate over the same elements."""
+        """A grid of another rate over the same elements."""
         return type(self)(self.topology, rate)
 
     def cut(self, topology: Topology) -> UniformGrid:
@@ -125,11 +126,11 @@ class UniformGrid(ABC):
     def vertices_of(self, other: UniformGrid) -> IntArray:
         """See `Grid.vertices_of`."""
         t, steps = self.topology, np.arange(1, self.rate)
-        found = np.empty(self.vertex_count, dtype=np.int64)
-        found[self.corner_vertex[t.face_vertices]] = other.corner_vertex[other.topology.face_vertices]
-        found[self.edge_start(t.edge_half_edge)[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
-        found[self.inner_begin :] = np.arange(other.inner_begin, other.vertex_count)
-        return found
+        originals = np.empty(self.vertex_count, dtype=np.int64)
+        originals[self.corner_vertex[t.face_vertices]] = other.corner_vertex[other.topology.face_vertices]
+        originals[self.edge_start(t.edge_half_edge)[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
+        originals[self.inner_begin :] = np.arange(other.inner_begin, other.vertex_count)
+        return originals
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """See `Grid.locations`."""
@@ -145,11 +146,11 @@ class UniformGrid(ABC):
 
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:
-        """``(n_v,)`` number of each vertex of the topology; without meaning where no face uses it."""
+        """``(n_v,)`` number of each vertex of the topology; undefined where no face uses it."""
         return np.cumsum(self._is_used, dtype=np.uint32) - 1
 
     def edge_start(self, corners: IntArray) -> IntArray:
-        """Number of the first vertex inside each edge that begins at a corner, along the edge's lowest half-edge."""
+        """Number of the first vertex inside the edge that begins at each corner, along the edge's lowest half-edge."""
         start = self.topology.edge[corners].astype(np.int64)
         start *= self.rate - 1
         start += self._corner_count
@@ -169,27 +170,27 @@ class UniformGrid(ABC):
         return self.topology.vertex_half_edge >= 0
 
     def along(self, corners: IntArray, steps: IntArray) -> NDArray[np.uint32]:
-        """Vertices after so many segments along the edges from corners: ``(*corners.shape, len(steps))``.
+        """Vertices ``steps`` segments along the edges that begin at corners: ``(*corners.shape, len(steps))``.
 
-        Steps 0 and ``rate`` are the edge's ends.
+        Steps 0 and ``rate`` are the ends of the edge.
         """
         is_forward = self.owns_edge[corners]
-        # Sums wrap around 2^32, so that signs do no harm.
+        # Unsigned sums wrap around 2^32, so that 2^32 - 1 acts as -1.
         start = self.edge_start(corners).astype(np.uint32)
         start += np.where(is_forward, np.uint32(2**32 - 1), np.uint32(self.rate - 1))
         step = np.where(is_forward, np.uint32(1), np.uint32(2**32 - 1))
-        # There are more corners than steps, and NumPy's loops over a last axis should be long.
+        # Corners are the last axis, as there are more corners than steps, and NumPy's inner loops should be long.
         numbers = np.multiply.outer(steps.astype(np.uint32), step)
         numbers += start
-        for place in np.flatnonzero(steps == 0):
-            numbers[place] = self._at_corners(corners)
-        for place in np.flatnonzero(steps == self.rate):
-            numbers[place] = self._at_corners(self.topology.next[corners])
+        for index in np.flatnonzero(steps == 0):
+            numbers[index] = self._at_corners(corners)
+        for index in np.flatnonzero(steps == self.rate):
+            numbers[index] = self._at_corners(self.topology.next[corners])
         return np.moveaxis(numbers, 0, -1)
 
     @cached_property
     def owns_edge(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether the element of each corner evaluates the edge that begins there: that of the lower one."""
+        """``(n_h,)`` whether each half-edge's element evaluates the edge: the element of the lower half-edge does."""
         twin = self.topology.twin
         return (twin < 0) | (twin > np.arange(len(twin), dtype=np.int32))
 
@@ -201,11 +202,11 @@ class UniformGrid(ABC):
         return owns
 
     def edge_part(self, owners: IntArray, corners: IntArray, samples: IntArray, uv: FloatArray) -> GridPart:
-        """Samples inside the edges from corners, whose patches are ``owners``."""
+        """The part of the samples inside edges that begin at corners of the patches ``owners``."""
         return GridPart.of(samples, owners, self.edge_start(corners), corners, uv)
 
     def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
-        """One sample, which lies at corners, whose patches are ``owners``."""
+        """The part of one sample, at corners of the patches ``owners``."""
         return GridPart.of(sample, owners, self._at_corners(corners), corners, np.zeros((1, 2)))
 
     def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
@@ -214,10 +215,10 @@ class UniformGrid(ABC):
 
     def side_parts(
         self,
-        corners: IntArray,  # (p,) int64: where the patches begin
-        # list of (rate + 1,) int64: samples of a patch's sides, counter-clockwise from this corner on
+        corners: IntArray,  # (p,) int64: corners at which the patches begin
+        # list of (rate + 1,) int64: samples of a patch's sides, counter-clockwise from the corner
         sides: list[IntArray],
-        along: FloatArray,  # (rate + 1,) float64: parameters of these along a side
+        along: FloatArray,  # (rate + 1,) float64: parameters of the samples along a side
     ) -> list[GridPart]:
         """Parts at the corners and along the sides of patches that are whole elements."""
         parts = []
@@ -232,7 +233,7 @@ class UniformGrid(ABC):
 
 
 def slices_of(indices: IntArray, size: int) -> Iterator[IntArray]:
-    """Cut indices, each of which stands for ``size`` vertices, into slices of about `VERTICES_AT_ONCE`."""
+    """Split indices, each of which represents ``size`` vertices, into slices of about `VERTICES_AT_ONCE` vertices."""
     length = max(1, VERTICES_AT_ONCE // size)
     for begin in range(0, len(indices), length):
         yield indices[begin : begin + length]

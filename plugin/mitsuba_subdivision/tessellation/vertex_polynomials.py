@@ -1,4 +1,4 @@
-"""The polynomial that each vertex of a tessellation lies on, and the parameters there."""
+"""The polynomials on which the vertices of a tessellation lie, and the parameters of the vertices on them."""
 
 from __future__ import annotations
 
@@ -19,62 +19,63 @@ from ..patches import PatchClass
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
-# Coefficients are computed for runs of patches with about so many weights, and vertices in runs of about so many
-# coefficients, whose arrays stay in a core's cache.
+# Weights per run of patches when computing coefficients, and coefficients per run of vertices when evaluating them. The
+# arrays of a run stay in a core's cache.
 WEIGHTS_AT_ONCE, COEFFICIENTS_AT_ONCE = 1 << 17, 1 << 18
-# Polynomials of so many patches follow each other.
+# Consecutive patches of a class whose polynomials are stored together, block by block.
 PATCHES_TOGETHER = 1 << 7
 
 
 class VertexRuns(NamedTuple):
-    """The vertices of a tessellation, in runs of successive ones.
+    """The vertices of a tessellation, in runs of consecutive vertices.
 
-    The vertices of a run are some samples of one patch. All runs of a kind have the same samples, on different patches
-    of one class.
+    The vertices of a run are samples of one patch. All runs of a kind have the same samples, on different patches of
+    one class.
     """
 
     patch_class: IntArray  # (k,): index of the class of each kind
     counts: IntArray  # (k,): number of samples of each kind
-    samples: IntArray  # (n,): numbers of the samples in their class, for all kinds, one after the other
-    kind: IntArray  # (r,): of each run
-    patch: IntArray  # (r,): of each run, counted from the first of the class
-    first_vertex: IntArray  # (r,): of each run
+    samples: IntArray  # (n,): samples of all kinds, as indices in their classes
+    kind: IntArray  # (r,): kind of each run
+    patch: IntArray  # (r,): patch of each run, 0-based in its class
+    first_vertex: IntArray  # (r,): first vertex of each run
 
 
 @dataclass(frozen=True, eq=False)
 class VertexPolynomials:
-    """Vertices on polynomials of the same monomials.
+    """Vertices on polynomials with the same monomials.
 
-    A *block* makes the coefficients of one polynomial of a class: weights times the control points of a patch. There is
-    a polynomial for each block and each patch of the class that has vertices there.
+    A *block* is a matrix of weights. Times the control points of a patch, it gives the coefficients of a polynomial.
+    There is a polynomial for each block, and each patch of the block's class that has vertices on it.
+
+    A run has vertices on one polynomial. All runs of a kind have vertices at the same parameters. An entry is one
+    vertex of a kind.
     """
 
-    powers: IntArray  # (m, 2) int64: of the monomials, about the middle of the domain
-    # (b, m, K) float64 for each size of one-rings: of blocks of classes of that size, one size after the other, the
-    # smallest first
+    powers: IntArray  # (m, 2) int64: exponents of the monomials in parameters from the middle of the domain
+    # (b, m, K) float64 for each size K of one-rings in ascending order: blocks of the classes of that size
     weights: tuple[FloatArray, ...]
-    # (b, 3) int64: of each block the index of the class's first control in `VertexTable.controls`, and its numbers of
-    # patches, whose controls follow each other column by column, and of controls
+    # (b, 3) int64, for each block: index of the class's first entry in `VertexTable.controls`, where controls are
+    # stored column by column; number of patches of the class; number of controls per patch
     blocks: IntArray
-    # (b,) float64: sum of the absolute weights in either tangent of a vertex, or more
+    # (b,) float64: upper bound of the sum of the absolute weights in either tangent of a vertex
     tangent_weights: FloatArray
-    block: IndexArray  # (p,) int32: of each polynomial; blocks of one size of one-rings together
-    patch: IndexArray  # (p,) int32: of each polynomial, counted from the first of its class
-    # A run has vertices of one polynomial, and runs of a kind have them at the same parameters. Where these are:
-    first_run: IntArray  # (p + 1,) int64: the first run of each polynomial; then the number of runs
-    kind: IndexArray  # (r,) int32: of each run
-    first_vertex: NDArray[np.uint32]  # (r,) uint32: of each run
-    first_entry: IntArray  # (k + 1,) int64: the first entry of each kind below; then the number of entries
-    offset: IndexArray  # (e,) int32: of a vertex from the first of its run
-    st: FloatArray  # (e, 2) float64: its parameters from the middle of the domain
+    block: IndexArray  # (p,) int32: block of each polynomial, in the order of sizes of one-rings
+    patch: IndexArray  # (p,) int32: patch of each polynomial, 0-based in its class
+    first_run: IntArray  # (p + 1,) int64: first run of each polynomial; finally the number of runs
+    kind: IndexArray  # (r,) int32: kind of each run
+    first_vertex: NDArray[np.uint32]  # (r,) uint32: first vertex of each run
+    first_entry: IntArray  # (k + 1,) int64: first entry of each kind; finally the number of entries
+    offset: IndexArray  # (e,) int32: offset of the vertex from the first vertex of its run
+    st: FloatArray  # (e, 2) float64: parameters of the vertex from the middle of the domain
 
     def sums(self, controls: NDArray[np.uint32], points: FloatArray, row_count: int = 3) -> Iterator[VertexSums]:
-        """Points, or with three rows points and tangents, of all vertices, some at a time.
+        """Evaluate points (``row_count`` 1), or points and two tangents (3), of all vertices, in runs of vertices.
 
         Coefficients are relative to a control point of each patch.
         """
         monomials = monomial_values(self.powers, self.st)[:row_count]
-        # Ascending.
+        # In ascending order.
         control_counts = self.blocks[self.block, 2]
         first_block = 0
         for weights in self.weights:
@@ -84,25 +85,25 @@ class VertexPolynomials:
                 polynomials = slice(first, min(first + step, end))
                 block = self.block[polynomials]
                 first_control, patch_count, _ = self.blocks[block].T
-                at = first_control + self.patch[polynomials] + patch_count * np.arange(weights.shape[2])[:, None]
-                own = points[controls[at]]
-                origin = own[0]
-                relative = own - origin
+                columns = np.arange(weights.shape[2])[:, None]
+                patch_points = points[controls[first_control + self.patch[polynomials] + patch_count * columns]]
+                origin = patch_points[0]
+                relative = patch_points - origin
                 extent = np.abs(relative).max(axis=0)
                 relative = np.ascontiguousarray(relative.swapaxes(0, 1))
                 coefficients = (weights[block - first_block] @ relative).transpose(1, 2, 0)
-                of_polynomials = origin.T, extent.T, self.tangent_weights[block]
+                polynomial_data = origin.T, extent.T, self.tangent_weights[block]
                 polynomial, vertex, entry = self._vertices(polynomials)
-                run = max(1, COEFFICIENTS_AT_ONCE // coefficients[:, :, 0].size)
-                for some in (slice(start, start + run) for start in range(0, len(vertex), run)):
-                    which = polynomial[some]
-                    factors = monomials.take(entry[some], axis=2)
-                    values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(which, axis=2))
-                    yield VertexSums(vertex[some], values, *(each[..., which] for each in of_polynomials))
+                length = max(1, COEFFICIENTS_AT_ONCE // coefficients[:, :, 0].size)
+                for run in (slice(start, start + length) for start in range(0, len(vertex), length)):
+                    run_polynomial = polynomial[run]
+                    factors = monomials.take(entry[run], axis=2)
+                    values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(run_polynomial, axis=2))
+                    yield VertexSums(vertex[run], values, *(data[..., run_polynomial] for data in polynomial_data))
             first_block += len(weights)
 
     def _vertices(self, polynomials: slice) -> tuple[IntArray, IntArray, IntArray]:
-        """Of the vertices of some polynomials: the polynomial, counted from the first of these; number; entry."""
+        """Polynomial (0-based in the slice), vertex and entry of each vertex on a slice of polynomials."""
         first_run = self.first_run[polynomials.start : polynomials.stop + 1]
         runs = slice(int(first_run[0]), int(first_run[-1]))
         kind = self.kind[runs]
@@ -114,12 +115,12 @@ class VertexPolynomials:
 
 
 class VertexSums(NamedTuple):
-    """Some vertices."""
+    """Evaluated vertices."""
 
     vertex: IntArray  # (n,)
-    values: FloatArray  # (d, k, n) float64: relative to ``origin``
-    origin: FloatArray  # (k, n) float64: a control point of the patch
-    extent: FloatArray  # (k, n) float64: how far the others are from it along each axis
+    values: FloatArray  # (d, k, n) float64: points relative to `origin`, and tangents if evaluated
+    origin: FloatArray  # (k, n) float64: a control point of the vertex's patch
+    extent: FloatArray  # (k, n) float64: largest distance along each axis of the patch's control points from `origin`
     tangent_weights: FloatArray  # (n,): see `VertexPolynomials`
 
     @property
@@ -131,7 +132,7 @@ class VertexSums(NamedTuple):
         """``(n, 3)`` unit normals; zero where the surface has none."""
         extent = self.extent
         if are_rounded:
-            # Refined control points are rounded before they are seen from the origin.
+            # Refined control points are rounded before the origin is subtracted.
             extent = np.maximum(extent, LEAST_EXTENT[64] * np.abs(self.origin))
         bound = np.broadcast_to(self.tangent_weights, (2, len(self.vertex)))
         return unit_normals(self.values[1:3], bound, extent).T
@@ -140,47 +141,53 @@ class VertexSums(NamedTuple):
 def vertex_polynomials(
     scheme: Scheme, classes: Sequence[PatchClass], uv: Sequence[FloatArray], runs: VertexRuns
 ) -> tuple[VertexPolynomials, ...]:
-    """Find the polynomials that vertices lie on: planes, and those of the scheme's basis; only what there is.
+    """Find the polynomials on which vertices lie: planes, and polynomials of the scheme's basis, if there are any.
 
     ``uv`` are the samples ``(s, 2)`` of each class.
     """
-    # At low rates, patches of other classes may have all samples of a class. One-rings of the same size come together.
+    # Without unused classes: at low rates, patches of other classes may evaluate all samples of a class. Sorted by the
+    # size of one-rings.
     used = np.unique(runs.patch_class).tolist()
     used.sort(key=lambda index: classes[index].controls.shape[1])
-    number = np.empty(len(classes), dtype=np.int64)
-    number[used] = np.arange(len(used))
+    used_index = np.empty(len(classes), dtype=np.int64)
+    used_index[used] = np.arange(len(used))
     classes, uv = [classes[index] for index in used], [uv[index] for index in used]
-    elements = [patch_tree(scheme, each.signature) for each in classes]
+    elements = [patch_tree(scheme, patch_class.signature) for patch_class in classes]
     forms = zip((PLANE_POWERS, polynomial_basis(scheme).powers), sampled_polynomials(scheme, elements, uv), strict=True)
-    # Samples are counted through all classes from now on.
-    first_sample = ragged.offsets([len(own) for own in uv])
+    # From here on, samples are numbered across all classes.
+    first_sample = ragged.offsets([len(class_uv) for class_uv in uv])
     runs = runs._replace(
-        patch_class=number[runs.patch_class],
-        samples=np.repeat(first_sample[number[runs.patch_class]], runs.counts) + runs.samples,
+        patch_class=used_index[runs.patch_class],
+        samples=np.repeat(first_sample[used_index[runs.patch_class]], runs.counts) + runs.samples,
     )
-    return tuple(_of_form(powers, classes, found, runs) for powers, found in forms if (found.polynomial >= 0).any())
+    return tuple(
+        _of_form(powers, classes, polynomials, runs)
+        for powers, polynomials in forms
+        if (polynomials.polynomial >= 0).any()
+    )
 
 
 def _of_form(
     powers: IntArray, classes: Sequence[PatchClass], polynomials: Polynomials, runs: VertexRuns
 ) -> VertexPolynomials:
-    """Polynomials of the same monomials of all classes."""
+    """Collect the polynomials with the same monomials, of all classes."""
     class_of_block = np.repeat(np.arange(len(classes)), [len(rows) for rows in polynomials.rows])
-    blocks = np.array([(each.first_control, *each.controls.shape) for each in classes])[class_of_block]
-    of_size: dict[int, list[FloatArray]] = {}
+    blocks = np.array([(patch_class.first_control, *patch_class.controls.shape) for patch_class in classes])
+    blocks = blocks[class_of_block]
+    weights_by_size: dict[int, list[FloatArray]] = {}
     for rows in polynomials.rows:
         if len(rows):
-            of_size.setdefault(rows.shape[2], []).append(rows)
-    weights = tuple(map(np.concatenate, of_size.values()))
+            weights_by_size.setdefault(rows.shape[2], []).append(rows)
+    weights = tuple(map(np.concatenate, weights_by_size.values()))
     kind, entry, first_entry = _divided_kinds(runs, polynomials.polynomial)
     sample = runs.samples[entry]
     st, block = polynomials.st[sample], polynomials.polynomial[sample]
-    run, own_kind = _divided_runs(runs, kind[first_entry])
-    run_block, patch = block[first_entry][own_kind], runs.patch[run]
-    # Polynomials of some neighbouring patches are neighbours, block by block: their vertices stay in a core's cache.
+    run, run_kind = _divided_runs(runs, kind[first_entry])
+    run_block, patch = block[first_entry][run_kind], runs.patch[run]
+    # Polynomials are sorted by chunks of neighbouring patches, then by blocks: the vertices stay in a core's cache.
     chunk = class_of_block[run_block] * (1 + int(patch.max()) // PATCHES_TOGETHER) + patch // PATCHES_TOGETHER
     keys = (chunk * len(blocks) + run_block) * PATCHES_TOGETHER + patch % PATCHES_TOGETHER
-    # Stable: fast where keys are sorted in large parts, as those of a uniform grid are.
+    # A stable sort is fast if large parts are sorted already, as for a uniform grid.
     order = np.argsort(keys, kind="stable")
     first_run = np.flatnonzero(np.diff(keys[order], prepend=-1))
     first = order[first_run]
@@ -192,7 +199,7 @@ def _of_form(
         run_block[first].astype(np.int32),
         patch[first].astype(np.int32),
         np.append(first_run, len(keys)),
-        own_kind[order].astype(np.int32),
+        run_kind[order].astype(np.int32),
         runs.first_vertex[run[order]].astype(np.uint32),
         np.append(first_entry, len(sample)),
         ragged.index_in_row(runs.counts)[entry].astype(np.int32),
@@ -201,9 +208,10 @@ def _of_form(
 
 
 def _divided_kinds(runs: VertexRuns, block_of_sample: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Kinds divided into those of samples in the same block.
+    """Divide each kind of run into parts whose samples are in the same block.
 
-    Returns the kind and the index in ``runs.samples`` of each sample that is in a block, and where the parts begin.
+    Returns the kind of each sample that is in a block, the sample's index in ``runs.samples``, and the indices at which
+    the parts begin.
     """
     kind, block = np.repeat(np.arange(len(runs.counts)), runs.counts), block_of_sample[runs.samples]
     order = np.lexsort((block, kind))
@@ -213,7 +221,7 @@ def _divided_kinds(runs: VertexRuns, block_of_sample: IntArray) -> tuple[IntArra
 
 
 def _divided_runs(runs: VertexRuns, kind_of_part: IntArray) -> tuple[IntArray, IntArray]:
-    """Runs divided as their kinds are: of each part of each run the run, and which part of all kinds it is."""
+    """Divide runs into the parts of their kinds. Returns run and part of a kind, for each part of a run."""
     part_counts = np.bincount(kind_of_part, minlength=len(runs.counts))
     counts = part_counts[runs.kind]
     return np.repeat(np.arange(len(counts)), counts), ragged.ranges(ragged.starts(part_counts)[runs.kind], counts)
@@ -221,8 +229,8 @@ def _divided_runs(runs: VertexRuns, kind_of_part: IntArray) -> tuple[IntArray, I
 
 def _tangent_weights(powers: IntArray, weights: tuple[FloatArray, ...], block: IntArray, st: FloatArray) -> FloatArray:
     """`VertexPolynomials.tangent_weights`, from the block and the parameters of each entry."""
-    magnitude = np.concatenate([np.abs(each).sum(axis=2) for each in weights])
-    slopes = (np.abs(monomial_values(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0)
-    found = np.zeros(len(magnitude))
-    np.maximum.at(found, block, slopes)
-    return found
+    magnitude = np.concatenate([np.abs(block_weights).sum(axis=2) for block_weights in weights])
+    entry_bounds = (np.abs(monomial_values(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0)
+    bounds = np.zeros(len(magnitude))
+    np.maximum.at(bounds, block, entry_bounds)
+    return bounds

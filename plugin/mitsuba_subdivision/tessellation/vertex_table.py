@@ -1,4 +1,4 @@
-"""A tessellation: a polynomial under every vertex, made once and applied whenever the control points move."""
+"""Tables of tessellations: a polynomial for every vertex, computed once and applied whenever control points move."""
 
 from __future__ import annotations
 
@@ -24,21 +24,20 @@ if TYPE_CHECKING:
 class VertexTable:
     """A tessellation: its vertices as points on polynomials, its triangles, and their elements.
 
-    A polynomial's coefficients are weights times the control points of a patch. Weights do not depend on where control
-    points are; of an adaptive tessellation, the triangles do.
+    A polynomial's coefficients are weights times the control points of a patch. Weights do not depend on the positions
+    of control points; the triangles of an adaptive tessellation do.
     """
 
     control_count: int
     patch_count: int
-    grid: Grid  # Numbers the vertices and triangles, and says where on the surface they lie
-    polynomials: tuple[VertexPolynomials, ...]  # What the vertices lie on
-    # (n,) uint32: control points of the patches of all classes; if there is a ``refinement``, refined ones
+    grid: Grid  # Numbers and locates the vertices and triangles
+    polynomials: tuple[VertexPolynomials, ...]  # Polynomials on which the vertices lie
+    # (n,) uint32: control points, or refined ones if there is a `refinement`, of the patches of all classes
     controls: NDArray[np.uint32]
-    # (2, n) int64: vertices that take their position from another one, and that one. Along a crease, either side has
-    # vertices of its own, with normals of their own but the same positions, bit by bit.
+    # (2, n) int64: copies, and the vertices whose positions they take. Each side of a crease has its own vertices, with
+    # different normals but bitwise equal positions.
     copies: IntArray
-    # (n, control_count) sparse array or None: makes refined control points of the cage's, where the patches are those
-    # of the cage refined once
+    # (n, control_count) matrix from control points to refined ones, if patches are those of the cage refined once
     refinement: sparse.csr_array | None = None
 
     @property
@@ -57,17 +56,17 @@ class VertexTable:
 
     @cached_property
     def weld_target(self) -> IntArray:
-        """``(vertex_count,)`` the vertex whose position each vertex has: itself, or the one that it is a copy of."""
+        """``(vertex_count,)`` the vertex whose position each vertex takes: itself, or its original if it is a copy."""
         target = np.arange(self.vertex_count)
         target[self.copies[0]] = self.copies[1]
         return target
 
     def locations(self) -> tuple[IntArray, FloatArray]:
-        """Where each vertex lies on the surface: see `Grid.locations`."""
+        """Location of each vertex on the surface, see `Grid.locations`."""
         return self.grid.locations()
 
     def refined(self, control_points: FloatArray) -> FloatArray:
-        """Points that `controls` are indices of, ``(n, k)``, from ``(control_count, k)`` of the cage."""
+        """``(n, k)`` points that `controls` indexes, from ``(control_count, k)`` control points of the cage."""
         return control_points if self.refinement is None else self.refinement @ control_points
 
     def apply(
@@ -76,25 +75,25 @@ class VertexTable:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Evaluate every vertex.
 
-        Returns positions, normals, (vertex_count, 3) float64: normals are zero where the surface has none, see
+        Returns positions and normals, (vertex_count, 3) float64. Normals are zero where undefined, see
         `SurfaceSamples`.
         """
         positions, normals = (np.empty((self.vertex_count, 3)) for _ in range(2))
         points, are_rounded = self.refined(control_points), self.refinement is not None
         for part in self.polynomials:
-            for found in part.sums(self.controls, points):
-                positions[found.vertex] = found.points
-                normals[found.vertex] = found.normals(are_rounded=are_rounded)
+            for sums in part.sums(self.controls, points):
+                positions[sums.vertex] = sums.points
+                normals[sums.vertex] = sums.normals(are_rounded=are_rounded)
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
     def interpolated(self, values: FloatArray) -> FloatArray:
-        """``(vertex_count, k)`` points of the surface that ``(control_count, k)`` values make, also of copies."""
-        found, points = np.empty((self.vertex_count, values.shape[1])), self.refined(values)
+        """``(vertex_count, k)`` limits of ``(control_count, k)`` values at the vertices, also evaluated for copies."""
+        limits, refined_values = np.empty((self.vertex_count, values.shape[1])), self.refined(values)
         for part in self.polynomials:
-            for some in part.sums(self.controls, points, 1):
-                found[some.vertex] = some.points
-        return found
+            for sums in part.sums(self.controls, refined_values, 1):
+                limits[sums.vertex] = sums.points
+        return limits
 
 
 class VertexMatrices(NamedTuple):
@@ -105,9 +104,9 @@ class VertexMatrices(NamedTuple):
     p : (n, n_v) CSR array of float64
         Times ``(n_v, k)`` control points: the vertices. Rows sum to one.
     tangent_u, tangent_v : (n, n_v) CSR array of float64
-        Tangents whose cross product is along the normal. Rows sum to zero. They are the derivatives by u and v of a
-        patch, but for a positive factor that differs from vertex to vertex, and but for extraordinary points, borders
-        and sharp features, where derivatives may vanish and these do not. `LimitSurface.matrix` has the derivatives.
+        Tangents whose cross product is along the normal. Rows sum to zero. They are the derivatives of a patch by u and
+        v, times a positive factor that differs from vertex to vertex, except at extraordinary points, borders and sharp
+        features, where derivatives may vanish but these tangents do not. For derivatives see `LimitSurface.matrix`.
     """
 
     p: sparse.csr_array
@@ -137,21 +136,21 @@ class Grid(Protocol):
         Returns
         -------
         half_edge : (vertex_count,) int64
-            Corner of an element at the origin of the parameters, a half-edge of `PatchTable.elements`.
+            Corner of an element at which the parameters are (0, 0), a half-edge of `PatchTable.elements`.
         uv : (vertex_count, 2) float64
-            Samples at corners have (0, 0).
+            Parameters. Vertices at corners of elements have (0, 0).
         """
         ...
 
     def cut(self, topology: Topology) -> Grid:
         """The same triangles over elements with the same half-edges, cut along more edges.
 
-        Vertices on a cut have a copy on each side, and lie on their side of it.
+        Vertices on a cut have a copy on each side, which is located on that side.
         """
         ...
 
     def vertices_of(self, other: Any) -> IntArray:
-        """``(vertex_count,)`` for each vertex, its original in a grid of which this one is a `cut`."""
+        """``(vertex_count,)`` the original of each vertex in a grid of which this one is a `cut`."""
         ...
 
 
@@ -168,8 +167,8 @@ class Tessellation:
     element : (m,) uint32
         0-based element of each triangle.
     texcoords : (n, 2) float64 or None
-        Texture coordinates. Along their seams, and those of other attributes, vertices have copies with the same
-        position and normal, one for each side.
+        Texture coordinates. Along seams of these and of other attributes, vertices have a copy for each side, with the
+        same position and normal.
     attributes : dict of str to (n, k) float64
         The cage's other attributes.
     """
