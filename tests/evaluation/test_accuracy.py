@@ -24,19 +24,19 @@ STENCIL = 4e-14
 SAMPLES = 36
 
 
-def test_samples_match_explicit_refinement(exact, surface):
-    """Points, normals, derivatives and curvatures; and limits at the extraordinary point."""
-    for derivatives in (1, 2):
-        assert_exact(surface.evaluate(0, exact.uv, derivatives=derivatives), exact)
-    # Term 1 of (11) is about 2^n times the rounding error, of float64 and at n = 1 nothing.
-    far = np.flatnonzero(exact.uv.max(axis=1) > 0.25)
-    assert_exact(surface.evaluate(0, exact.uv[far], evaluator="stam", derivatives=2), exact, far)
+@pytest.mark.parametrize("derivatives", [1, 2])
+def test_samples_match_explicit_refinement(exact, surface, derivatives):
+    """Points, normals, derivatives and curvatures."""
+    assert_exact(surface.evaluate(0, exact.uv, derivatives=derivatives), exact)
+
+
+def test_point_and_normal_at_the_extraordinary_point_are_the_limits(exact, surface):
     found = surface.evaluate(0, [[0.0, 0.0]])
     assert np.abs(found.p - exact.limit_p).max() <= POINT * exact.size
     assert angle(found.n[0], exact.limit_n) <= NORMAL
 
 
-def test_normals_stay_finite_and_those_of_float32_right_at_every_level(exact, surface):
+def test_float32_normals_stay_right_at_every_level(exact, surface):
     uv = np.concatenate([0.9 * np.ldexp([[0.6, 0.45]], -level) for level in range(49)])
     found = surface.evaluate(0, np.concatenate([exact.uv, uv]), dtype=np.float32)
     precise = surface.evaluate(0, np.concatenate([exact.uv, uv]))
@@ -45,8 +45,6 @@ def test_normals_stay_finite_and_those_of_float32_right_at_every_level(exact, su
     bar = bars.NORMAL_FLOAT32_NARROW if is_narrow else bars.NORMAL_FLOAT32
     assert angle(found.n, precise.n).max() <= bar
     assert np.abs(found.p - precise.p).max() <= bars.POINT_FLOAT32 * exact.size
-    deep = surface.evaluate(0, np.ldexp([[1.0, 0.3]], [[-100], [-500], [-1000], [-1070]]))
-    assert all(np.isfinite(values).all() for values in (deep.p, deep.dp_du, deep.dp_dv, deep.n))
 
 
 @EVERY_SCHEME
@@ -55,6 +53,12 @@ def test_powers_of_the_matrix_give_the_same_points(scheme, valence):
     exact = samples_at(scheme, valence)
     found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, evaluator="power")
     assert np.abs(found.p - exact.p).max() <= POINT * exact.size
+
+
+def test_stam_agrees_far_from_the_extraordinary_vertex(exact, surface):
+    # Term 1 of (11) is about 2^n times the rounding error, of float64 and at n = 1 nothing.
+    far = np.flatnonzero(exact.uv.max(axis=1) > 0.25)
+    assert_exact(surface.evaluate(0, exact.uv[far], evaluator="stam", derivatives=2), exact, far)
 
 
 @pytest.mark.parametrize(("valence", "first_level"), [(3, 17), (5, 28)])
@@ -67,18 +71,20 @@ def test_stam_in_float32_loses_the_normal(valence, first_level):
     assert (np.isnan(error) | (error > 5)).all()
 
 
+@pytest.mark.parametrize("evaluator", ["stam", "power"])
+def test_published_forms_have_no_value_at_the_point_itself(evaluator):
+    found = LimitSurface(extraordinary(5)).evaluate(0, [[0.0, 0.0]], evaluator=evaluator)
+    assert np.isnan(found.n).all()
+    assert found.level[0] == -1
+
+
 @EVERY_SCHEME
 @pytest.mark.parametrize("valence", [3, 5, 12, 50])
-def test_limit_evaluator_gives_the_extraordinary_point_for_every_sample_and_published_forms_none(scheme, valence):
+def test_limit_evaluator_gives_the_extraordinary_point_for_every_sample(scheme, valence):
     exact = samples_at(scheme, valence)
-    surface = LimitSurface(exact.cage, scheme)
-    found = surface.evaluate(0, exact.uv, evaluator="limit")
+    found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, evaluator="limit")
     assert np.abs(found.p - exact.limit_p).max() <= POINT * exact.size
     assert angle(found.n, exact.limit_n).max() <= NORMAL
-    for evaluator in ("stam", "power"):
-        found = surface.evaluate(0, [[0.0, 0.0]], evaluator=evaluator)
-        assert np.isnan(found.n).all()
-        assert found.level[0] == -1
 
 
 @EVERY_SCHEME
@@ -98,6 +104,13 @@ def test_tangents_at_the_extraordinary_point_run_along_the_edges(scheme, valence
         assert (np.abs((tangents * at_point.n).sum(axis=1)) <= POINT * np.linalg.norm(tangents, axis=1)).all()
         assert np.abs(deep.p - at_point.p).max() <= POINT
         assert angle(tangents, getattr(near, field)).max() < 1e-3
+
+
+def test_normals_stay_finite_at_any_level(surface):
+    uv = np.ldexp([[1.0, 0.3]], [[-100], [-500], [-1000], [-1070]])
+    found = surface.evaluate(0, uv)
+    for values in (found.p, found.dp_du, found.dp_dv, found.n):
+        assert np.isfinite(values).all()
 
 
 @pytest.mark.parametrize(
@@ -158,9 +171,9 @@ def test_a_torus_grid_is_a_bicubic_spline(np_rng):
     assert (found.level == 0).all()
 
 
-def test_evaluation_commutes_with_affine_maps(exact, surface, np_rng):
+def test_evaluation_commutes_with_affine_maps(exact, np_rng):
     matrix, shift = np_rng.standard_normal((3, 3)), np_rng.standard_normal(3)
-    before = surface.evaluate(0, exact.uv)
+    before = LimitSurface(exact.cage, exact.scheme).evaluate(0, exact.uv)
     moved = exact.cage.with_positions(exact.cage.positions @ matrix.T + shift)
     after = LimitSurface(moved, exact.scheme).evaluate(0, exact.uv)
     assert np.abs(before.p @ matrix.T + shift - after.p).max() <= POINT * 10

@@ -13,10 +13,10 @@ from reference.refined_cages import half_disc, sheet, tagged
 
 SCENES = Path(__file__).parents[2] / "scenes"
 INFINITE = 10.0
-# Modes do not choose seams, but how values move there, if at all.
 MODES = ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all")
 # Of values of size one, in float64.
 ROUNDING = 2e-14
+
 
 CAGES = {
     "cube": ("catmull_clark", cube()),
@@ -32,7 +32,7 @@ CAGES = {
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
 
 
-def random_locations(surface, rng, count=100):
+def random_locations(surface, rng, count=150):
     t = surface.cage.topology
     element = rng.integers(0, t.face_count, count)
     corner = rng.integers(0, t.face_sizes[element])
@@ -52,8 +52,10 @@ def random_tags(cage, rng, share, sharpness=(INFINITE,)):
     """Sharp edges and vertices."""
     t = cage.topology
     corners = np.flatnonzero(rng.random(t.vertex_count) < share / 2)
-    creases = creases_along(cage, t.edge_half_edge[rng.random(t.edge_count) < share], rng, sharpness)
-    return {"creases": creases, "corners": [(v, rng.choice(sharpness)) for v in corners]}
+    return {
+        "creases": creases_along(cage, t.edge_half_edge[rng.random(t.edge_count) < share], rng, sharpness),
+        "corners": [(v, rng.choice(sharpness)) for v in corners],
+    }
 
 
 def face_varying(values, indices):
@@ -63,11 +65,12 @@ def face_varying(values, indices):
 def random_indices(cage, rng, kind):
     """Face-varying indices with seams of many kinds."""
     t = cage.topology
-    if kind.endswith("islands"):
-        island = rng.integers(0, 3, t.face_count)[t.face]
+    if kind == "islands":
+        return t.face_vertices * 4 + rng.integers(0, 3, t.face_count)[t.face]
+    if kind == "joined islands":
         # Some vertices have one value only: seams end there, or touch.
-        is_joined = (rng.random(t.vertex_count) < 0.5)[t.face_vertices] if kind == "joined islands" else False
-        return t.face_vertices * 4 + np.where(is_joined, 0, island)
+        island = rng.integers(0, 3, t.face_count)[t.face]
+        return t.face_vertices * 4 + np.where((rng.random(t.vertex_count) < 0.5)[t.face_vertices], 0, island)
     # Single corners torn off, and rows shared by vertices that have nothing else in common.
     own = t.face_vertices * 2 + (rng.random(t.half_edge_count) < 0.15)
     return np.where(rng.random(t.half_edge_count) < 0.05, 0, own)
@@ -77,13 +80,18 @@ def textured(cage, indices, rng, **options):
     return tagged(cage, texcoords=face_varying(rng.random((indices.max() + 1, 2)), indices), **options)
 
 
+# Independent refinement
+
+
 def as_channel(cage):
     """What the reference makes of a cage with texture coordinates."""
-    indices = cage.texcoords.indices
+    faces = [tuple(map(int, face)) for face in faces_of(cage)]
+    rows = np.split(cage.texcoords.indices, cage.topology.face_offsets[1:-1])
+    keys = zip(cage.face_vertices.tolist(), cage.texcoords.indices.tolist(), strict=True)
     return Channel(
-        [tuple(map(int, face)) for face in faces_of(cage)],
-        [tuple(map(int, row)) for row in np.split(indices, cage.topology.face_offsets[1:-1])],
-        {key: cage.texcoords.values[key[1]] for key in zip(cage.face_vertices.tolist(), indices.tolist(), strict=True)},
+        faces,
+        [tuple(map(int, row)) for row in rows],
+        {key: cage.texcoords.values[key[1]] for key in keys},
         {frozenset((int(a), int(b))): float(s) for a, b, s in cage.tags.creases(cage.topology)},
         {int(vertex): float(s) for vertex, s in cage.tags.corners()},
         cage.boundary == "edge_and_corner",
@@ -109,6 +117,16 @@ def as_cage(channel):
     )
 
 
+KINDS = ("islands", "joined islands", "torn corners")
+
+
+def mixed(scheme, cage, mode):
+    """A generator and numbers for what else varies, so that all pairs of it with cages and with modes come up."""
+    name = next(name for name, known in CAGES.items() if known == (scheme, cage))
+    number = list(CAGES).index(name) + MODES.index(mode)
+    return np.random.default_rng(number), KINDS[number % 3], ("uniform", "chaikin")[number % 2]
+
+
 # Two refinements decay all of them. Beside 0.2, Chaikin's method ends 1.2 at once, of which more than one was left.
 DECAYING = (0.2, 1, 1.2, 1.7)
 SHARP, SEMI_SHARP = (1, 0.1, (INFINITE,)), (2, 0.4, DECAYING)
@@ -120,10 +138,7 @@ SHARP, SEMI_SHARP = (1, 0.1, (INFINITE,)), (2, 0.4, DECAYING)
     [(mode, *SHARP) for mode in MODES] + [(mode, *SEMI_SHARP) for mode in MODES[:-1]],
 )
 def test_refinements_by_the_reference_have_the_same_values(scheme, cage, mode, refinements, share, sharpness):
-    # So that all pairs of what else varies with cages and with modes come up.
-    number = list(CAGES.values()).index((scheme, cage)) + MODES.index(mode)
-    rng, method = np.random.default_rng(number), ("uniform", "chaikin")[number % 2]
-    kind = ("islands", "joined islands", "torn corners")[number % 3]
+    rng, kind, method = mixed(scheme, cage, mode)
     boundary = str(rng.choice(["edge_and_corner", "edge_only"]))
     tags = random_tags(cage, rng, share, sharpness)
     options = {"crease_method": method, "boundary": boundary, "face_varying": mode}
@@ -147,6 +162,9 @@ def test_refinements_by_the_reference_have_the_same_values(scheme, cage, mode, r
     here = surface.evaluate_attribute("texcoords", element, np.where(halved, uv / 2, uv), corner)
     there = LimitSurface(as_cage(channel), scheme).evaluate_attribute("texcoords", place, fine)
     np.testing.assert_allclose(here, there, rtol=0, atol=ROUNDING)
+
+
+# Laws
 
 
 @EVERY_CAGE
@@ -236,49 +254,68 @@ def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
     assert np.abs(sharp.evaluate(*places).p - plain.evaluate(*places).p).max() > 1e-3
 
 
-@pytest.mark.core
-@pytest.mark.parametrize("mode", MODES[:-1])
-def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
-    """On a torus of two rings with a seam between them, and creases on the first: semi-sharp ones and the seam's own.
+class TwoRings:
+    """A torus of two rings with a seam between them, and creases on the first: semi-sharp ones and the seam's own.
 
     Its values at face corners are its points, so that each ring of values could be a surface.
     """
-    cage = torus(8, 6)
-    t, lowest = cage.topology, cage.topology.edge_half_edge
-    first = (np.arange(cage.face_count) < 24)[t.face]
-    is_seam = first[lowest] != first[t.twin[lowest]]
-    is_semi = (np_rng.random(t.edge_count) < 0.4) & first[lowest] & ~is_seam
-    semi, seam = (creases_along(cage, lowest[on], np_rng, [s]) for on, s in ((is_semi, 1.75), (is_seam, INFINITE)))
-    cage = cage.with_positions(cage.positions + np_rng.uniform(-0.1, 0.1, cage.positions.shape))
-    values = face_varying(np.tile(cage.positions, (2, 1)), cage.face_vertices + first * cage.vertex_count)
-    places = random_locations(LimitSurface(cage), np_rng, 400)
-    beyond = ~first[t.face_offsets[places[0]]]
 
-    def evaluated(creases=(), corners=()):
+    def __init__(self, mode, rng):
+        self.mode, cage = mode, torus(8, 6)
+        t, lowest = cage.topology, cage.topology.edge_half_edge
+        first = (np.arange(cage.face_count) < 24)[t.face]
+        is_seam = first[lowest] != first[t.twin[lowest]]
+        is_semi = (rng.random(t.edge_count) < 0.4) & first[lowest] & ~is_seam
+        self.semi, self.seam = (
+            creases_along(cage, lowest[on], rng, [s]) for on, s in ((is_semi, 1.75), (is_seam, INFINITE))
+        )
+        self.cage = cage.with_positions(cage.positions + rng.uniform(-0.1, 0.1, cage.positions.shape))
+        indices = cage.face_vertices + first * cage.vertex_count
+        self.values = face_varying(np.tile(self.cage.positions, (2, 1)), indices)
+        self.places = random_locations(LimitSurface(cage), rng, 400)
+        self.beyond = ~first[t.face_offsets[self.places[0]]]
+
+    def evaluate(self, **tags):
         """Values and points."""
-        given = tagged(cage, face_varying=mode, attributes={"p": values}, creases=creases, corners=corners)
-        surface = LimitSurface(given)
-        return surface.evaluate_attribute("p", *places), surface.evaluate(*places).p
+        surface = LimitSurface(tagged(self.cage, face_varying=self.mode, attributes={"p": self.values}, **tags))
+        return surface.evaluate_attribute("p", *self.places), surface.evaluate(*self.places).p
 
+
+@pytest.mark.core
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_sharpness_beyond_a_seam_acts_where_values_depend_on_each_other(mode, np_rng):
+    rings = TwoRings(mode, np_rng)
+    semi, seam, beyond = rings.semi, rings.seam, rings.beyond
     # Sharpness of the seam itself is none of either side.
-    plain, sharp, sharper = (evaluated(each)[0] for each in ([], semi, semi + [(a, b, 2.5) for a, b, _ in seam]))
+    on_seam = [(a, b, 2.5) for a, b, _ in seam]
+    plain, sharp, sharper = (rings.evaluate(creases=tags)[0] for tags in ([], semi, semi + on_seam))
     np.testing.assert_allclose(sharper, sharp, rtol=0, atol=2 * ROUNDING)
     if mode.startswith("corners_plus"):
         # As if the seam were a crease: a vertex on it is a corner while anything is sharp there.
-        np.testing.assert_allclose(sharp, evaluated(semi + seam)[1], rtol=0, atol=2 * ROUNDING)
+        _, creased = rings.evaluate(creases=semi + seam)
+        np.testing.assert_allclose(sharp, creased, rtol=0, atol=2 * ROUNDING)
         assert np.abs(sharp - plain)[beyond].max() > 1e-3
     else:
         np.testing.assert_allclose(sharp[beyond], plain[beyond], rtol=0, atol=2 * ROUNDING)
     assert np.abs(sharp - plain)[~beyond].max() > 1e-3
-    # Values at semi-sharp vertices are corners for as long as these are sharp, and then for as long as their own edges
-    # are: they do not depend on each other.
-    corners = [(vertex, 0.5) for vertex in {end for *ends, _ in seam for end in ends}]
-    cornered, both = (evaluated(creases, corners)[0] for creases in ([], semi))
-    np.testing.assert_allclose(both[beyond], cornered[beyond], rtol=0, atol=2 * ROUNDING)
-    assert np.abs(both - cornered)[~beyond].max() > 1e-3
-    assert np.abs(cornered - plain)[beyond].max() > 1e-3 or mode == "boundaries"
 
 
+@pytest.mark.core
+@pytest.mark.parametrize("mode", MODES[:-1])
+def test_values_at_a_semi_sharp_vertex_do_not_depend_on_each_other(mode, np_rng):
+    """They are corners for as long as the vertex is sharp, and then for as long as their own edges are."""
+    rings = TwoRings(mode, np_rng)
+    corners, beyond = [(vertex, 0.5) for vertex in {end for *ends, _ in rings.seam for end in ends}], rings.beyond
+    plain, sharp, without = (
+        rings.evaluate(creases=creases, corners=tags)[0]
+        for creases, tags in (([], corners), (rings.semi, corners), ([], []))
+    )
+    np.testing.assert_allclose(sharp[beyond], plain[beyond], rtol=0, atol=2 * ROUNDING)
+    assert np.abs(sharp - plain)[~beyond].max() > 1e-3
+    assert np.abs(plain - without)[beyond].max() > 1e-3 or mode == "boundaries"
+
+
+# Modes do not choose seams, but how values move there, if at all.
 @EVERY_CAGE
 @pytest.mark.parametrize("mode", ["none", "corners_plus2", "all"])
 def test_sides_of_an_edge_differ_on_seams_only(scheme, cage, mode, np_rng):
@@ -319,8 +356,10 @@ def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
         if scheme == "loop":
             expected.append((1 - u - v) * ring[0] + u * ring[1] + v * ring[2])
             continue
-        quarter = ring[0], (ring[0] + ring[1]) / 2, ring.mean(axis=0), (ring[0] + ring[-1]) / 2
-        a, b, c, d = ring if len(ring) == 4 else quarter
+        if len(ring) == 4:
+            a, b, c, d = ring
+        else:
+            a, b, c, d = ring[0], (ring[0] + ring[1]) / 2, ring.mean(axis=0), (ring[0] + ring[-1]) / 2
         expected.append((1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d)
     for name in ("texcoords", "varying"):
         found = surface.evaluate_attribute(name, element, uv, corner)
@@ -333,6 +372,9 @@ def test_a_constant_stays_one(np_rng):
     constant = face_varying(np.full((indices.max() + 1, 1), 0.1), indices)
     surface = LimitSurface(tagged(cage, attributes={"one": constant}))
     assert (surface.evaluate_attribute("one", *random_locations(surface, np_rng)) == 0.1).all()
+
+
+# Doo-Sabin
 
 
 def test_doo_sabin_interpolates_what_has_no_seams(np_rng):

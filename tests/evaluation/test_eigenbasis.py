@@ -1,5 +1,3 @@
-"""Eigenbases of subdivision matrices, and of matrices whose Jordan blocks are known; limit frames."""
-
 import re
 from functools import cache
 
@@ -8,11 +6,8 @@ import pytest
 from mitsuba_subdivision.evaluation import irregular_patch
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
 from mitsuba_subdivision.evaluation.equations import times_powers
-from mitsuba_subdivision.evaluation.normals import limit_frame
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, isolated_signature, regular_signature
-from mitsuba_subdivision.mesh.connectivity import VertexRule
-from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
-from mitsuba_subdivision.schemes import CatmullClark, scheme_named
+from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, isolated_signature
+from mitsuba_subdivision.schemes import CatmullClark
 from reference.exact_samples import subdominant
 from scipy.linalg import block_diag
 
@@ -112,19 +107,17 @@ def test_hidden_blocks_are_found_and_their_powers_are_those_of_the_matrix(hidden
     for level in (0, 1, 2, 5, 30):
         rows = times_powers(basis.vectors[None], np.full(len(matrix), level), basis, 1.0)[0]
         np.testing.assert_allclose(rows @ basis.inverse, np.linalg.matrix_power(matrix, level), rtol=0, atol=POWER)
-    # Turned over, the basis has its third vector negated.
-    turned, sign = basis.turned_over(), np.where(np.arange(len(hidden)) == 2, -1.0, 1.0)
-    np.testing.assert_array_equal(turned.vectors, basis.vectors * sign)
-    np.testing.assert_array_equal(turned.inverse, basis.inverse * sign[:, None])
-    np.testing.assert_allclose(turned.vectors @ turned.block_matrix() @ turned.inverse, matrix, rtol=0, atol=POWER)
 
 
-def test_of_opposite_eigenvalues_the_positive_comes_first():
+@pytest.mark.parametrize("seed", range(8))
+def test_of_opposite_eigenvalues_the_positive_comes_first(seed):
     # Which of the two has the greater modulus is up to rounding.
-    for seed in range(8):
-        basis = eigenbasis(similar(HIDDEN["opposite to the subdominant"], seed))
-        np.testing.assert_allclose(basis.eigenvalues, [1, 0.25, 0.25, -0.25, 0.125], rtol=0, atol=EIGENVALUE)
-    # At valence 2 the ring's two modes have 1/4; -1/4 belongs to the rows beyond it.
+    basis = eigenbasis(similar(HIDDEN["opposite to the subdominant"], seed))
+    np.testing.assert_allclose(basis.eigenvalues, [1, 0.25, 0.25, -0.25, 0.125], rtol=0, atol=EIGENVALUE)
+
+
+def test_subdominant_pair_of_valence_2_is_that_of_the_ring():
+    # The ring's two modes have 1/4; -1/4 belongs to the rows beyond it.
     np.testing.assert_allclose(basis_of(2).eigenvalues[:4], [1, 0.25, 0.25, -0.25], rtol=0, atol=EIGENVALUE)
 
 
@@ -134,20 +127,27 @@ def times_matrix_powers(rows, levels, matrix):
 
 @pytest.mark.core
 @EVERY_HIDDEN
-def test_scaled_powers_are_matrix_powers_in_the_precision_of_the_rows(hidden):
+@pytest.mark.parametrize("place", [0, 1, 2, 3])
+def test_scaled_powers_are_matrix_powers(hidden, place):
     basis = eigenbasis(similar(hidden))
+    base = basis.moduli[min(place, np.flatnonzero(basis.moduli > EIGENVALUE)[-1])]
     levels = np.array([0, 1, 2, 3, 7, 20, 3, 0])
     rows = np.random.default_rng(2).standard_normal((3, len(levels), len(hidden)))
-    for place in range(4):
-        base = basis.moduli[min(place, np.flatnonzero(basis.moduli > EIGENVALUE)[-1])]
-        expected = times_matrix_powers(rows, levels, basis.block_matrix() / base)
-        # Columns of larger eigenvalues than the base are left out.
-        expected[..., basis.moduli > base * (1 + DEFECTIVE_EIGENVALUE)] = 0
-        np.testing.assert_allclose(times_powers(rows, levels, basis, base), expected, rtol=0, atol=POWER)
+    expected = times_matrix_powers(rows, levels, basis.block_matrix() / base)
+    # Columns of larger eigenvalues than the base are left out.
+    expected[..., basis.moduli > base * (1 + DEFECTIVE_EIGENVALUE)] = 0
+    np.testing.assert_allclose(times_powers(rows, levels, basis, base), expected, rtol=0, atol=POWER)
+
+
+@EVERY_HIDDEN
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_scaled_powers_keep_the_precision_of_the_rows(hidden, dtype):
+    basis = eigenbasis(similar(hidden))
     levels = np.array([0, 1, 5, 40])
-    precise, single = (times_powers(rows[:, :4].astype(t), levels, basis, 1.0) for t in (np.float64, np.float32))
-    assert (precise.dtype, single.dtype) == (np.float64, np.float32)
-    np.testing.assert_allclose(single, precise, rtol=0, atol=100 * np.finfo(np.float32).eps)
+    rows = np.random.default_rng(3).standard_normal((2, len(levels), len(hidden)))
+    found = times_powers(rows.astype(dtype), levels, basis, 1.0)
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, times_powers(rows, levels, basis, 1.0), rtol=0, atol=100 * np.finfo(dtype).eps)
 
 
 @pytest.mark.parametrize("size", [2, 3, 4])
@@ -181,24 +181,36 @@ def test_orientation_of_the_computed_eigenvectors_does_not_matter(valence, monke
     np.testing.assert_allclose(*found, rtol=0, atol=RESIDUAL)
 
 
-NO_SUBDIVISION = "subdivision matrix|second eigenvalue"
+@EVERY_HIDDEN
+def test_turned_over_basis_has_its_third_vector_negated(hidden):
+    basis = eigenbasis(similar(hidden))
+    turned = basis.turned_over()
+    sign = np.where(np.arange(len(hidden)) == 2, -1.0, 1.0)
+    np.testing.assert_array_equal(turned.vectors, basis.vectors * sign)
+    np.testing.assert_array_equal(turned.inverse, basis.inverse * sign[:, None])
+    matrix = turned.vectors @ turned.block_matrix() @ turned.inverse
+    np.testing.assert_allclose(matrix, similar(hidden), rtol=0, atol=POWER)
+
+
 DOES_NOT_CONTRACT = "the second eigenvalue has modulus 1.*; expected below 1, or there is no"
 
 
 @pytest.mark.parametrize(
     ("matrix", "message"),
     [
-        (similar(block_diag(1, jordan(0.5, 8))), NO_SUBDIVISION),
+        (similar(block_diag(1, jordan(0.5, 8))), "subdivision matrix|second eigenvalue"),
         # Rows that sum to two, and that do not sum to one.
-        (2 * similar(HIDDEN["diagonal"]), NO_SUBDIVISION),
-        (np.diag([1, 0.5, 0.25]), NO_SUBDIVISION),
+        (2 * similar(HIDDEN["diagonal"]), "subdivision matrix|second eigenvalue"),
+        (np.diag([1, 0.5, 0.25]), "subdivision matrix|second eigenvalue"),
         *((similar(np.diag([1, second, 0.5])), DOES_NOT_CONTRACT) for second in (1, -1, 1 + 1e-3)),
     ],
 )
 def test_matrix_it_cannot_handle_is_an_error(matrix, message):
     with pytest.raises(EigenbasisError, match=message):
         eigenbasis(matrix)
-    # One that contracts slowly has a basis.
+
+
+def test_a_matrix_that_contracts_slowly_has_a_basis():
     slow = eigenbasis(similar(np.diag([1, 1 - 1e-3, 0.5])))
     np.testing.assert_allclose(slow.eigenvalues, [1, 1 - 1e-3, 0.5], rtol=0, atol=EIGENVALUE)
 
@@ -232,43 +244,3 @@ def test_a_matrix_that_inverse_iteration_cannot_invert_is_an_error(monkeypatch):
     monkeypatch.setattr(np.linalg, "inv", singular)
     with pytest.raises(EigenbasisError, match=r"6 x 6 .* closest eigenvalues are 0\.\d+\S* and 0\.\d+\S*; expected"):
         eigenbasis(matrix)
-
-
-# Eigenvectors are right to this.
-EIGENVECTOR = 1e-10
-
-
-def signature_at_corner(scheme, ahead, rule):
-    """A face on the border whose first corner is the first of ``ahead`` faces there, and otherwise regular."""
-    size, regular = scheme.regular_face_size, scheme.regular_border_faces
-    first, last = TaggedFan((size,) * regular, ()), TaggedFan((size,), (size,) * (regular - 1))
-    inner = list(regular_signature(scheme).fans)
-    others = [last, *inner[2:-1], first] if ahead == 1 else [last, *inner[2:]]
-    return Signature("face", (TaggedFan((size,) * ahead, (), rule), *others))
-
-
-CASES = {
-    "one face on a border": (1, VertexRule.AUTOMATIC),
-    "several faces on a border": (4, VertexRule.AUTOMATIC),
-    "narrow corner": (2, VertexRule.CORNER),
-    "wide corner": (5, VertexRule.CORNER),
-}
-
-
-@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
-@pytest.mark.parametrize(("faces", "rule"), CASES.values(), ids=CASES.keys())
-def test_the_frame_does_not_depend_on_the_signs_of_eigenvectors(scheme, faces, rule):
-    """They are up to rounding, and differ between libraries."""
-    scheme = scheme_named(scheme)
-    structure = irregular_structure(scheme, signature_at_corner(scheme, faces, rule))
-    basis = eigenbasis(structure.matrix)
-    expected = limit_frame(scheme, structure.signature, basis) @ basis.inverse
-    for which in ([1], [2], [1, 2], [1, 2, 3], [3]):
-        sign = np.ones(len(basis.eigenvalues))
-        sign[which] = -1
-        blocks = tuple((place, sign[place, None] * block * sign[place]) for place, block in basis.blocks)
-        turned = Eigenbasis(
-            basis.vectors * sign, basis.inverse * sign[:, None], basis.eigenvalues, basis.moduli, blocks
-        )
-        found = limit_frame(scheme, structure.signature, turned) @ turned.inverse
-        np.testing.assert_allclose(found, expected, rtol=0, atol=EIGENVECTOR)

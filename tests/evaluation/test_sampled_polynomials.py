@@ -42,27 +42,24 @@ def weights_of(forms, which, own):
 
 
 @EVERY_SURFACE
-def test_polynomials_are_limit_stencils(name):
+@pytest.mark.parametrize("rate", [1, 4, 7])
+def test_polynomials_are_limit_stencils(name, rate):
     scheme, signatures = classes(surface_named(name))
-    elements, points = [patch_tree(scheme, signature) for signature in signatures], np.random.default_rng(0)
-    every = [grid(scheme, rate) for rate in (1, 4, 7)]
-    stencils = [element_stencils(scheme, signature, np.concatenate(every)) for signature in signatures]
-    ends = np.cumsum([len(uv) for uv in every])
-    for uv, end in zip(every, ends, strict=True):
-        both = sampled_polynomials(scheme, elements, [uv] * len(elements))
-        forms = list(zip((PLANE_POWERS, polynomial_basis(scheme).powers), both, strict=True))
-        for which, of_element in enumerate(stencils):
-            expected = of_element[:, end - len(uv) : end]
-            found, held = weights_of(forms, which, slice(which * len(uv), (which + 1) * len(uv)))
-            assert (held == 1).all()
-            np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=ROUNDED * np.abs(expected[0]).max())
-            np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
-            some = points.normal(size=(found.shape[2], 3))
-            normals, expected_normals = (np.cross(*(own[1:] @ some)) for own in (found, expected))
-            exists = expected[1:].any(axis=(0, 2))
-            for each in (normals, expected_normals):
-                each[exists] /= np.linalg.norm(each[exists], axis=1, keepdims=True)
-            np.testing.assert_allclose(normals[exists], expected_normals[exists], rtol=0, atol=PARALLEL)
+    uv, elements = grid(scheme, rate), [patch_tree(scheme, signature) for signature in signatures]
+    both = sampled_polynomials(scheme, elements, [uv] * len(elements))
+    forms = list(zip((PLANE_POWERS, polynomial_basis(scheme).powers), both, strict=True))
+    for which, signature in enumerate(signatures):
+        expected = element_stencils(scheme, signature, uv)
+        found, held = weights_of(forms, which, slice(which * len(uv), (which + 1) * len(uv)))
+        assert (held == 1).all()
+        np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=ROUNDED * np.abs(expected[0]).max())
+        np.testing.assert_array_equal((found == 0).all(axis=2), (expected == 0).all(axis=2))
+        points = np.random.default_rng(0).normal(size=(found.shape[2], 3))
+        normals, expected_normals = (np.cross(*(own[1:] @ points)) for own in (found, expected))
+        exists = expected[1:].any(axis=(0, 2))
+        for each in (normals, expected_normals):
+            each[exists] /= np.linalg.norm(each[exists], axis=1, keepdims=True)
+        np.testing.assert_allclose(normals[exists], expected_normals[exists], rtol=0, atol=PARALLEL)
 
 
 def test_few_samples_have_planes_and_many_a_polynomial():

@@ -19,22 +19,26 @@ from reference.sharp_refinement import SharpMesh
 POSITION = 1e-14
 NORMAL = 1e-9
 LADDER = (0.3, 0.5, 1, 1.7, 2.5, 4)
+
+
 TOP = ((4, 5), (5, 7), (7, 6), (6, 4))
 BALLS = {"catmull_clark": cube(), "loop": ControlCage(*octahedron())}
 
 
 def ring(*sharpness, **options):
     """A cube with creases around its top, of one sharpness or of one each."""
-    each = sharpness * 4 if len(sharpness) == 1 else sharpness
-    return tagged(cube(), creases=[(*edge, s) for edge, s in zip(TOP, each, strict=True)], **options)
+    each = zip(TOP, sharpness * 4 if len(sharpness) == 1 else sharpness, strict=True)
+    return tagged(cube(), creases=[(a, b, s) for (a, b), s in each], **options)
 
 
 def sharp_ball(scheme, sharpness, spread, method, **options):
     """Creases along all edges, of sharpness from ``sharpness`` down to nearly ``spread`` less."""
-    t, first = BALLS[scheme].topology, BALLS[scheme].topology.edge_half_edge
-    fall = spread * np.arange(len(first)) / len(first)
-    creases = np.column_stack([t.face_vertices[first], t.face_vertices[t.next[first]], sharpness - fall])
-    return tagged(BALLS[scheme], creases=creases, crease_method=method, **options)
+    cage = BALLS[scheme]
+    t = cage.topology
+    ends = [(t.face_vertices[h], t.face_vertices[t.next[h]]) for h in t.edge_half_edge]
+    fall = spread * np.arange(len(ends)) / len(ends)
+    creases = [(int(a), int(b), sharpness - less) for (a, b), less in zip(ends, fall, strict=True)]
+    return tagged(cage, creases=creases, crease_method=method, **options)
 
 
 CAGES = {
@@ -74,20 +78,29 @@ EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAG
 def slow_mesh(scheme, cage):
     t, creases = cage.topology, cage.tags.creases(cage.topology)
     ends_of_border = np.flatnonzero(t.is_border_vertex & (t.vertex_face_count == 1)).tolist()
-    faces = [tuple(face) for face in faces_of(cage)]
-    edges = {frozenset((int(a), int(b))): float(s) for a, b, s in creases}
-    vertices = dict.fromkeys(ends_of_border, 10.0) | {int(v): float(s) for v, s in cage.tags.corners()}
-    is_smooth = cage.triangle_rule == "smooth"
-    return SharpMesh(scheme, cage.positions, faces, edges, vertices, cage.crease_method, is_smooth)
+    return SharpMesh(
+        scheme,
+        cage.positions,
+        [tuple(face) for face in faces_of(cage)],
+        {frozenset((int(a), int(b))): float(s) for a, b, s in creases},
+        {**dict.fromkeys(ends_of_border, 10.0), **{int(v): float(s) for v, s in cage.tags.corners()}},
+        cage.crease_method,
+        cage.triangle_rule == "smooth",
+    )
 
 
 @pytest.mark.core
 @EVERY_CAGE
-def test_one_refinement_has_the_same_surface_and_neighbours_agree_along_edges(scheme, cage, np_rng):
-    surface = LimitSurface(with_bumps(cage), scheme)
-    points, normals = differences_to_refined(surface, np_rng, levels=12)
+def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
+    points, normals = differences_to_refined(LimitSurface(with_bumps(cage), scheme), np_rng, levels=12)
     assert points <= POSITION * 4
     assert normals <= NORMAL
+
+
+@pytest.mark.core
+@EVERY_CAGE
+def test_neighbours_agree_along_edges(scheme, cage, np_rng):
+    surface = LimitSurface(with_bumps(cage), scheme)
     t = cage.topology
     whole = (cage.face_sizes == surface.scheme.domain.corner_count)[t.face]
     half_edge = np_rng.choice(np.flatnonzero((t.twin >= 0) & whole & whole[t.twin]), 60)
@@ -97,14 +110,12 @@ def test_one_refinement_has_the_same_surface_and_neighbours_agree_along_edges(sc
     assert angle(one.n[smooth], other.n[smooth]).max() <= NORMAL
 
 
-def test_greater_sharpness_pulls_further_and_10_is_infinite_and_9_nearly():
+def test_sharpness_10_is_infinite_and_9_nearly():
     infinite, nearly, smooth = (LimitSurface(with_bumps(ring(s))).tessellate(4).positions for s in (10, 9, 0))
     assert np.abs(smooth.max(axis=0) - infinite.max(axis=0)).max() > 0.05
     # The crease of 9 follows the other to half a thousandth of an edge.
     distance = np.linalg.norm(infinite[:, None] - nearly[None], axis=2).min(axis=1)
     assert 0 < distance.max() < 2e-3
-    heights = [LimitSurface(ring(s)).tessellate(8).positions[:, 2].mean() for s in (0, *LADDER)]
-    assert (np.diff(heights) > 0).all()
 
 
 @pytest.mark.parametrize("scheme", BALLS)
@@ -115,6 +126,11 @@ def test_a_vertex_of_sharpness_10_stays_and_one_of_9_nearly(scheme):
         moved = np.abs(found.p[0] - surface.cage.positions[0]).max()
         # A cusp draws near its tip more slowly than by halves.
         assert (moved <= POSITION) if stays else (1e-5 < moved < 2e-2)
+
+
+def test_greater_sharpness_pulls_further():
+    heights = [LimitSurface(ring(s)).tessellate(8).positions[:, 2].mean() for s in (0, *LADDER)]
+    assert (np.diff(heights) > 0).all()
 
 
 @pytest.mark.core
@@ -129,9 +145,12 @@ def test_smooth_triangles_are_those_of_the_rules_and_differ():
     assert np.abs(LimitSurface(cage).tessellate(2).positions - usual.tessellate(2).positions).max() > 1e-3
 
 
-def test_chaikin_mixes_what_uniform_keeps_apart_and_rules_that_change_nothing_keep_the_scheme():
+def test_rules_that_change_nothing_keep_the_scheme():
     unchanged = LimitSurface(tagged(cube(), triangle_rule="smooth", crease_method="chaikin"))
     assert unchanged.scheme is LimitSurface(cube()).scheme
+
+
+def test_chaikin_mixes_what_uniform_keeps_apart():
     cages = (tagged(cube(), creases=[(4, 5, 0.5), (5, 7, 3.5)], crease_method=m) for m in ("uniform", "chaikin"))
     uniform, chaikin = (LimitSurface(cage).tessellate(4).positions for cage in cages)
     assert np.abs(uniform - chaikin).max() > 1e-3
@@ -166,15 +185,23 @@ def assert_part(found, whole, faces):
 
 
 @pytest.mark.core
-def test_holes_and_faces_at_a_boundary_that_is_none_shape_the_surface_but_are_not_part_of_it():
-    cage = with_bumps(sheet(4, 4))
-    whole = LimitSurface(cage).tessellate(3)
-    pierced = LimitSurface(tagged(cage, holes=[4, 0]))
-    assert_part(pierced.tessellate(3), whole, set(range(16)) - {0, 4})
-    assert_part(LimitSurface(tagged(cage, boundary="none")).tessellate(3), whole, {5, 6, 9, 10})
-    pierced.evaluate(3, [[0.5, 0.5]])
+def test_holes_shape_the_surface_but_are_not_part_of_it():
+    cage = with_bumps(sheet(3, 3))
+    pierced = LimitSurface(tagged(cage, holes=[4, 0])).tessellate(3)
+    assert_part(pierced, LimitSurface(cage).tessellate(3), set(range(9)) - {0, 4})
+
+
+def test_holes_are_no_elements():
+    surface = LimitSurface(sheet(3, 3, holes=[4]))
+    surface.evaluate(3, [[0.5, 0.5]])
     with pytest.raises(ValueError, match="element of sample 0 is 4; expected one that has a surface: no hole"):
-        pierced.evaluate(4, [[0.5, 0.5]])
+        surface.evaluate(4, [[0.5, 0.5]])
+
+
+def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
+    cage = with_bumps(sheet(4, 4))
+    inner = LimitSurface(tagged(cage, boundary="none")).tessellate(2)
+    assert_part(inner, LimitSurface(cage).tessellate(2), {5, 6, 9, 10})
     with pytest.raises(SchemeError, match='boundary "none" leaves no face'):
         LimitSurface(sheet(2, 2, boundary="none"))
 
@@ -195,10 +222,15 @@ def around(mesh, vertex):
         faces = [face for face in mesh.faces if near & {*face}]
         near = {v for face in faces for v in face}
     number = {v: k for k, v in enumerate(sorted(near))}
-    faces = [tuple(number[v] for v in face) for face in faces]
-    edges = {frozenset(number[v] for v in edge): s for edge, s in mesh.edges.items() if edge <= near}
-    vertices = {number[v]: s for v, s in mesh.vertices.items() if v in near}
-    return SharpMesh(mesh.scheme, mesh.points[sorted(near)], faces, edges, vertices, mesh.method), number[vertex]
+    kept = SharpMesh(
+        mesh.scheme,
+        mesh.points[sorted(near)],
+        [tuple(number[v] for v in face) for face in faces],
+        {frozenset(number[v] for v in edge): s for edge, s in mesh.edges.items() if edge <= near},
+        {number[v]: s for v, s in mesh.vertices.items() if v in near},
+        mesh.method,
+    )
+    return kept, number[vertex]
 
 
 # Refinements, after which a vertex is nearer to its limit than this: ten with a crease, then each divides the distance,

@@ -109,14 +109,19 @@ def places(scheme, rng, count=12):
 
 
 @EVERY_CAGE
-def test_polynomials_are_the_limit_stencils_and_agree_with_their_neighbours_where_they_meet(scheme, cage, np_rng):
+def test_polynomials_are_the_limit_stencils(scheme, cage, np_rng):
     for own, patch_class, tree, levels in trees(scheme, cage):
-        walker, domain = Walker(own, tree, levels), own.domain
-        uv = places(own, np_rng)
+        uv, walker = places(own, np_rng), Walker(own, tree, levels)
         found, expected = [walker.stencil(each) for each in uv], element_stencils(own, patch_class.signature, uv)[0]
         np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
-        # On lines between copies of the domain, at every level, taken from either side. Both sides of a dart have their
-        # own copies of the vertices on it.
+
+
+@EVERY_CAGE
+def test_pieces_agree_with_their_neighbours_where_they_meet(scheme, cage, np_rng):
+    """On lines between copies of the domain, at every level, taken from either side."""
+    for own, patch_class, tree, levels in trees(scheme, cage):
+        walker, domain = Walker(own, tree, levels), own.domain
+        # Both sides of a dart have their own copies of the vertices on it.
         vertices = cage.cut_mesh.vertex[patch_class.controls[0]]
         for _ in range(8):
             depth = int(np_rng.integers(1, 7))
@@ -132,7 +137,7 @@ def test_polynomials_are_the_limit_stencils_and_agree_with_their_neighbours_wher
 @EVERY_CAGE
 def test_trees_are_whole_and_rows_of_the_constant_sum_to_one_and_all_others_to_zero(scheme, cage):
     """Every node but the first is the child of one other, and pieces and blocks follow each other without gaps."""
-    for own, patch_class, tree, piece_levels in trees(scheme, cage):
+    for own, _, tree, piece_levels in trees(scheme, cage):
         constant = (polynomial_basis(own).powers == 0).all(axis=1)
         for each in tree.maps:
             sums = each.pieces.sum(axis=2)
@@ -140,8 +145,10 @@ def test_trees_are_whole_and_rows_of_the_constant_sum_to_one_and_all_others_to_z
             if each.stencils is not None:
                 np.testing.assert_allclose(each.stencils.sum(axis=1), 1, rtol=0, atol=ROUNDING)
         is_inner, is_tip = np.isin(tree.kinds, (PartKind.DIVIDED, PartKind.ONLY_CHILD)), tree.kinds == PartKind.TIP
-        children = ragged.ranges(tree.first[is_inner], np.where(tree.kinds == PartKind.DIVIDED, 4, 1)[is_inner])
-        assert sorted(children.tolist()) == list(range(1, len(tree.kinds)))
+        counts = np.where(tree.kinds == PartKind.DIVIDED, 4, 1)[is_inner]
+        np.testing.assert_array_equal(
+            np.sort(ragged.ranges(tree.first[is_inner], counts)), np.arange(1, len(tree.kinds))
+        )
         assert (tree.turns < own.domain.corner_count).all()
         first = [(number, 1) for number in tree.first[tree.kinds == PartKind.REGULAR].tolist()]
         first += [(number, 3 * piece_levels) for number in tree.first[is_tip].tolist()]
@@ -150,12 +157,6 @@ def test_trees_are_whole_and_rows_of_the_constant_sum_to_one_and_all_others_to_z
         uneven = np.where(tree.frames == FrameKind.UNEVEN, 2, 1)
         sizes = (3 * uneven * (tree.levels - piece_levels) + 2)[is_tip]
         assert followed(zip(tree.first_block[is_tip].tolist(), sizes.tolist(), strict=True)) == len(tree.blocks)
-        # The last level is as near as single precision tells.
-        (element,) = patch_trees(own, [patch_class.signature])
-        tips = np.flatnonzero(is_tip)[np.argsort(tree.first_block[is_tip])]
-        for levels, tip in zip(tree.levels[tips], element.tips, strict=True):
-            assert tip.irregular_patch.basis.subdominant**levels <= FLOAT32_SIZE * (1 + 1e-9)
-            assert levels >= -np.log2(FLOAT32_SIZE)
 
 
 def followed(runs):
@@ -165,6 +166,18 @@ def followed(runs):
         assert first == end or not size
         end += size
     return end
+
+
+@EVERY_CAGE
+def test_the_last_level_is_as_near_as_single_precision_tells(scheme, cage):
+    for own, patch_class, tree, _ in trees(scheme, cage):
+        (element,) = patch_trees(own, [patch_class.signature])
+        eigenvalues = [tip.irregular_patch.basis.subdominant for tip in element.tips]
+        is_tip = np.flatnonzero(tree.kinds == PartKind.TIP)
+        in_order = is_tip[np.argsort(tree.first_block[is_tip])]
+        for levels, eigenvalue in zip(tree.levels[in_order], eigenvalues, strict=True):
+            assert eigenvalue**levels <= FLOAT32_SIZE * (1 + 1e-9)
+            assert levels >= -np.log2(FLOAT32_SIZE)
 
 
 def test_parts_that_are_divided_alike_share_their_pieces():

@@ -9,7 +9,6 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.patches import closest_points, polynomial_pieces
-from mitsuba_subdivision.patches.closest_points import BoxTree
 from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
 from patches.closed_cages import bumpy, cage_of, creased
 from patches.locations import grid_locations
@@ -81,7 +80,8 @@ def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np
     # Most minima that the other search finds are the same.
     assert np.median(others - found.distance) <= 1e-5 * size
     there = surface.evaluate(found.element, found.uv, found.corner)
-    np.testing.assert_array_equal([found.p, found.n], [there.p, there.n])
+    np.testing.assert_array_equal(found.p, there.p)
+    np.testing.assert_array_equal(found.n, there.n)
     np.testing.assert_array_equal(found.distance, np.linalg.norm(points - found.p, axis=1))
     inside = surface.scheme.domain.inside(found.uv) > 1e-9
     assert inside.sum() > len(points) / 4
@@ -104,16 +104,12 @@ def test_ways_cross_edges_of_elements_along_the_normal(scheme, np_rng):
 
 
 @pytest.mark.core
-def test_nearest_points_of_flat_sheets_and_creased_boxes_are_projections(np_rng):
+def test_nearest_points_of_a_flat_sheet_are_projections():
+    surface = LimitSurface(sheet(4, 3))
     points = np.array([[1.3, 2.2, 5.0], [2, 1, -1], [-1, 1.25, 1], [5, 4, 2], [0.5, -3, 0]])
-    found = LimitSurface(sheet(4, 3)).closest_point(points)
+    found = surface.closest_point(points)
     np.testing.assert_allclose(found.p, np.clip(points, 0, [4, 3, 0]), rtol=0, atol=1e-14)
     np.testing.assert_allclose(found.n, [[0, 0, 1]] * 5, rtol=0, atol=1e-14)
-    points = np_rng.uniform(1, 3, (50, 3)) * np_rng.choice([-1, 1], (50, 3))
-    points[:20, 0] = np_rng.uniform(-1, 1, 20)
-    points[:10, 1] = np_rng.uniform(-1, 1, 10)
-    found = LimitSurface(creased(cube())).closest_point(points)
-    np.testing.assert_allclose(found.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
 
 
 @pytest.mark.core
@@ -140,6 +136,15 @@ def test_points_above_places_next_to_extraordinary_ones(name, np_rng):
     assert (surface.closest_point(samples.p + 1e-3 * samples.n).distance <= 1e-3 + ROUNDED).all()
 
 
+def test_creases_are_found(np_rng):
+    """A cube of creases is flat: the nearest points are those of a box."""
+    points = np_rng.uniform(1, 3, (50, 3)) * np_rng.choice([-1, 1], (50, 3))
+    points[:20, 0] = np_rng.uniform(-1, 1, 20)
+    points[:10, 1] = np_rng.uniform(-1, 1, 10)
+    found = LimitSurface(creased(cube())).closest_point(points)
+    np.testing.assert_allclose(found.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
+
+
 def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
     surface = surface_named("mixed torus")
     points = np_rng.normal(size=(200, 3)) * 3
@@ -155,9 +160,10 @@ def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "count", "module", "limits"),
     [
-        ("rook", 300, closest_points, [{"MOST_KEPT": 0}, {"MOST_KEPT": 100}]),
-        ("mixed torus", 20, polynomial_pieces, [{"MOST_PIECES": 1, "DIVISIONS": 1}]),
-        ("semi-sharp ring", 20, polynomial_pieces, [{"MOST_PIECES": 1, "DIVISIONS": 1}]),
+        ("rook", 300, closest_points, {"MOST_KEPT": 0}),
+        ("rook", 300, closest_points, {"MOST_KEPT": 100}),
+        ("mixed torus", 20, polynomial_pieces, {"MOST_PIECES": 1, "DIVISIONS": 1}),
+        ("semi-sharp ring", 20, polynomial_pieces, {"MOST_PIECES": 1, "DIVISIONS": 1}),
     ],
 )
 def test_levels_and_divisions_that_are_made_when_needed_change_nothing(
@@ -166,12 +172,11 @@ def test_levels_and_divisions_that_are_made_when_needed_change_nothing(
     surface = surface_named(name)
     points = np_rng.uniform(-1.5, 3, (count, 3))
     expected = surface.closest_point(points)
-    for each in limits:
-        for limit, value in each.items():
-            monkeypatch.setattr(module, limit, value)
-        later = LimitSurface(surface.cage)
-        np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
-        assert later.area() == pytest.approx(surface.area(), rel=AREA)
+    for limit, value in limits.items():
+        monkeypatch.setattr(module, limit, value)
+    later = LimitSurface(surface.cage)
+    np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
+    assert later.area() == pytest.approx(surface.area(), rel=AREA)
 
 
 def points_of_pieces(pieces, which, uv):
@@ -216,8 +221,8 @@ def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_p
     np.testing.assert_array_equal(nearest_in_pieces(scaled, which, unit * points, begin, unit)[0], uv)
     # Some take shorter steps where others have taken theirs.
     parts = [nearest_in_pieces(pieces, which[at], points[at], begin[at], 1.0) for at in np.split(np.arange(count), 100)]
-    for all_found, found in ((uv, [each for each, _, _ in parts]), (slope, [each for _, _, each in parts])):
-        np.testing.assert_allclose(all_found, np.concatenate(found), rtol=0, atol=DESCENT)
+    np.testing.assert_allclose(uv, np.concatenate([each for each, _, _ in parts]), rtol=0, atol=DESCENT)
+    np.testing.assert_allclose(slope, np.concatenate([each for _, _, each in parts]), rtol=0, atol=DESCENT)
 
 
 def test_nearest_points_move_with_the_surface(np_rng):
@@ -228,10 +233,9 @@ def test_nearest_points_move_with_the_surface(np_rng):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
 
 
-def test_holes_and_no_points_have_no_nearest_points(np_rng):
+def test_holes_have_no_nearest_points():
     surface = LimitSurface(tagged(cube(), holes=[1]))
-    assert 1 not in surface.closest_point(np_rng.normal(size=(100, 3)) * 3).element
-    assert surface.closest_point(np.empty((0, 3))).p.shape == (0, 3)
+    assert 1 not in surface.closest_point(np.random.default_rng(0).normal(size=(100, 3)) * 3).element
 
 
 @pytest.mark.parametrize("points", [[1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, np.nan, 0.0]], [[np.inf, 0.0, 0.0]]])
@@ -240,31 +244,11 @@ def test_points_that_are_none_are_an_error(points):
         LimitSurface(cube()).closest_point(points)
 
 
+def test_no_points_have_no_nearest_ones():
+    assert LimitSurface(cube()).closest_point(np.empty((0, 3))).p.shape == (0, 3)
+
+
 def test_a_collapsed_surface_is_a_point():
     found = LimitSurface(cube().with_positions(np.ones((8, 3)))).closest_point([[1.0, 1.0, 4.0]])
     np.testing.assert_allclose(found.p, [[1, 1, 1]], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(found.n, [[0, 0, 0]])
-
-
-@pytest.mark.core
-@pytest.mark.parametrize("most", [closest_points.MOST_PAIRS, 10])
-def test_near_boxes_are_those_no_further_than_asked(most, np_rng, monkeypatch):
-    """In whole numbers, so that some are exactly as far."""
-    monkeypatch.setattr(closest_points, "MOST_PAIRS", most)
-    lower = np_rng.integers(0, 20, (300, 3)).astype(float)
-    upper, points = lower + np_rng.integers(0, 5, (300, 3)), np_rng.integers(-5, 30, (40, 3)).astype(float)
-    squared = np_rng.integers(0, 6, 40).astype(float) ** 2
-    point, box = BoxTree.build(lower, upper).near(points, squared)
-    gaps = np.linalg.norm(np.maximum(0, np.maximum(lower - points[:, None], points[:, None] - upper)), axis=2) ** 2
-    assert (np.abs(gaps - squared[:, None]) < 0.5).any()
-    expected = np.argwhere(gaps.round() <= squared[:, None])
-    assert sorted(np.stack([point, box], axis=1).tolist()) == expected.tolist()
-
-
-@pytest.mark.core
-def test_boxes_of_a_grid_have_parents_that_are_cubes(np_rng):
-    """Along Morton's curve, which fills a cube of eight before it goes on."""
-    lower = np.indices((8, 8, 8)).reshape(3, -1).T.astype(float)[np_rng.permutation(512)]
-    levels = BoxTree.build(lower, lower + 1).levels
-    for (low, high), side in zip(levels, (1, 2, 4), strict=True):
-        np.testing.assert_array_equal(high - low, side)

@@ -18,9 +18,11 @@ GRID, BETWEEN = 16, 1.005
 
 
 def assert_contained(surface, np_rng, count=SAMPLES):
-    bounds, elements, domain = surface.bounds(), surface.patches.elements, surface.scheme.domain
-    number = np_rng.integers(0, len(bounds.element), count)
-    element = bounds.element[number]
+    bounds = surface.bounds()
+    lower, upper = (np.full((len(surface.patches.elements.face_sizes), 3), np.nan) for _ in range(2))
+    lower[bounds.element], upper[bounds.element] = bounds.lower, bounds.upper
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    element = np_rng.choice(bounds.element, count)
     corner = np_rng.integers(0, elements.face_sizes[element])
     uv = np_rng.dirichlet(np.ones(domain.corner_count), count) @ domain.corners
     uv[: count // 2] *= 2.0 ** -np_rng.integers(0, 30, (count // 2, 1))
@@ -28,8 +30,8 @@ def assert_contained(surface, np_rng, count=SAMPLES):
     uv[: count // 4, 0] = 0
     for dtype in (np.float64, np.float32):
         found = surface.evaluate(element, uv, corner, dtype=dtype).p.astype(np.float64)
-        assert (found >= bounds.lower[number]).all()
-        assert (found <= bounds.upper[number]).all()
+        assert (found >= lower[element]).all()
+        assert (found <= upper[element]).all()
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -57,10 +59,16 @@ def test_a_minimum_inside_an_element_is_met_to_a_256th_of_its_square():
     assert -1 / 256 - 1e-5 <= bounds.lower[middle, 2] <= 0
 
 
-@pytest.mark.parametrize("name", [*SURFACES, "bent catmull_clark", "bent loop", "bent doo_sabin"])
-def test_boxes_are_tight(name):
-    _, *bent = name.split("bent ")
-    surface = LimitSurface(bumpy(cage_of(*bent, "mixed torus"), size=1), *bent) if bent else surface_named(name)
+def bent(scheme):
+    return LimitSurface(bumpy(cage_of(scheme, "mixed torus"), size=1), scheme)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [(surface_named, name) for name in SURFACES] + [(bent, name) for name in ("catmull_clark", "loop", "doo_sabin")],
+)
+def test_boxes_are_tight(make, name):
+    surface = make(name)
     bounds = surface.bounds()
     start, uv = grid_locations(surface, GRID)
     points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
@@ -72,11 +80,10 @@ def test_boxes_are_tight(name):
     assert (np.linalg.norm(bounds.upper - bounds.lower, axis=1) <= LONGER * BETWEEN * tight).all()
 
 
-def test_boxes_of_flat_elements_are_the_elements_and_a_collapsed_surface_has_some():
-    inner = LimitSurface(sheet(4, 3)).bounds([5])
+def test_boxes_of_flat_elements_are_the_elements():
+    surface = LimitSurface(sheet(4, 3))
+    inner = surface.bounds([5])
     np.testing.assert_allclose([inner.lower, inner.upper], [[[1, 1, 0]], [[2, 2, 0]]], rtol=0, atol=1e-5)
-    point = LimitSurface(cube().with_positions(np.zeros((8, 3)))).bounds()
-    np.testing.assert_array_equal([point.lower, point.upper], 0)
 
 
 def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
@@ -92,17 +99,29 @@ def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
     np.testing.assert_allclose(found, expected, rtol=0, atol=0.03 * size)
 
 
-def test_elements_are_chosen_by_number_and_those_that_do_not_exist_are_an_error():
+def test_elements_are_chosen_by_number():
     surface = LimitSurface(bumpy(cage_of("catmull_clark", "mixed torus")))
     every, some, chosen = surface.bounds(), surface.bounds([4, 1, 4]), [4, 1, 4]
     assert some.element.tolist() == chosen
     np.testing.assert_array_equal([some.lower, some.upper], [every.lower[chosen], every.upper[chosen]])
-    pierced = LimitSurface(tagged(cube(), holes=[2]))
-    assert pierced.bounds().element.tolist() == [0, 1, 3, 4, 5]
-    problems = {6: "expected 0 to 5", -1: "expected 0", 0.5: "integers", 2: "0 is 2; expected one that has a surface"}
-    for element, problem in problems.items():
-        with pytest.raises(ValueError, match=problem):
-            pierced.bounds([element])
+
+
+def test_holes_have_no_box():
+    surface = LimitSurface(tagged(cube(), holes=[2]))
+    assert surface.bounds().element.tolist() == [0, 1, 3, 4, 5]
+    with pytest.raises(ValueError, match="element of sample 0 is 2; expected one that has a surface"):
+        surface.bounds([2])
+
+
+@pytest.mark.parametrize(("element", "problem"), [([6], "expected 0 to 5"), ([-1], "expected 0"), ([0.5], "integers")])
+def test_elements_that_do_not_exist_are_an_error(element, problem):
+    with pytest.raises(ValueError, match=problem):
+        LimitSurface(cube()).bounds(element)
+
+
+def test_a_collapsed_surface_has_boxes():
+    bounds = LimitSurface(cube().with_positions(np.zeros((8, 3)))).bounds()
+    np.testing.assert_array_equal([bounds.lower, bounds.upper], 0)
 
 
 def test_boxes_do_not_depend_on_the_numbering_of_faces():

@@ -1,5 +1,3 @@
-"""Patches of elements, in classes of equal one-rings."""
-
 import numpy as np
 import pytest
 from evaluation.test_semi_sharp import CAGES as SEMI_SHARP
@@ -8,7 +6,6 @@ from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import NEAR_FACES, signature_at
 from mitsuba_subdivision.patches import PatchTable
-from mitsuba_subdivision.patches.one_ring_codes import FEW_CODES, row_codes
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, triangulated
 from reference.exact_samples import mesh_of
@@ -39,21 +36,14 @@ def assert_classes_differ(table):
 
 
 @EVERY_SURFACE
-def test_every_whole_element_is_one_patch_and_every_corner_of_others_and_leads_back_to_it(scheme, name):
+def test_every_whole_element_is_one_patch_and_every_corner_of_others(scheme, name):
     table = patch_table(scheme, cage_of(scheme, name))
-    elements, face = table.elements, table.elements.face
+    face = table.elements.face
     corners = np.concatenate([patch_class.corners for patch_class in table.classes])
     assert len(corners) == table.patch_count
     whole = table.is_whole[face[corners]]
     np.testing.assert_array_equal(np.sort(face[corners[whole]]), np.flatnonzero(table.is_whole))
     np.testing.assert_array_equal(np.sort(corners[~whole]), np.flatnonzero(~table.is_whole[face]))
-    classes, patches, turns = table.patch_at(np.arange(elements.half_edge_count))
-    for corner in range(elements.half_edge_count):
-        found = table.classes[classes[corner]].corners[patches[corner]]
-        for _ in range(turns[corner]):
-            found = elements.next[found]
-        assert found == corner
-        assert 0 <= turns[corner] < (table.scheme.domain.corner_count if table.is_whole[face[corner]] else 1)
 
 
 @pytest.mark.parametrize(("scheme", "cage"), EVERY_CAGE.values(), ids=EVERY_CAGE)
@@ -94,6 +84,19 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
 
 
 @EVERY_SURFACE
+def test_the_patch_at_a_corner_leads_back_to_it(scheme, name):
+    table = patch_table(scheme, cage_of(scheme, name))
+    elements = table.elements
+    classes, patches, turns = table.patch_at(np.arange(elements.half_edge_count))
+    for corner in range(elements.half_edge_count):
+        found = table.classes[classes[corner]].corners[patches[corner]]
+        for _ in range(turns[corner]):
+            found = elements.next[found]
+        assert found == corner
+        assert 0 <= turns[corner] < (table.scheme.domain.corner_count if table.is_whole[elements.face[corner]] else 1)
+
+
+@EVERY_SURFACE
 def test_numbering_and_first_corners_do_not_matter_to_the_classes(scheme, name):
     cage = cage_of(scheme, name)
     rng = np.random.default_rng(8)
@@ -126,36 +129,18 @@ def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
     np.testing.assert_array_equal(elements.face_vertices[elements.twin], elements.face_vertices[elements.next])
 
 
-def test_a_regular_mesh_and_a_cube_are_one_class_and_a_prism_has_one_for_each_kind_of_corner():
-    for scheme in ("catmull_clark", "doo_sabin", "loop"):
-        cage = triangulated(torus(40, 50)) if scheme == "loop" else torus(40, 50)
-        table = patch_table(scheme, cage)
-        (patch_class,) = table.classes
-        count = cage.vertex_count if scheme == "doo_sabin" else cage.face_count
-        assert table.patch_count == len(patch_class.corners) == count
+@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin", "loop"])
+def test_regular_mesh_has_one_class(scheme):
+    cage = triangulated(torus(40, 50)) if scheme == "loop" else torus(40, 50)
+    table = patch_table(scheme, cage)
+    (patch_class,) = table.classes
+    count = cage.vertex_count if scheme == "doo_sabin" else cage.face_count
+    assert table.patch_count == len(patch_class.corners) == count
+
+
+def test_cube_is_one_class_and_a_prism_has_one_for_each_kind_of_corner():
     assert len(patch_table("catmull_clark", CLOSED_CAGES["cube"]()).classes) == 1
     table = patch_table("catmull_clark", CLOSED_CAGES["prism"]())
-    # Corners of both pentagons; quads; three corners of triangles that stand on a pentagon, and of those on a quad.
+    # Corners of the two pentagons; quads; three corners of the triangles that stand on a pentagon, and of those on a
+    # quad.
     assert sorted(len(patch_class.corners) for patch_class in table.classes) == [5] * 9
-
-
-@pytest.mark.parametrize("count", [1, 7, 500])
-@pytest.mark.parametrize("widths", [(3,), (1, 1), (2, 5, 3), (1 << 40, 3, 1 << 20), (300, 1, 300, 300)])
-def test_codes_are_equal_and_ordered_as_rows_are(np_rng, widths, count):
-    # Few distinct values over wide ranges: rows repeat, and ranges multiply beyond any integer.
-    columns = [np_rng.choice(np_rng.integers(-width, width, 4), count) for width in widths]
-    rows = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
-    codes = row_codes(columns)
-    np.testing.assert_array_equal(np.unique(codes, return_inverse=True)[1].ravel(), rows)
-
-
-def test_many_codes_of_many_rows_are_numbered_anew(np_rng):
-    count = 60_000
-    columns = [3 * np_rng.integers(0, 300, count), 7 * np_rng.integers(0, 30, count)]
-    assert FEW_CODES < 890 * 200 < 4 * count
-    rows = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
-    np.testing.assert_array_equal(row_codes(columns), rows)
-
-
-def test_no_rows_have_no_codes():
-    assert row_codes([np.zeros(0, dtype=np.int64)] * 2).shape == (0,)

@@ -1,4 +1,4 @@
-"""Adaptive tessellations have no cracks and no folds, and their vertices lie where they say, however they are made."""
+"""Adaptive tessellations have no cracks and no folds, and their vertices lie where they say."""
 
 import warnings
 from collections import defaultdict
@@ -10,8 +10,7 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube, torus
-from mitsuba_subdivision.mesh import ragged
-from mitsuba_subdivision.tessellation import Criterion, Measure, tile_choice
+from mitsuba_subdivision.tessellation import Criterion, Measure
 from mitsuba_subdivision.tessellation.tile_choice import feature_edges
 from mitsuba_subdivision.tessellation.tiles import PatchFrames
 from patches.closed_cages import bumpy
@@ -93,12 +92,11 @@ def assert_vertices_lie_where_triangles_say(surface, table):
     positions, normals = table.apply(surface.cage.positions)
     rounding = ROUNDING * np.abs(positions).max()
     corner, uv = table.grid.triangle_locations
-    starts, places = table.locations()
-    every_start, every_uv = np.concatenate([corner.repeat(3), starts]), np.concatenate([uv.reshape(-1, 2), places])
-    seen = surface._evaluate_from(every_start.astype(np.int64), every_uv, "stabilized", np.float64)
-    every_vertex = np.concatenate([table.triangles.ravel(), np.arange(table.vertex_count)])
-    np.testing.assert_allclose(positions[every_vertex], seen.p, rtol=0, atol=rounding)
-    np.testing.assert_allclose(normals, seen.n[-len(normals) :], rtol=0, atol=ROUNDING / 1e-3)
+    for i in range(3):
+        seen = surface._evaluate_from(corner.astype(np.int64), uv[:, i], "stabilized", np.float64)
+        np.testing.assert_allclose(positions[table.triangles[:, i]], seen.p, rtol=0, atol=rounding)
+    found = surface._evaluate_from(*table.locations(), "stabilized", np.float64)
+    np.testing.assert_allclose(normals, found.n, rtol=0, atol=ROUNDING / 1e-3)
     np.testing.assert_array_equal(positions, positions[table.weld_target])
     assert np.array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
 
@@ -111,11 +109,18 @@ def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
     assert found.surface_vertex is not None
     np.testing.assert_array_equal(found.surface_vertex[found.triangles], table.triangles)
     corner, uv = table.grid.triangle_locations
-    element = table.element.repeat(3)
-    places = element, uv.reshape(-1, 2), corner.repeat(3) - surface.patches.elements.face_offsets[element]
+    first = surface.patches.elements.face_offsets[table.element]
     for name, values in found.values.items():
-        expected = surface.evaluate_attribute(name, *places)
-        np.testing.assert_allclose(values[found.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
+        for i in range(3):
+            expected = surface.evaluate_attribute(name, table.element, uv[:, i], corner - first)
+            np.testing.assert_allclose(values[found.triangles[:, i]], expected, rtol=0, atol=ROUNDING)
+
+
+def test_the_same_cage_has_the_same_triangles():
+    cage = bumpy(torus(5, 4))
+    first, second = (table_of(LimitSurface(bumpy(torus(5, 4)))) for _ in range(2))
+    np.testing.assert_array_equal(first.triangles, second.triangles)
+    np.testing.assert_array_equal(*(each.apply(cage.positions)[0] for each in (first, second)))
 
 
 def with_a_diagonal_twice():
@@ -139,16 +144,23 @@ WITH_A_DIAGONAL_ON_THE_BORDER = ControlCage(
 )
 
 
-@pytest.mark.parametrize("cage", [with_a_diagonal_twice(), TWO_TRIANGLES, WITH_A_DIAGONAL_ON_THE_BORDER])
-def test_elements_that_meet_twice_have_no_edge_twice(cage):
+@pytest.mark.parametrize(
+    ("cage", "scheme", "is_open"),
+    [
+        (with_a_diagonal_twice(), "catmull_clark", False),
+        (TWO_TRIANGLES, "loop", False),
+        (WITH_A_DIAGONAL_ON_THE_BORDER, "catmull_clark", True),
+    ],
+)
+def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme, is_open):
     """The diagonals of two patches would be one edge, with four triangles; so would cuts across their corners."""
-    surface = LimitSurface(cage, "loop" if cage is TWO_TRIANGLES else "catmull_clark")
+    surface = LimitSurface(cage, scheme)
     table = table_of(surface, 100, 1)
     _, keys, twins = numbered_edges(table.triangles)
     assert len(np.unique(keys)) == len(keys)
     # All edges have two triangles, but for the three that a border has at least.
     lonely = np.setdiff1d(keys, twins)
-    assert len(lonely) >= 3 if cage is WITH_A_DIAGONAL_ON_THE_BORDER else len(lonely) == 0
+    assert len(lonely) >= 3 if is_open else len(lonely) == 0
     assert len(np.unique(np.sort(table.triangles, axis=1), axis=0)) == len(table.triangles)
     assert_elements_are_covered(surface, table)
     assert_vertices_lie_where_triangles_say(surface, table)
@@ -179,7 +191,8 @@ def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(see
 
 
 def test_a_surface_may_be_a_curve():
-    surface = LimitSurface(cube().with_positions(cube().positions * [1, 0, 0]))
+    cage = cube()
+    surface = LimitSurface(cage.with_positions(cage.positions * [1, 0, 0]))
     table = table_of(surface)
     assert table.grid.tiles["rates"].min() >= 1
     assert_elements_are_covered(surface, table)
@@ -210,7 +223,7 @@ FOLDED = {
     "convex": ControlCage([(0, 0, 0), (1, 0, 0), (1.4, 1, 0), (0, 1, 0)], TWICE),
     "concave": ControlCage([(0, 0, 0), (1, 0.8, 0), (2, 0, 0), (1, 2, 0)], TWICE),
     "foldover": ControlCage(
-        [(-0.5, -1, 0), (0.5, -1, 0), (1, 0, 0), (0.5, 1, 0), (-0.5, 1, 0), (-1, 0, 0)],
+        np.array([(-2, -4, 0), (2, -4, 0), (4, 0, 0), (2, 4, 0), (-2, 4, 0), (-4, 0, 0)]) / 4,
         [(0, 1, 2, 3, 4, 5), (5, 4, 3), (5, 1, 0)],
     ),
 }
@@ -232,51 +245,3 @@ def test_a_surface_folded_in_its_plane_is_covered(name):
     table, dense = table_of(surface, error, 1024), surface.tessellate(12).positions
     reached = distances_to(table.apply(surface.cage.positions)[0][table.triangles], dense).max()
     assert reached <= error * size_of(surface) * (1 + ROUNDING)
-
-
-def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
-    """And no block has more patches than it may: a class at its end is cut."""
-    surface, most, sizes = surface_named("rook"), 7, []
-    whole = table_of(surface, 1e-2, 64).triangles
-    whole_patches = tile_choice._whole_patches
-
-    def counted(*arguments):
-        for part in whole_patches(*arguments):
-            sizes.append(len(part.tiles))
-            yield part
-
-    monkeypatch.setattr(tile_choice, "MOST_WAITING", 2 * most)
-    monkeypatch.setattr(tile_choice, "TILES_AT_ONCE", most)
-    monkeypatch.setattr(tile_choice, "_whole_patches", counted)
-    np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)
-    assert max(sizes) == most
-    assert sum(sizes) == surface.patches.patch_count
-
-
-def test_tessellations_do_not_depend_on_the_chunks_that_fit_a_cache(monkeypatch):
-    named = surface_named("mixed torus")
-    tables = []
-    for length in (ragged.CHUNK_LENGTH, 5):
-        monkeypatch.setattr(ragged, "CHUNK_LENGTH", length)
-        # Tables of its own: a surface keeps what it has made.
-        surface = LimitSurface(named.cage, named.scheme)
-        adaptive, uniform = table_of(surface), surface.sampling(3)
-        vertices = *adaptive.apply(named.cage.positions), *uniform.apply(named.cage.positions)
-        places = *adaptive.locations(), *adaptive.grid.triangle_locations
-        tables.append([adaptive.triangles, adaptive.element, uniform.triangles, *vertices, *places])
-    assert len(tables[0][0]) > 100
-    for whole, cut in zip(*tables, strict=True):
-        np.testing.assert_array_equal(whole, cut)
-
-
-def test_too_many_triangles_are_refused_before_most_tiles_are_looked_at(monkeypatch):
-    surface, seen, decided = surface_named("rook"), [], tile_choice._decided
-
-    def counted(rates, part):
-        seen.append(len(part.tiles))
-        return decided(rates, part)
-
-    monkeypatch.setattr(tile_choice, "_decided", counted)
-    with pytest.raises(MemoryError, match="expected a larger error"):
-        surface.adaptive_sampling(Criterion(Measure.EDGE, 1e-9), 1024)
-    assert sum(seen) < 10 * surface.patches.patch_count

@@ -98,41 +98,38 @@ def test_the_shape_says_so_too(leave):
 
 
 LIMITED = """
-import re, resource
+import sys, resource
 import mitsuba_subdivision as msub
 from mitsuba_subdivision.cage import named_cages
-surface, rate = msub.LimitSurface(named_cages.cube()), 5000
+surface, rate = msub.LimitSurface(named_cages.cube()), int(sys.argv[1])
 surface.tessellate(8)
-for megabytes in (200, 300):
-    used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + (megabytes << 20), resource.RLIM_INFINITY))
-    try:
-        print(len(surface.tessellate(rate).positions))
-    except MemoryError as error:
-        print(error)
-        rate = int(re.search(r"[0-9]+$", str(error))[0])
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + int(sys.argv[2]), resource.RLIM_INFINITY))
+try:
+    print(len(surface.tessellate(rate).positions))
+except MemoryError as error:
+    print(error)
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of the process are read from /proc")
 def test_a_cube_at_5000_is_an_error_and_no_more_than_the_estimate_is_needed():
-    # Threads of other libraries would reserve memory of their own.
-    settings = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    output = subprocess.check_output([sys.executable, "-c", LIMITED], text=True, timeout=120, env=settings)
-    said, count = output.splitlines()
+    def run(rate, limit):
+        command = [sys.executable, "-c", LIMITED, str(rate), str(limit)]
+        # Threads of other libraries would reserve memory of their own.
+        settings = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        return subprocess.check_output(command, text=True, timeout=120, env=settings).strip()
+
+    said = run(5000, 200 * MEGABYTE)
     fits = int(re.fullmatch(r"tessellation rate 5000 needs about 32.7 GB, .* expected at most (\d+)", said)[1])
     assert 300 < fits < 500
     # It is an estimate: allocators keep more than they are asked for.
-    assert int(count) == 6 * fits**2 + 2
+    assert int(run(fits, 300 * MEGABYTE)) == 6 * fits**2 + 2
 
 
 # Rates of an adaptive grid have 16 bits.
 MAX_RATES = (0, -1, 2.5, "8", None, 1025, 40_000)
 OF_ANOTHER_CAGE = (np.zeros((5, 3)), np.zeros((9, 3)), np.full((8, 3), np.nan))
-
-
-NO_RATE = "max_rate .*; expected (an integer|1 or more|at most 1024)"
-NO_POINTS = r"control points of shape .*; expected finite ones of shape \(8, 3\)"
 
 
 @pytest.mark.parametrize(
@@ -141,8 +138,16 @@ NO_POINTS = r"control points of shape .*; expected finite ones of shape \(8, 3\)
         (LimitSurface.tessellate, (2.5, "8", None, np.array([1, 2])), "tessellation rate .*; expected an integer"),
         (LimitSurface.tessellate, (0, -1), "tessellation rate (0|-1); expected 1 or more"),
         (lambda each, rate: uniform_table(each.patches, rate), (0, -1), "tessellation rate (0|-1); expected 1 or more"),
-        (lambda surface, rate: surface.adaptive_sampling(CHORD, rate), MAX_RATES, NO_RATE),
-        (lambda surface, p: surface.adaptive_sampling(CHORD, control_points=p), OF_ANOTHER_CAGE, NO_POINTS),
+        (
+            lambda surface, rate: surface.adaptive_sampling(CHORD, rate),
+            MAX_RATES,
+            "max_rate .*; expected (an integer|1 or more|at most 1024)",
+        ),
+        (
+            lambda surface, points: surface.adaptive_sampling(CHORD, control_points=points),
+            OF_ANOTHER_CAGE,
+            r"control points of shape .*; expected finite ones of shape \(8, 3\)",
+        ),
         (lambda _, error: Criterion(Measure.CHORD, error), (-1e-3, np.nan), "expected a number from 0 on"),
     ],
 )
@@ -150,6 +155,9 @@ def test_what_makes_no_tessellation_is_an_error(make, values, message):
     for value in values:
         with pytest.raises(ValueError, match=message):
             make(LimitSurface(named_cages.cube()), value)
+
+
+def test_a_tessellation_is_shown_by_its_sizes():
     assert repr(LimitSurface(named_cages.cube()).tessellate(np.int64(2))) == "Tessellation(26 vertices, 48 triangles)"
 
 

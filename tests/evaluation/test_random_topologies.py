@@ -1,0 +1,53 @@
+"""A few of the random topologies of `fuzz.topologies`, and that its laws notice what is wrong."""
+
+import numpy as np
+import pytest
+from fuzz import topologies
+from mitsuba_subdivision import ControlCage, LimitSurface
+
+FEW = 60
+
+
+def test_surfaces_of_random_topologies_agree_with_those_of_their_refined_cages():
+    found = [topologies.outcome(seed) for seed in range(FEW)]
+    wrong = [(seed, result) for seed, (result, _) in enumerate(found) if not result.startswith(("ok", "refused"))]
+    assert wrong == []
+    compared = [differences for _, differences in found if differences is not None]
+    assert len(compared) > FEW / 2
+    # Some of them collapse, and most do not.
+    assert 0 < sum(differences.zero > 0 for differences in compared) < len(compared) / 2
+
+
+def test_random_faces_are_manifold_and_of_every_kind():
+    rng = np.random.default_rng(0)
+    valences, is_closed = set(), set()
+    for _ in range(100):
+        faces, origin = topologies.random_topology(rng)
+        assert topologies.is_manifold(faces)
+        topology = ControlCage(rng.random((len(origin), 3)), faces).topology
+        valences |= set(topology.vertex_face_count.tolist())
+        is_closed.add(bool((topology.twin >= 0).all()))
+    assert is_closed == {True, False}
+    assert {1, 2, 3, 4, 5, 6} <= valences
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda found: {"p": found.p + 1e-9}, "points differ by"),
+        (lambda found: {"n": found.n @ np.array([(1, 1e-6, 0), (-1e-6, 1, 0), (0, 0, 1)])}, "normals differ by"),
+        (lambda found: {"n": 0.999 * found.n}, "normals neither unit nor zero"),
+        (lambda found: {"n": np.nan * found.n}, "normals neither unit nor zero"),
+        (lambda found: {"n": 0 * found.n}, "normals zero on one side only"),
+    ],
+)
+def test_wrong_points_and_normals_are_found(change, problem, monkeypatch):
+    surface = LimitSurface(ControlCage(np.random.default_rng(1).random((4, 3)), topologies.SEEDS[4]))
+    evaluate_at = topologies.evaluate_at
+
+    def changed(of, *samples):
+        found = evaluate_at(of, *samples)
+        return found._replace(**change(found)) if of is surface else found
+
+    monkeypatch.setattr(topologies, "evaluate_at", changed)
+    assert problem in topologies.differences_to_refined(surface, np.random.default_rng(2)).problem

@@ -1,0 +1,30 @@
+"""Rows of numbers are read as they lie in memory, whatever their size, and their derivatives return to them."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+
+ROW_COUNT = 6
+
+
+# Sizes that packets divide and that they do not.
+@pytest.mark.core
+@pytest.mark.parametrize("size", [3, 4, 12, 16, 28, 48])
+def test_a_row_is_where_it_was_written_and_derivatives_return_to_it(size, variants_all_ad_rgb, np_rng):  # noqa: ARG001
+    types = ArrayTypes.of(mi.Float)
+    rows = np.arange(ROW_COUNT * size, dtype=np.float64).reshape(ROW_COUNT, size) + 1
+    buffer = types.floats(rows)
+    index, active = np_rng.integers(0, ROW_COUNT, 20), np_rng.random(20) < 0.7
+    found = types.row(buffer, size, types.indices(index), upload(mi.Mask, active))
+    np.testing.assert_array_equal(np.array(found).T, rows[index] * active[:, None])
+
+    dr.enable_grad(buffer)
+    weights = np_rng.integers(1, 5, (size, 20)).astype(np.float32)
+    found = types.row(buffer, size, types.indices(index))
+    dr.backward(dr.sum(sum(number * upload(mi.Float, weight) for number, weight in zip(found, weights, strict=True))))
+    expected = np.zeros((ROW_COUNT, size))
+    np.add.at(expected, index, weights.T)
+    np.testing.assert_array_equal(np.array(dr.grad(buffer)).reshape(ROW_COUNT, size), expected)

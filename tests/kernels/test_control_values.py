@@ -1,0 +1,78 @@
+"""Values of a cage on a device: sparse weights times them, with derivatives, and what kernels look up."""
+
+from functools import partial
+
+import drjit as dr
+import numpy as np
+import pytest
+from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
+from scipy import sparse
+
+ROWS, COLUMNS = 40, 12
+
+
+@pytest.fixture
+def weights(np_rng):
+    """Rows of a few weights that sum to one."""
+    dense = np_rng.random((ROWS, COLUMNS)) * (np_rng.random((ROWS, COLUMNS)) < 0.3)
+    dense[:, 0] += 0.1
+    return sparse.csr_array(dense / dense.sum(axis=1, keepdims=True))
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("size", [1, 2, 3, 4])
+def test_weighted_values_and_derivatives_are_products(float_type, rounding, weights, size, np_rng):
+    weighted = WeightedValues(weights, float_type)
+    values, change = np_rng.random((2, COLUMNS, size))
+    gradient = np_rng.random((ROWS, size))
+    for is_forward in (False, True):
+        flat = upload(float_type, values)
+        dr.enable_grad(flat)
+        found = weighted(flat, size)
+        np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=rounding)
+        if is_forward:
+            dr.set_grad(flat, upload(float_type, change))
+            dr.forward_to(found)
+            np.testing.assert_allclose(np.array(dr.grad(found)), (weights @ change).ravel(), rtol=0, atol=rounding)
+        else:
+            dr.backward(dr.sum(found * upload(float_type, gradient)))
+            expected = (weights.T @ gradient).ravel()
+            np.testing.assert_allclose(np.array(dr.grad(flat)), expected, rtol=0, atol=10 * rounding)
+
+
+@pytest.mark.parametrize("is_weighted", [False, True])
+def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, rounding, weights, is_weighted, np_rng):
+    types = ArrayTypes.of(float_type)
+    first, second = np_rng.random((2, COLUMNS, 3))
+    values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
+    flat = values.flat
+    given = upload(float_type, second)
+    dr.enable_grad(given)
+    assert not values.are_moving
+    values.set(given)
+    assert values.are_moving
+    assert values.flat is flat
+    expected = weights @ second if is_weighted else second
+    found = values.fetch(types.index(5))
+    np.testing.assert_allclose(np.array(dr.detach(found)).ravel(), expected[5], rtol=0, atol=rounding)
+    dr.backward(found.x)
+    of_row = weights.toarray()[5] if is_weighted else np.eye(COLUMNS)[5]
+    found = np.array(dr.grad(given)).reshape(-1, 3)
+    np.testing.assert_allclose(found, of_row[:, None] * [1, 0, 0], rtol=0, atol=rounding)
+
+
+def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, rounding, weights, np_rng):
+    types, weighted = ArrayTypes.of(float_type), WeightedValues(weights, float_type)
+    values = np_rng.random((COLUMNS, 3))
+    make = partial(weighted, size=3)
+    first, second = (ControlValues(values.copy(), types, make, key=weighted) for _ in range(2))
+    other, apart = ControlValues(values + 1, types, make, key=weighted), ControlValues(values, types, make)
+    kept = np.array(second.flat)
+    assert first.flat is not second.flat
+    assert first.flat.index == second.flat.index
+    assert len({each.flat.index for each in (first, other, apart)}) == 3
+    first.set(upload(float_type, 2 * values))
+    np.testing.assert_array_equal(second.flat, kept)
+    np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding)

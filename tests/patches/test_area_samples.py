@@ -1,0 +1,149 @@
+"""Random points of a surface: the same for the same seed, and uniform by area, by tests of chi-square.
+
+Seeds are fixed, so the tests always give the same. At a significance of one in a thousand, each would fail by chance
+for one seed in a thousand.
+"""
+
+import numpy as np
+import pytest
+from kernels.surfaces import surface_named
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.patches import uniform_locations
+from reference.refined_cages import sheet, tagged
+from scipy import stats
+
+CATMULL_CLARK = ("mixed torus", "hexagon", "rook", "half disc of 6", "crease")
+NAMES = [*CATMULL_CLARK, "loop mixed torus", "loop corner", "doo_sabin mixed torus"]
+SIGNIFICANCE = 1e-3
+COUNT = 20_000
+# Cells on each side of an element, and parts of a cell that are evaluated to measure it.
+CELLS, PARTS = 4, 5
+
+
+def cell_areas(surface, element, corner):
+    """Areas of the cells of elements, by sums over the middles of their parts."""
+    domain, count = surface.scheme.domain, CELLS * PARTS
+    j, i = (np.indices((count, count)).reshape(2, -1) + 0.5) / count
+    # Of parts on the diagonal of a triangle, half are inside.
+    share = np.clip((1 - i - j) * count + 0.5, 0, 1) if domain.corner_count == 3 else np.ones(len(i))
+    uv, share = np.stack([i, j], axis=1)[share > 0], share[share > 0]
+    found = surface.evaluate(element, uv, corner)
+    size = share * np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)
+    return np.bincount(cell_of(uv), size, CELLS * CELLS) / count**2
+
+
+def cell_of(uv):
+    i, j = np.minimum((uv * CELLS).astype(int), CELLS - 1).T
+    return CELLS * j + i
+
+
+def assert_fits(counts, expected):
+    chosen = expected > 0
+    assert counts[~chosen].sum() == 0
+    expected = expected[chosen] * counts.sum() / expected[chosen].sum()
+    assert stats.chisquare(counts[chosen], expected).pvalue > SIGNIFICANCE
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_elements_have_points_by_their_areas(name):
+    surface = surface_named(name)
+    found = surface.sample(COUNT, seed=1)
+    sizes = surface.patches.elements.face_sizes
+    areas = np.zeros(len(sizes))
+    for element, corners in enumerate(np.where(surface.patches.is_whole, 1, sizes).tolist()):
+        areas[element] = sum(cell_areas(surface, element, corner).sum() for corner in range(corners))
+    assert_fits(np.bincount(found.element, minlength=len(sizes)), areas)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_points_are_uniform_inside_elements(name):
+    surface = surface_named(name)
+    bounds = surface.bounds()
+    element = int(bounds.element[np.linalg.norm(bounds.upper - bounds.lower, axis=1).argmax()])
+    # What `sample` evaluates, of which there have to be many for enough of them to lie in one element.
+    start, uv = uniform_locations(surface._all_pieces, surface._areas, 5 * COUNT, np.random.default_rng(2))
+    elements, corners = surface._element_and_corner(start)
+    own = elements == element
+    if surface.patches.is_whole[element]:
+        # Seen from the first corner.
+        domain, uv = surface.scheme.domain, uv[own]
+        for corner in range(1, domain.corner_count):
+            turned = corners[own] == corner
+            uv[turned] = domain.rotation(corner)(uv[turned])
+    else:
+        own &= corners == 0
+        uv = uv[own]
+    assert own.sum() > 500
+    assert_fits(np.bincount(cell_of(uv), minlength=CELLS * CELLS), cell_areas(surface, element, 0))
+
+
+@pytest.mark.core
+def test_points_of_a_sheet_are_uniform():
+    found = LimitSurface(sheet(4, 3)).sample(COUNT, seed=3)
+    for axis, size in ((0, 4), (1, 3)):
+        assert stats.kstest(found.p[:, axis] / size, "uniform").pvalue > SIGNIFICANCE
+    np.testing.assert_array_equal(found.p[:, 2], 0)
+
+
+@pytest.mark.core
+def test_seeds_determine_points():
+    surface = surface_named("hexagon")
+    first, again, other = surface.sample(100, 7), surface.sample(100, 7), surface.sample(100, 8)
+    np.testing.assert_array_equal(first.p, again.p)
+    assert (first.p != other.p).any(axis=1).all()
+    rng = np.random.default_rng(7)
+    np.testing.assert_array_equal(surface.sample(100, rng).p, first.p)
+    assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
+
+
+def test_samples_do_not_depend_on_the_unit_of_length():
+    cage = cube()
+    metres, millimetres = (LimitSurface(cage.with_positions(unit * cage.positions)) for unit in (1, 1024))
+    first, second = metres.sample(100, 3), millimetres.sample(100, 3)
+    np.testing.assert_array_equal(first.uv, second.uv)
+    cells, scaled = metres._sampling_cells(), millimetres._sampling_cells()
+    np.testing.assert_array_equal(cells.offsets, scaled.offsets)
+    np.testing.assert_allclose(1024**2 * cells.areas, scaled.areas, rtol=1e-12)
+
+
+def test_points_are_those_of_their_parameters():
+    surface = surface_named("rook")
+    found = surface.sample(1000)
+    expected = surface.evaluate(found.element, found.uv, found.corner)
+    for column in ("p", "n", "dp_du", "dp_dv"):
+        np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
+
+
+def test_holes_have_no_points():
+    assert 1 not in LimitSurface(tagged(cube(), holes=[1])).sample(1000).element
+
+
+@pytest.mark.parametrize("count", [-1, 2.5, "3"])
+def test_counts_that_are_none_are_an_error(count):
+    with pytest.raises(ValueError, match="expected an integer of 0 or more"):
+        LimitSurface(cube()).sample(count)
+
+
+def test_a_surface_without_area_has_no_points():
+    surface = LimitSurface(cube().with_positions(np.zeros((8, 3))))
+    with pytest.raises(ValueError, match="the surface has no area"):
+        surface.sample(3)
+    with pytest.raises(ValueError, match="the surface has no area"):
+        surface.on_device("llvm_ad_rgb").sample(0.5, [0.5, 0.5])
+
+
+def test_no_points_can_be_drawn():
+    assert LimitSurface(cube()).sample(0).p.shape == (0, 3)
+
+
+def test_points_of_a_flat_sheet_are_uniform_however_its_parameters_run():
+    """Columns of growing width: within an element, tangents grow, up to twice as long."""
+    cage = sheet(4, 2)
+    surface = LimitSurface(cage.with_positions(cage.positions ** [2, 1, 1]))
+    samples = surface.sample(4 * COUNT, 3)
+    element = np.arange(surface.patches.elements.face_count)
+    ends = [surface.evaluate(element, np.tile(uv, (len(element), 1))).p[:, 0] for uv in ([0.0, 0], [1.0, 1])]
+    low, high = np.sort(ends, axis=0)[:, samples.element]
+    along = (samples.p[:, 0] - low) / (high - low)
+    assert stats.kstest(along, "uniform").pvalue > SIGNIFICANCE
