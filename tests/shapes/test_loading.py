@@ -13,7 +13,7 @@ import pytest
 from mitsuba_subdivision import Attribute, CageWarning, ControlCage
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.files.formats import FORMATS
-from mitsuba_subdivision.shapes import nesting
+from mitsuba_subdivision.shapes import registration
 from reference.refined_cages import tagged
 from shapes.cages import cube, described
 from shapes.updates import update
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.threads
 # Four frames of Python for each of so many shapes on two threads are more than a stack may have, were they nested.
 MANY = 600
 # Of what takes longer; enough that constructors go on in other threads several times.
-SOME = 3 * nesting.DEEPEST
+SOME = 3 * registration.DEEPEST
 BUFFERS = ("vertex_positions", "vertex_normals", "vertex_colour", "faces", "face_element")
 # Vertices that were placed at once, or with others: sums in single precision, in another order.
 SINGLE = 1e-6
@@ -123,18 +123,18 @@ def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
 def test_a_constructor_too_deep_runs_in_its_own_thread():
     threads, depths = [], []
 
-    @nesting.on_shallow_stack
+    @registration.on_shallow_stack
     def begin(left):
         threads.append(threading.get_ident())
-        depths.append(nesting._stack.depth)
+        depths.append(registration._stack.depth)
         if not left:
             raise KeyError("innermost")
         begin(left - 1)
 
     with pytest.raises(KeyError, match="innermost"):
-        begin(3 * nesting.DEEPEST - 1)
+        begin(3 * registration.DEEPEST - 1)
     assert len(set(threads)) == 3
-    assert depths == 3 * list(range(1, nesting.DEEPEST + 1))
+    assert depths == 3 * list(range(1, registration.DEEPEST + 1))
     # Nothing is left on the stack.
     depths.clear()
     with pytest.raises(KeyError):
