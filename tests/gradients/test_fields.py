@@ -43,11 +43,11 @@ def cage_of(scheme):
 
 
 def rays_at(cage, scheme):
-    """From outside towards places within."""
+    """From outside towards places within, aslant: along its normals, a surface moves by no texture coordinate."""
     inside, centre = LimitSurface(cage, scheme).sample(RAYS, 1), cage.positions.mean(axis=0)
     o = inside.p + inside.n
-    d = centre + 0.9 * (inside.p - centre) - o
-    return mi.Ray3f(msub.upload(mi.Point3f, o.T), msub.upload(mi.Vector3f, d.T))
+    d = centre + 0.5 * (np.roll(inside.p, 1, axis=0) - centre) - o
+    return mi.Ray3f(msub.upload(mi.Point3f, o), msub.upload(mi.Vector3f, d))
 
 
 def wrong_parts(scheme, by):
