@@ -117,7 +117,8 @@ class Triangles(NamedTuple):
 
     def samples(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Random points, uniform by area, and their normals."""
-        chosen, weights = triangle_samples(self.positions, self.triangles, count, seed)
+        a, b, c = self.positions[self.triangles].swapaxes(0, 1)
+        chosen, weights = triangle_samples(np.linalg.norm(np.cross(b - a, c - a), axis=1), count, seed)
         corners, weights = self.triangles[chosen], weights[:, :, None]
         points, normals = ((each[corners] * weights).sum(axis=1) for each in (self.positions, self.normals))
         return points, unit(normals)

@@ -273,23 +273,20 @@ def mesh_samples(positions: FloatArray, triangles: IntArray, count: int, seed: i
     doubled = np.linalg.norm(normals, axis=1)
     if not doubled.sum() > 0:
         raise ValueError("the mesh has no area; expected triangles")
-    chosen, weights = triangle_samples(positions, triangles, count, seed)
+    chosen, weights = triangle_samples(doubled, count, seed)
     points: FloatArray = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
     return points, normals[chosen] / doubled[chosen, None]
 
 
 def triangle_samples(
-    positions: FloatArray,  # (n, 3)
-    triangles: IntArray,  # (m, 3): 0-based; some of them have an area
+    areas: FloatArray,  # (m,): in any unit; some of them are not zero
     count: int,
     seed: int,
 ) -> tuple[IntArray, FloatArray]:
-    """Locations uniform by area.
+    """Locations on triangles, uniform by area.
 
     Returns 0-based triangles ``(count,)`` int64, and weights ``(count, 3)`` float64 of their three vertices; these are
     not negative, and their sum is one.
     """
     rng = np.random.default_rng(seed)
-    a, b, c = positions[triangles].swapaxes(0, 1)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return rng.choice(len(areas), count, p=areas / areas.sum()), rng.dirichlet(np.ones(3), count)
