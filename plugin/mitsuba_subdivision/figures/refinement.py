@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.collections import LineCollection
-from numpy.typing import NDArray
 
-from ..mesh.connectivity import Topology
+from ..cage.structure import edges_of
 from ..mesh.one_ring import one_ring
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
@@ -51,9 +50,9 @@ class RefinementStep:
         # Refined points without such a stencil belong to neighbouring patches.
         distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
         needed = (distance < 10.0**-DECIMALS).any(axis=1)
-        edges, old = _edges(refinement.topology), characteristic.control_points
+        edges, old = edges_of(refinement.topology), characteristic.control_points
         new_edges = refinement.apply(old)[edges[needed[edges].all(axis=1)]]
-        return cls(characteristic, old, stencils @ old, old[_edges(ring)], new_edges)
+        return cls(characteristic, old, stencils @ old, old[edges_of(ring)], new_edges)
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -85,9 +84,3 @@ def draw(options: FigureOptions) -> list[Path]:
     before.set(title=f"a patch of valence {VALENCE}", xlabel=f"$K$ = {len(step.old)} control points")
     after.set(title="one refinement", xlabel=f"$M$ = {len(step.new)} new control points")
     return write_plot(options, "refinement", figure)
-
-
-def _edges(topology: Topology) -> NDArray[np.int64]:
-    """Both ends of every edge: ``(edges, 2)``."""
-    half_edge = topology.edge_half_edge
-    return np.stack([topology.face_vertices[half_edge], topology.face_vertices[topology.next[half_edge]]], axis=1)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.colors import PowerNorm
 
+from ..cage.structure import edges_of
 from ..evaluation.element import element_stencils
 from ..evaluation.irregular_patch import level_domains, level_rows
 from ..evaluation.patch_tree import patch_tree
@@ -30,9 +33,6 @@ REST, EDGE, LINE = "#8d97a1", "#b6bec6", "#2d3a45"
 
 def draw(options: FigureOptions) -> list[Path]:
     """Draw a face with two extraordinary vertices, its leaves, and the Bernstein coefficients of these as weights."""
-    from matplotlib.collections import LineCollection
-    from matplotlib.colors import PowerNorm
-
     scheme = scheme_named("catmull_clark")
     signature = Signature("face", tuple((4,) * valence for valence in VALENCES))
     tree, form, ring = patch_tree(scheme, signature), regular_bernstein(scheme), one_ring(signature)
@@ -59,21 +59,19 @@ def draw(options: FigureOptions) -> list[Path]:
         return np.asarray(element_stencils(scheme, signature, uv)[0] @ flat)
 
     figure, ((face, matrix),) = panels(options, 1, 2)
-    t = ring.topology
-    edges = np.stack([t.face_vertices, t.face_vertices[t.next]], axis=1)
-    face.add_collection(LineCollection(list(flat[edges]), colors=EDGE, linewidths=0.6))
+    face.add_collection(LineCollection(list(flat[edges_of(ring.topology)]), colors=EDGE, linewidths=0.6))
     face.plot(*flat.T, "o", color="black", markersize=3, zorder=4)
     style = {"edgecolor": LINE, "linewidth": 0.4, "zorder": 2}
-    corners = scheme.domain.corners
-    for domain, level, _ in leaves:
-        face.fill(*at(np.clip(domain(outline(corners)), 0, 1)).T, facecolor=COLOURS[level], **style)
-    for domain in rests:
-        face.fill(*at(np.clip(domain(outline(corners)), 0, 1)).T, facecolor=REST, **style)
-        face.plot(*at(domain.offset[None]).T, "o", color="#c8432b", markersize=4, zorder=5)
+    around = outline(scheme.domain.corners)
+    for domain, colour in [(domain, COLOURS[level]) for domain, level, _ in leaves] + [(rest, REST) for rest in rests]:
+        face.fill(*at(np.clip(domain(around), 0, 1)).T, facecolor=colour, **style)
+    face.plot(*at(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
     face.set_aspect("equal")
     hide_frame(face)
-    face.set_title("a face and its one-ring,\nleaves of its patch tree")
-    face.set_xlabel(f"$K$ = {ring.vertex_count} control points\ngrey: (10) and (12); red: (13)")
+    face.set(
+        title="a face and its one-ring,\nleaves of its patch tree",
+        xlabel=f"$K$ = {ring.vertex_count} control points\ngrey: (10) and (12); red: (13)",
+    )
 
     weights = np.concatenate([rows for *_, rows in leaves])
     # Small weights are seen, too.
@@ -83,10 +81,12 @@ def draw(options: FigureOptions) -> list[Path]:
         strip = {"xmin": -0.06, "xmax": -0.01, "clip_on": False, "linewidth": 0.2, "edgecolor": LINE}
         matrix.axhspan(size * number - 0.5, size * (number + 1) - 0.5, facecolor=COLOURS[level], **strip)
         matrix.axhline(size * number - 0.5, color=LINE, linewidth=0.2)
-    matrix.set_xticks([])
-    matrix.set_yticks([])
-    matrix.set_title("coefficients of all leaves =\nmatrix × control points")
-    matrix.set_xlabel(f"$K$ = {ring.vertex_count} control points\n{len(leaves)} leaves, {size} coefficients each")
+    matrix.set(
+        xticks=[],
+        yticks=[],
+        title="coefficients of all leaves =\nmatrix × control points",
+        xlabel=f"$K$ = {ring.vertex_count} control points\n{len(leaves)} leaves, {size} coefficients each",
+    )
     return write_plot(options, "tree", figure)
 
 
