@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..files.formats import FORMATS
 from ..messages import print_remark, print_result
 from ..progress import counted
+from ..regression.image import METADATA_ATTRIBUTE
 from ..regression.scene import BOX, kept_search_folders, load_scene
 from ..shapes.parameter_table import SHADINGS
 from ..studio.camera import DEFAULT_VIEW, UP_AXES, VIEWS
@@ -225,9 +226,6 @@ def _write_frames(options: argparse.Namespace) -> None:
 
 
 def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
-
-    from ..regression.image import METADATA_ATTRIBUTE
-
     with whole_file(path) as beside:
         in_8_bits = path.suffix.lower() in (".png", ".jpg")
         bitmap = mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
