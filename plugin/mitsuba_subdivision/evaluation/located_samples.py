@@ -36,6 +36,10 @@ from .tree_arrays import LEVEL_PIECES, PIECE_LEVELS, level_polynomials
 # eigen-coordinates, whose large terms may cancel and leave rounding errors. Times `TANGENT_ROUNDING`, this share is at
 # least one rounding error.
 CANCELLED = 1 / 16
+# A piece with fewer samples than this is replaced by a plane for each sample.
+FEW_SAMPLES = 4
+# Exponents of the monomials of a plane.
+PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,12 +287,6 @@ def _sorted(element: IntArray, turn: IntArray, uv: FloatArray) -> tuple[IntArray
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
     return element[order], turn[order], uv[order], number
-
-
-# A piece with fewer samples than this is replaced by a plane for each sample.
-FEW_SAMPLES = 4
-# Exponents of the monomials of a plane.
-PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
 
 
 class Polynomials(NamedTuple):

@@ -34,6 +34,11 @@ TANGENT_ROUNDING = {32: 2.0**-19, 64: 2.0**-40}
 LEAST_EXTENT = {32: 2.0**-3, 64: 2.0**-11}
 # The smallest normal number by the number of bits; replaces a length of zero.
 LEAST_LENGTH = {32: 2.0**-126, 64: 2.0**-1022}
+# An eigenvector belongs to the border curve if the weight of an inner vertex, relative to the largest, is not above
+# this.
+INSIDE = 1e-6
+# Bound of the rounding error of sines of multiples of pi.
+ROUNDED = 1e-14
 
 
 def unit_normals(
@@ -83,13 +88,6 @@ def _are_rounding(
         bound = (b * z + c * y) ** 2 + (c * x + a * z) ** 2 + (a * y + b * x) ** 2
         suspect[suspect] = ~(squared[suspect] > bound)
     return suspect
-
-
-# An eigenvector belongs to the border curve if the weight of an inner vertex, relative to the largest, is not above
-# this.
-INSIDE = 1e-6
-# Bound of the rounding error of sines of multiples of pi.
-ROUNDED = 1e-14
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,17 @@ from .equations import MOST_MULTIPLICATIONS
 
 # Largest rounding error in the matrices of `BernsteinBasis`, whose entries are fractions with small denominators.
 NO_ENTRY = 1e-12
+# Highest power of each parameter that a basis may have. The schemes of this package need 2 (Doo-Sabin), 3
+# (Catmull-Clark) and 4 (Loop, total degree).
+HIGHEST_POWER = 5
+# Largest rounding error in the coefficients of monomials. Other coefficients are fractions with small denominators.
+NO_COEFFICIENT = 1e-6
+# Cutoff of singular values for least squares, relative to the largest. The monomials are independent: their smallest
+# singular value is 10^-7 of the largest. NumPy's default is not used, as NumPy 2.2 computes it from `numpy.finfo`,
+# which warns in Mitsuba's threads because they flush denormal numbers to zero.
+INDEPENDENT = 1e-13
+# Tolerance when comparing the polynomials with the scheme's `regular_basis`.
+ROUNDED = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,19 +155,6 @@ def times(rows: FloatArray, points: FloatArray) -> FloatArray:
 def _clean(matrix: FloatArray) -> FloatArray:
     """Replace rounding errors by zeros."""
     return np.where(np.abs(matrix) < NO_ENTRY, 0, matrix)
-
-
-# Highest power of each parameter that a basis may have. The schemes of this package need 2 (Doo-Sabin), 3
-# (Catmull-Clark) and 4 (Loop, total degree).
-HIGHEST_POWER = 5
-# Largest rounding error in the coefficients of monomials. Other coefficients are fractions with small denominators.
-NO_COEFFICIENT = 1e-6
-# Cutoff of singular values for least squares, relative to the largest. The monomials are independent: their smallest
-# singular value is 10^-7 of the largest. NumPy's default is not used, as NumPy 2.2 computes it from `numpy.finfo`,
-# which warns in Mitsuba's threads because they flush denormal numbers to zero.
-INDEPENDENT = 1e-13
-# Tolerance when comparing the polynomials with the scheme's `regular_basis`.
-ROUNDED = 1e-11
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,13 @@ from .polynomial import Monomials
 if TYPE_CHECKING:
     from ..tessellation import VertexPolynomials, VertexTable
 
+# Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
+# nor overflows. A shorter tangent means that the patch has collapsed to a point or a curve.
+SHORTEST = 1e-30
+# Constants of `evaluation.normals`, by precision.
+TANGENT_ROUNDING = {dr.VarType.Float32: normals.TANGENT_ROUNDING[32], dr.VarType.Float64: normals.TANGENT_ROUNDING[64]}
+LEAST_EXTENT = {dr.VarType.Float32: normals.LEAST_EXTENT[32], dr.VarType.Float64: normals.LEAST_EXTENT[64]}
+
 
 class VertexKernel:
     """A tessellation on the device, evaluated whenever its control points move.
@@ -245,14 +252,6 @@ class _Evaluation(dr.CustomOp):
 def coordinates_expected(count: int, control_count: int) -> str:
     """Message for ``count`` coordinates that do not fit ``control_count`` control points."""
     return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"
-
-
-# Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
-# nor overflows. A shorter tangent means that the patch has collapsed to a point or a curve.
-SHORTEST = 1e-30
-# Constants of `evaluation.normals`, by precision.
-TANGENT_ROUNDING = {dr.VarType.Float32: normals.TANGENT_ROUNDING[32], dr.VarType.Float64: normals.TANGENT_ROUNDING[64]}
-LEAST_EXTENT = {dr.VarType.Float32: normals.LEAST_EXTENT[32], dr.VarType.Float64: normals.LEAST_EXTENT[64]}
 
 
 @dataclass(frozen=True)

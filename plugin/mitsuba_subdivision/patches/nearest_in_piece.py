@@ -37,6 +37,12 @@ SHORTER = 0.25
 CHUNK = 4096
 # Rounding error of a distance, relative to the size of the coordinates: some units of double precision.
 ROUNDED = 2.0**-50
+# Tolerance of the products of an orthonormal frame's vectors.
+SQUARE = 1e-12
+# Boxes or points per run, whose arrays stay in a processor's cache.
+RUN = 1024
+# Least length of a tangent, to which shorter ones are clamped so that divisions by its square do not overflow.
+SHORTEST = 1e-100
 
 
 def nearest_in_pieces(
@@ -209,14 +215,6 @@ def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
     along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
     lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
     return (along / np.maximum(lengths, sys.float_info.min)).max(axis=1)
-
-
-# Tolerance of the products of an orthonormal frame's vectors.
-SQUARE = 1e-12
-# Boxes or points per run, whose arrays stay in a processor's cache.
-RUN = 1024
-# Least length of a tangent, to which shorter ones are clamped so that divisions by its square do not overflow.
-SHORTEST = 1e-100
 
 
 @dataclass(frozen=True, eq=False)

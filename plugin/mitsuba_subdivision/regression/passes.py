@@ -31,6 +31,8 @@ BATCH = 64
 LEAST_BATCHES = 4
 # Entries of the metadata that all passes of an image share.
 _SHARED = ("variant", "filter", "size", "files", "parameters")
+# Mesh attribute of the shape `subdivision`: the face of the cage that each triangle belongs to.
+ELEMENT_ATTRIBUTE = "face_element"
 
 
 @dataclass(frozen=True)
@@ -170,10 +172,6 @@ def _joined(ordered: Sequence[Image]) -> list[list[int]]:
         else:
             joined.append([start, stop])
     return joined
-
-
-# Mesh attribute of the shape `subdivision`: the face of the cage that each triangle belongs to.
-ELEMENT_ATTRIBUTE = "face_element"
 
 
 def probe_scene(loaded: LoadedScene) -> Probe:

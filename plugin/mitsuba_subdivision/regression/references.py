@@ -23,6 +23,11 @@ from .tiers import Status, Tolerances
 # Samples per pixel: four batches for a test, and 64 times as many for a reference.
 TEST_SPP = 256
 REFERENCE_SPP = 16384
+# The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
+# attempts are as far from each other.
+SEED_STEP = 2**20
+# Samples of the second attempt, in samples of the first.
+RETRY_FACTOR = 4
 
 
 def render_reference(
@@ -92,13 +97,6 @@ def sampling_of(reference: Image) -> Sampling:
 
 def _assignments(option: str, values: Mapping[str, object]) -> list[str]:
     return [word for name, value in sorted(values.items()) for word in (option, f"{name}={value}")]
-
-
-# The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
-# attempts are as far from each other.
-SEED_STEP = 2**20
-# Samples of the second attempt, in samples of the first.
-RETRY_FACTOR = 4
 
 
 def variant_for(reference: Image) -> str:

@@ -26,6 +26,12 @@ BOX = "box"
 # Path of an XML file, dictionary, or mi.Scene.
 # As text, since Mitsuba has no classes before a variant is set.
 SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
+# Samples of a part, and the fewest samples per pixel of a part: with fewer, the weights of a wide reconstruction filter
+# would differ too much from part to part.
+PART_SAMPLES = 1 << 22
+LEAST_PART_SPP = 16
+# Seeds of Mitsuba have 32 bits.
+SEEDS = 2**32
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,14 +195,6 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
         Path(os.path.relpath(file, folder)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted(files)
     }
-
-
-# Samples of a part, and the fewest samples per pixel of a part: with fewer, the weights of a wide reconstruction filter
-# would differ too much from part to part.
-PART_SAMPLES = 1 << 22
-LEAST_PART_SPP = 16
-# Seeds of Mitsuba have 32 bits.
-SEEDS = 2**32
 
 
 def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArray[np.float32]:

@@ -49,6 +49,9 @@ _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 # Locations on triangles, shared by shapes with the same tessellation and elements.
 _TRIANGLES: Shared[TriangleLocations] = Shared()
 _WELDED: Shared[AttributeLayout] = Shared()
+# Number of fixed-point iterations of `Parameterization.hit`. Each removes most of the difference between texture
+# coordinates on the surface and on its triangles.
+STEPS = 3
 
 
 class Side(Enum):
@@ -379,11 +382,6 @@ def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray)
     """Select rows of the locations that a function returns."""
     start, uv = locate()
     return start[chosen], uv[chosen]
-
-
-# Number of fixed-point iterations of `Parameterization.hit`. Each removes most of the difference between texture
-# coordinates on the surface and on its triangles.
-STEPS = 3
 
 
 class Parameterization:

@@ -34,6 +34,10 @@ QUERY_VARIANT = "scalar_rgb"
 _registered: dict[str, type] = {}
 # Re-entrant, because creating the class may switch variants in a callback of another module.
 _lock = threading.RLock()
+# Maximum number of nested constructors on one stack. Each takes 4 to 15 of the thousand frames that Python allows, and
+# less than 8 kB of a stack of at least half a megabyte.
+DEEPEST = 32
+_stack = threading.local()
 
 
 def register() -> None:
@@ -92,13 +96,6 @@ def _register_loaded_variants() -> None:
         # Variants are loaded when they are first set or accessed; loading all of them would take seconds.
         if f"mitsuba.{variant}" in sys.modules:
             register_variant(variant)
-
-
-# Maximum number of nested constructors on one stack. Each takes 4 to 15 of the thousand frames that Python allows, and
-# less than 8 kB of a stack of at least half a megabyte.
-DEEPEST = 32
-
-_stack = threading.local()
 
 
 def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:

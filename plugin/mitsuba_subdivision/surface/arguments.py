@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 
 # Distance by which rounding may put a parameter outside its domain.
 DOMAIN_TOLERANCE = 1e-12
+# Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Eigenbases of such one-rings take 3 seconds.
+MOST_FACES = 511
+# Most faces around a vertex at the end of a crease, or with semi-sharp features: each face has a different one-ring,
+# and that many eigenbases take as long.
+MOST_DIFFERENT_FACES = 64
 
 
 def checked_samples(
@@ -82,13 +87,6 @@ def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str)
         raise ValueError(
             f"{name} of sample {first} is {in_digits(values[first])}; expected {expected} ({wrong.sum()} such samples)"
         )
-
-
-# Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Eigenbases of such one-rings take 3 seconds.
-MOST_FACES = 511
-# Most faces around a vertex at the end of a crease, or with semi-sharp features: each face has a different one-ring,
-# and that many eigenbases take as long.
-MOST_DIFFERENT_FACES = 64
 
 
 def require_valences(cage: ControlCage, scheme: Scheme) -> None:

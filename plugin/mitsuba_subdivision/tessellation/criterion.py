@@ -39,6 +39,8 @@ RATE_ROUNDING = 1e-9
 TRIED = (-1, 0, 1)
 # Upper limit of rates, above any that is used.
 MOST = 1 << 20
+# Directions whose sine is below this are parallel.
+PARALLEL = 1e-9
 
 
 class Measure(Enum):
@@ -253,10 +255,6 @@ def _with_other(forms: FloatArray, first: FloatArray) -> FloatArray:
 def rounded_up(values: FloatArray) -> IntArray:
     """Round up to integers of at least 1, ignoring rounding errors above an integer."""
     return np.clip(np.ceil(values - RATE_ROUNDING), 1, MOST).astype(np.int64)
-
-
-# Directions whose sine is below this are parallel.
-PARALLEL = 1e-9
 
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:

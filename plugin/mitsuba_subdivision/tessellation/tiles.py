@@ -21,6 +21,8 @@ from ..schemes.domain import FloatArray, ParameterDomain
 UNIT = 1 << 28
 # Length of an edge of an element in the same parts: a patch of a polygon reaches half way along it.
 EDGE = 2 * UNIT
+# Greatest depth of tiles around extraordinary points: single precision does not resolve smaller ones.
+DEEPEST = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +164,6 @@ class PatchFrames:
         has_copies |= len(first) < len(border)
         return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)
 
-
-# Greatest depth of tiles around extraordinary points: single precision does not resolve smaller ones.
-DEEPEST = 24
 
 Tiles = NDArray[np.void]
 
