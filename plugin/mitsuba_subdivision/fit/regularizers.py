@@ -13,7 +13,7 @@ from scipy import sparse
 
 from ..cage import ControlCage
 from ..device_arrays import upload
-from ..kernels.control_values import SparseMatrix
+from ..kernels.linear_maps import SparseMatrix
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
@@ -101,7 +101,7 @@ def device_form(regularizer: Regularizer) -> Callable[[dr.ArrayBase], mi.Float]:
     def energy(points: dr.ArrayBase) -> mi.Float:
         away = points - origin
         # The derivative of the form is the product, which need not be differentiated.
-        product = matrix(dr.detach(away))
+        product = matrix.product(dr.detach(away))
         return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2
 
     return energy

@@ -9,6 +9,7 @@ from functools import reduce
 import drjit as dr
 
 from .array_types import Float, FloatBuffer, Matrix4, Vector3
+from .linear_maps import attached
 from .vectors import cross, dot, like, unit
 
 
@@ -61,7 +62,9 @@ def placed(
     p: Vector3 = dr.unravel(vector3, positions)
     n: Vector3 = dr.unravel(vector3, normals)
     if dr.grad_enabled(matrix):
-        matrix = dr.custom(_Spread, matrix, dr.width(p))
+        # With Dr.Jit's derivatives, each use of an entry would add a sum over the points, in a separate kernel.
+        zero = dr.zeros(type(matrix), dr.width(p))
+        matrix = attached(dr.detach(matrix) + zero, matrix, lambda change: change + zero, _summed)
     to_world = AffineMap.of(matrix)
     return dr.ravel(to_world.point(p)), dr.ravel(unit(to_world.normal(n)))
 
@@ -79,23 +82,6 @@ def _inverse(rows: tuple[Sequence[Float], ...]) -> tuple[Sequence[Float], ...]:
     return tuple([column[i] * factor for column in columns] for i in range(3))
 
 
-class _Spread(dr.CustomOp):
-    """Broadcasts a matrix to all points.
-
-    With Dr.Jit's derivatives, each use of an entry would add a sum over the points, in a separate kernel.
-    """
-
-    def eval(self, matrix, count):
-        self.count = count
-        return matrix + dr.zeros(type(matrix), count)
-
-    def forward(self):
-        self.set_grad_out(self.grad_in("matrix") + dr.zeros(type(self.grad_in("matrix")), self.count))
-
-    def backward(self):
-        gradient = self.grad_out()
-        dr.eval(gradient)
-        self.set_grad_in("matrix", type(gradient)([[dr.sum(entry) for entry in row] for row in gradient]))
-
-    def name(self):
-        return "Spread"
+def _summed(gradient: Matrix4) -> Matrix4:
+    dr.eval(gradient)
+    return type(gradient)([[dr.sum(entry) for entry in row] for row in gradient])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -12,9 +11,8 @@ import numpy as np
 
 from ..patches import LinearChannel, PieceTable
 from ..patches.piece_table import CODE, FOLLOWING, PRECEDING, WHOLE
-from .array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, Value
-from .coefficient_map import CoefficientMap
-from .control_values import ControlValues, WeightedValues
+from .array_types import ArrayTypes, Float, Index, Mask, Value
+from .linear_maps import CoefficientMap, ControlValues, SparseMatrix
 from .piece_kernel import PatchValues, Piece, PieceKernel
 from .polynomial import Monomials
 
@@ -36,17 +34,8 @@ class SubdividedChannelKernel:
     ) -> None:
         table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
         self._kernel, types = PieceKernel.shared(table, float_type), ArrayTypes.of(float_type)
-        self._map = coefficients = CoefficientMap.shared(table, float_type)
         self._size = size = channel.values.shape[1]
-
-        def make(values: FloatBuffer) -> FloatBuffer:
-            components: Value = values if size == 1 else dr.unravel(types.vector(size), values)
-            return coefficients(
-                dr.ravel(types.vector3(*([components] if size == 1 else components), *[0] * (3 - size)))
-            )
-
-        # Coefficients of pieces, padded to 3-vectors with zeros
-        self.values = ControlValues(channel.values, types, make, key=coefficients)
+        self.values = ControlValues(types, size, CoefficientMap.shared(table, float_type)).load(channel.values)
 
     def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:
         """The value, and its derivatives by the parameters."""
@@ -96,8 +85,8 @@ class LinearChannelKernel:
                 channel.with_centres,
             )
         size = channel.values.shape[1]
-        make = None if weights is None else partial(WeightedValues(weights, float_type), size=size)
-        self.values = ControlValues(channel.values, self._types, make)
+        linear_map = None if weights is None else SparseMatrix(weights, float_type)
+        self.values = ControlValues(self._types, size, linear_map).load(channel.values)
         self._monomials = Monomials(_POWERS[: 3 if self._is_triangular else 4])
         self._rows = self._types.indices(rows)
 

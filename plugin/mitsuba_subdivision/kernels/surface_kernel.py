@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
-from ..mesh.shared import Content, LaterArray, Shared
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
-from .coefficient_map import CoefficientMap
 from .element_walk import ElementWalk, Location
 from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
+from .linear_maps import CoefficientMap, ControlValues
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
@@ -29,8 +27,6 @@ if TYPE_CHECKING:
 
 # Largest distance of a hit from its line, relative to the longest derivative of the surface; used by `intersect`.
 NEAR_LINE = 1e-4
-
-_LOADED: Shared[LaterArray] = Shared()
 
 
 class SurfaceKernel:
@@ -53,9 +49,7 @@ class SurfaceKernel:
         # to the heights and their scale.
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
-        self._map = CoefficientMap.shared(table, float_type)
-        self.coefficients: FloatBuffer = float_type()  # Coefficients of all pieces, see `PieceTable`
-        self._loaded: LaterArray | None = None
+        self.values = ControlValues(self.types, 3, CoefficientMap.shared(table, float_type))  # Its control points
 
     def set_control_points(self, points: FloatBuffer) -> None:
         """Set the control points. Later results are differentiable with respect to them.
@@ -76,24 +70,12 @@ class SurfaceKernel:
             points = self.types.floats(np.ravel(points))
         if len(points) != 3 * self._control_count:
             raise ValueError(coordinates_expected(len(points), self._control_count))
-        self._loaded = None
-        self.take(self._map(points))
+        self.values.set(points)
 
-    def load(self, positions: NDArray[np.floating]) -> None:
-        """Set control points, ``(n, 3)``. Kernels with equal control points share their coefficients."""
-        self._loaded = _LOADED.get((self._map, Content(positions)), LaterArray)
-        self.take(self._loaded.get(lambda: self._map(self.types.floats(positions.ravel()))))
-
-    def attach(self, points: FloatBuffer) -> None:
-        """Attach the coefficients to control points again, without computing them."""
-        self.take(self._map(points, dr.detach(self.coefficients)))
-
-    def take(self, coefficients: FloatBuffer) -> None:
-        """Set the coefficients, or attach equal ones to other variables."""
-        # Dr.Jit compiles literals into kernels.
-        dr.make_opaque(coefficients)
-        # Assign in place, because other objects may hold a reference to the array.
-        self.coefficients[:] = coefficients
+    @property
+    def coefficients(self) -> FloatBuffer:
+        """Coefficients of all pieces, see `PieceTable`."""
+        return self.values.flat
 
     def evaluate(
         self, element: Index | Location, uv: Vector2 | None = None, corner: Index = 0, derivatives: int = 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -13,8 +14,7 @@ from ..evaluation import normals
 from ..mesh import ragged
 from ..patches.piece_table import PACKET
 from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Vector3
-from .coefficient_map import WeightRows, padded_rows
-from .control_values import WeightedValues
+from .linear_maps import SparseMatrix, WeightBlocks, attached
 from .polynomial import Monomials
 
 if TYPE_CHECKING:
@@ -38,11 +38,10 @@ class VertexKernel:
     def __init__(self, table: VertexTable, float_type: type) -> None:
         self.vertex_count, self.control_count = table.vertex_count, table.control_count
         self._types = types = ArrayTypes.of(float_type)
-        self._refined_count, self._refinement = table.control_count, None
-        if table.refinement is not None:
-            self._refined_count = table.refinement.shape[0]
-            self._refinement = WeightedValues.shared(table.refinement, float_type)
-        controls, are_rounded = types.indices(table.controls), table.refinement is not None
+        refinement = table.refinement
+        self._refined_count = table.control_count if refinement is None else refinement.shape[0]
+        self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
+        controls, are_rounded = types.indices(table.controls), refinement is not None
         self._parts = [_Part(types, part, controls, are_rounded) for part in table.polynomials]
         self._weld_target = types.indices(table.weld_target) if table.copies.size else None
 
@@ -106,15 +105,8 @@ class _Part:
         # to the first control point.
         self._rounding = types.floats((TANGENT_ROUNDING[precision] * part.tangent_weights)[part.block])
         self._least_extent = LEAST_EXTENT[precision] if are_rounded else 0
-        self._rows = WeightRows(
-            types,
-            len(part.powers),
-            np.column_stack([part.blocks, ragged.starts(part.blocks[:, 2])]),
-            padded_rows(part.weights, types.numpy_float),
-            controls,
-            part.block,
-            part.patch,
-        )
+        columns = np.column_stack([part.blocks, ragged.starts(part.blocks[:, 2])])
+        self._blocks = WeightBlocks(types, part.weights, columns, controls, part.block, part.patch)
         self._first_run, self._kind, self._first_vertex, self._first_entry, self._offset = map(
             types.indices, (part.first_run, part.kind, part.first_vertex, part.first_entry, part.offset)
         )
@@ -126,12 +118,12 @@ class _Part:
         self, padded: FloatBuffer, buffers: Sequence[FloatBuffer], padded_change: FloatBuffer | None = None
     ) -> None:
         """Scatter points and normals, or their directional derivatives for a change of the control points."""
-        coefficients, bound = self._coefficients(padded)
-        change = None if padded_change is None else self._rows.vectors(padded_change)[0]
+        coefficients, *bound = self._coefficients(padded)
+        change = None if padded_change is None else self._blocks.vectors(padded_change)[0]
 
         def add(vertex: Index, s: Float, t: Float) -> tuple:
             p, du, dv = self._monomials.values(coefficients, s, t)
-            normal = UnitNormal(du, dv, bound)
+            normal = UnitNormal(du, dv, *bound)
             vectors = p, normal.value
             if change is not None:
                 p, change_u, change_v = self._monomials.values(change, s, t)
@@ -147,13 +139,13 @@ class _Part:
     ) -> None:
         """Scatter-add gradients by padded control points, from the gradients by points and normals."""
         types = self._types
-        coefficients, bound = self._coefficients(padded)
+        coefficients, *bound = self._coefficients(padded)
 
         def add(vertex: Index, s: Float, t: Float, *gradients: Vector3) -> tuple:
             _, du, dv = self._monomials.values(coefficients, s, t)
             p: Vector3 = dr.gather(types.vector3, positions, vertex)
             normal: Vector3 = dr.gather(types.vector3, normals, vertex)
-            by_u, by_v = UnitNormal(du, dv, bound).backward(normal)
+            by_u, by_v = UnitNormal(du, dv, *bound).backward(normal)
             totals = []
             for (monomial, monomial_s, monomial_t), gradient in zip(self._monomials.each(s, t), gradients, strict=True):
                 total = dr.fma(p, monomial, gradient)
@@ -161,21 +153,21 @@ class _Part:
                 totals.append(total if monomial_t is None else dr.fma(by_v, monomial_t, total))
             return tuple(totals)
 
-        zero: Vector3 = dr.zeros(types.vector3, self._rows.count)
+        zero: Vector3 = dr.zeros(types.vector3, self._blocks.count)
         gradients = self._loop(tuple(types.vector3(zero) for _ in self._monomials.powers), add, "vertex_gradients")
-        self._rows.add_transposed(gradients, sums)
+        self._blocks.add_transposed(gradients, sums)
 
-    def _coefficients(self, padded: FloatBuffer) -> tuple[list[Vector3], RoundingBound]:
-        """The coefficients of each lane's polynomial, and the rounding bound of its tangents."""
+    def _coefficients(self, padded: FloatBuffer) -> tuple[list[Vector3], Float, Vector3]:
+        """The coefficients of each lane's polynomial; rounding error and extent for `UnitNormal`."""
         types = self._types
-        coefficients, origin, extent = self._rows.vectors(padded)
-        rounding: Float = types.fetch(types.float, self._rounding, dr.arange(types.index, self._rows.count))
-        return coefficients, RoundingBound(rounding, rounding, dr.maximum(extent, dr.abs(origin) * self._least_extent))
+        coefficients, origin, extent = self._blocks.vectors(padded)
+        rounding: Float = types.fetch(types.float, self._rounding, dr.arange(types.index, self._blocks.count))
+        return coefficients, rounding, dr.maximum(extent, dr.abs(origin) * self._least_extent)
 
     def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
         """Call ``add`` for each vertex of each lane's polynomial, with its index, its parameters and the state."""
         types = self._types
-        lane: Index = dr.arange(types.index, self._rows.count)
+        lane: Index = dr.arange(types.index, self._blocks.count)
 
         def range_of(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
             return types.fetch(types.index, table, index), types.fetch(types.index, table, index + 1)
@@ -223,45 +215,15 @@ class EvaluatedVertices:
 
         Returns positions, normals, flat Dr.Jit float arrays, (3 vertex_count).
         """
-        positions, normals = self.positions, self.normals
-        if dr.grad_enabled(control_points):
-            positions, normals = dr.custom(_Evaluation, self, control_points)
-        return self.kernel.welded(positions), normals
-
-
-class _Evaluation(dr.CustomOp):
-    """The map from control points to points and normals, for evaluated vertices."""
-
-    def eval(self, vertices, control_points):  # noqa: ARG002 - the argument of the derivatives
-        self.vertices = vertices
-        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
-        return type(vertices.positions)(vertices.positions), type(vertices.normals)(vertices.normals)
-
-    def forward(self):
-        vertices = self.vertices
-        self.set_grad_out(vertices.kernel.changes(vertices.control_points, self.grad_in("control_points")))
-
-    def backward(self):
-        vertices = self.vertices
-        self.set_grad_in("control_points", vertices.kernel.gradient(vertices.control_points, *self.grad_out()))
-
-    def name(self):
-        return "VertexKernel"
+        kernel, values = self.kernel, (self.positions, self.normals)
+        derivatives = (partial(function, self.control_points) for function in (kernel.changes, kernel.gradient))
+        positions, normals = attached(values, control_points, *derivatives)
+        return kernel.welded(positions), normals
 
 
 def coordinates_expected(count: int, control_count: int) -> str:
     """Message for ``count`` coordinates that do not fit ``control_count`` control points."""
     return f"{count} coordinates; expected {3 * control_count}, x, y, z of {control_count} control points"
-
-
-@dataclass(frozen=True)
-class RoundingBound:
-    """Rounding errors of two tangents, which are sums of weighted points."""
-
-    # Sum of the absolute weights of each tangent, times the relative rounding error of such a sum
-    weight_u: Float
-    weight_v: Float
-    extent: Vector3  # Largest distance of the points from the first one, along each axis
 
 
 class UnitNormal:
@@ -272,25 +234,27 @@ class UnitNormal:
         # Tangents, of any Dr.Jit type, detached: derivatives are `forward` and `backward`
         du: Vector3,
         dv: Vector3,
-        # Rounding error of the tangents. The normal is also zero where tangents are parallel within this error, as in
-        # `evaluation.normals.unit_normals`.
-        bound: RoundingBound | None = None,
+        # Rounding error of a tangent, relative to the extent of the points that it is a sum of: their largest distance
+        # from the first one, along each axis. The normal is also zero where tangents are parallel within this error, as
+        # in `evaluation.normals.unit_normals`.
+        rounding: Float = 0,
+        extent: Vector3 = None,
     ) -> None:
         # The normal does not depend on the tangents' lengths; its derivative does by these factors.
         self._scale_u, self._scale_v = _scale(du), _scale(dv)
         self._du, self._dv = du * self._scale_u, dv * self._scale_v
         cross = dr.cross(self._du, self._dv)
         squared = dr.squared_norm(cross)
-        self.exists = squared > (0 if bound is None else self._rounding_of_cross(bound))
+        self.exists = squared > (0 if extent is None else self._rounding_of_cross(rounding, extent))
         self._inverse_length = dr.select(self.exists, dr.rsqrt(squared), 0)
         self.value = cross * self._inverse_length
 
-    def _rounding_of_cross(self, bound: RoundingBound) -> Float:
+    def _rounding_of_cross(self, rounding: Float, extent: Vector3) -> Float:
         """Squared rounding error of the cross product of parallel tangents."""
-        error_u, error_v = bound.weight_u * self._scale_u, bound.weight_v * self._scale_v
+        error_u, error_v = rounding * self._scale_u, rounding * self._scale_v
         # Components of one tangent times the error of the other; products with the extent bound the error of each
         # component.
-        a, b = dr.fma(dr.abs(self._du), error_v, dr.abs(self._dv) * error_u), bound.extent
+        a, b = dr.fma(dr.abs(self._du), error_v, dr.abs(self._dv) * error_u), extent
         return (
             dr.square(dr.fma(a.y, b.z, a.z * b.y))
             + dr.square(dr.fma(a.z, b.x, a.x * b.z))

@@ -52,7 +52,7 @@ class CageAttributes:
     Weights are computed when values first change, so a shape with constant values never needs them.
     """
 
-    # See `WeightedValues`.
+    # See `SparseMatrix`.
     UPLOADED_LATER = ("all_weights",)
 
     def __init__(
@@ -168,9 +168,9 @@ class CageAttributes:
         if key not in self._weights:
             weights: Any = channel.weights(*self._locations())
             if self._float is not None:
-                from ..kernels.control_values import WeightedValues
+                from ..kernels.linear_maps import SparseMatrix
 
-                weights = WeightedValues(weights, self._float)
+                weights = SparseMatrix(weights, self._float)
             self._weights[key] = weights
         return self._weights[key]
 

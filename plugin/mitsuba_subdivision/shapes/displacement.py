@@ -23,8 +23,8 @@ import numpy as np
 from ..device_arrays import mapped
 from ..kernels.array_types import FloatBuffer
 from ..kernels.channel_kernel import channel_kernel
-from ..kernels.control_values import ControlValues
 from ..kernels.displacement import Displacement
+from ..kernels.linear_maps import ControlValues
 from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
@@ -84,7 +84,7 @@ class ShapeDisplacement:
             self.kernel, channel = exact.kernel, exact.channel(self.attribute)
         elif self._is_jit:
             self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
-            self.kernel.load(positions)
+            self.kernel.values.load(positions)
             channel = channel_kernel(self._loaded, self.kernel.walk, variant.Float)
             self._own_values = channel.values
         if self.kernel is not None:

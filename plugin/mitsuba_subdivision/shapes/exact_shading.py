@@ -17,8 +17,8 @@ from ..device_arrays import upload
 from ..kernels.affine_map import AffineMap
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
-from ..kernels.control_values import ControlValues
 from ..kernels.line_intersection import ON_LINE, Lines
+from ..kernels.linear_maps import ControlValues
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
 from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
@@ -92,7 +92,7 @@ class ExactShading:
         pieces = surface.pieces("stam" if use_stam else "stabilized")
         # The surface in object space, relative to the centre
         self.kernel = SurfaceKernel(pieces, variant.Float, use_stam=use_stam)
-        self.kernel.load(positions)
+        self.kernel.values.load(positions)
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
         self.take_counts()
@@ -147,7 +147,7 @@ class ExactShading:
     ) -> None:
         """Set the transformation and the coefficients. Surface interactions are differentiable with respect to both."""
         self._are_turned = placement.mirrors
-        self.kernel.take(coefficients)
+        self.kernel.values.take(coefficients)
         # Assign in place, because other objects may hold a reference to the array.
         self.to_world[:] = self.kernel.types.matrix4(to_world)
         self._map = AffineMap.of(dr.detach(self.to_world), self.kernel.types.matrix4(placement.inverse))

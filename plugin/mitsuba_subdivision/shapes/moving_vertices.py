@@ -65,7 +65,7 @@ class MovingVertices:
         if kernel is not None and moves_points:
             kernel.set_control_points(points)
         elif kernel is not None and is_attached:
-            kernel.attach(points)
+            kernel.values.attach(points)
         sources = (control_points, placement.matrix, *self._others())
         moves = self.are_differentiable and dr.grad_enabled(*sources)
         self._computed = computed_ones(*sources) if moves else set()
@@ -77,7 +77,7 @@ class MovingVertices:
         """Attach exact shading and the buffers of the last evaluation to the parameters again."""
         points = self._points(control_points)
         if self._kernel is not None and dr.grad_enabled(points):
-            self._kernel.attach(points)
+            self._kernel.values.attach(points)
         return self._placed(*self._vertices.attached(points), placement, on_backward)
 
     def warn_of_lost(

@@ -1,13 +1,11 @@
 """Values of a cage on a device: sparse weights times them, with derivatives, and what kernels look up."""
 
-from functools import partial
-
 import drjit as dr
 import numpy as np
 import pytest
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
-from mitsuba_subdivision.kernels.control_values import ControlValues, WeightedValues
+from mitsuba_subdivision.kernels.linear_maps import ControlValues, SparseMatrix
 from scipy import sparse
 
 ROWS, COLUMNS = 40, 12
@@ -24,13 +22,13 @@ def weights(np_rng):
 @pytest.mark.core
 @pytest.mark.parametrize("size", [1, 2, 3, 4])
 def test_weighted_values_and_derivatives_are_products(float_type, rounding, weights, size, np_rng):
-    weighted = WeightedValues(weights, float_type)
+    matrix = SparseMatrix(weights, float_type)
     values, change = np_rng.random((2, COLUMNS, size))
     gradient = np_rng.random((ROWS, size))
     for is_forward in (False, True):
         flat = upload(float_type, values)
         dr.enable_grad(flat)
-        found = weighted(flat, size)
+        found = matrix(flat, size)
         np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=rounding)
         if is_forward:
             dr.set_grad(flat, upload(float_type, change))
@@ -46,7 +44,7 @@ def test_weighted_values_and_derivatives_are_products(float_type, rounding, weig
 def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, rounding, weights, is_weighted, np_rng):
     types = ArrayTypes.of(float_type)
     first, second = np_rng.random((2, COLUMNS, 3))
-    values = ControlValues(first, types, partial(WeightedValues(weights, types.float), size=3) if is_weighted else None)
+    values = ControlValues(types, 3, SparseMatrix(weights, types.float) if is_weighted else None).load(first)
     flat = values.flat
     given = upload(float_type, second)
     dr.enable_grad(given)
@@ -64,11 +62,11 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, roundin
 
 
 def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, rounding, weights, np_rng):
-    types, weighted = ArrayTypes.of(float_type), WeightedValues(weights, float_type)
+    types, matrix = ArrayTypes.of(float_type), SparseMatrix(weights, float_type)
     values = np_rng.random((COLUMNS, 3))
-    make = partial(weighted, size=3)
-    first, second = (ControlValues(values.copy(), types, make, key=weighted) for _ in range(2))
-    other, apart = ControlValues(values + 1, types, make, key=weighted), ControlValues(values, types, make)
+    first, second = (ControlValues(types, 3, matrix).load(values.copy()) for _ in range(2))
+    other = ControlValues(types, 3, matrix).load(values + 1)
+    apart = ControlValues(types, 3, SparseMatrix(weights, float_type)).load(values)
     kept = np.array(second.flat)
     assert first.flat is not second.flat
     assert first.flat.index == second.flat.index

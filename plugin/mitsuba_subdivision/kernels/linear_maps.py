@@ -1,0 +1,406 @@
+"""Linear maps from control values to what kernels read, with their transposes: sparse matrices, and blocks of weights.
+
+- `SparseMatrix` interpolates values, or refines control points once.
+- `WeightBlocks` makes the polynomials of patches. Patches of a class share weights; each has control points of its own.
+- `CoefficientMap` stores the polynomials of a whole piece table, for hits and samples. `VertexKernel` needs each of
+  its polynomials for the vertices on it only, and stores none.
+- `ControlValues` holds the values of a cage, or what such a map makes of them, for kernels to gather from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..mesh import ragged
+from ..mesh.shared import Content, LaterArray, Shared, SharedArray
+from ..patches.piece_table import NOTHING, PACKET, piece_packets
+from .array_types import NO_CONFLICTS, ArrayTypes, FloatBuffer, Index, IndexBuffer, Mask, Value, Vector3, Vector4
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+    from ..patches import PieceTable
+
+_MATRICES: Shared[SparseMatrix] = Shared()
+_MAPS: Shared[CoefficientMap] = Shared()
+_MADE: Shared[LaterArray] = Shared()
+
+
+def attached(values: Any, argument: Any, forward: Callable[..., Any], backward: Callable[..., Any]) -> Any:
+    """Attach detached values to the argument that they were computed from, if it is differentiated.
+
+    ``forward`` returns the change of the values for a change of the argument; ``backward`` the gradient by the argument
+    from those by the values. Dr.Jit's own derivatives cannot replace these transposes: in version 1.5, its reverse mode
+    ends the process at loops whose terms are relative to a gathered origin.
+    """
+    return dr.custom(_Attached, values, argument, forward, backward) if dr.grad_enabled(argument) else values
+
+
+class _Attached(dr.CustomOp):
+    def eval(self, values, argument, forward, backward):  # noqa: ARG002 - the argument of the derivatives
+        self._forward, self._backward = forward, backward
+        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
+        return tuple(type(x)(x) for x in values) if isinstance(values, tuple) else type(values)(values)
+
+    def forward(self):
+        self.set_grad_out(self._forward(self.grad_in("argument")))
+
+    def backward(self):
+        gradients = self.grad_out()
+        self.set_grad_in("argument", self._backward(*(gradients if isinstance(gradients, tuple) else [gradients])))
+
+
+class SparseMatrix:
+    """A sparse matrix on the device, whose products are differentiable, forward and backward."""
+
+    # Properties that upload arrays at their first use; see `shapes.device_state`.
+    UPLOADED_LATER = ("transposed_rows",)
+
+    def __init__(
+        self,
+        matrix: sparse.csr_array,  # (n, m) sparse array
+        float_type: type,  # Flat Dr.Jit array of the values, such as `drjit.llvm.ad.Float`; entries have its precision
+        *,
+        # Whether rows sum to one. Sums are then relative to the first value of each row, which reduces rounding errors.
+        is_relative: bool = True,
+    ) -> None:
+        self._types, self._matrix, self._is_relative = ArrayTypes.of(float_type), matrix, is_relative
+        self._rows = self._uploaded(matrix)
+
+    @classmethod
+    def shared(cls, matrix: sparse.csr_array, float_type: type) -> SparseMatrix:
+        """A matrix whose rows sum to one; equal ones share the object while it is referenced."""
+        key = float_type, *map(Content, (matrix.data, matrix.indices, matrix.indptr)), matrix.shape
+        return _MATRICES.get(key, lambda: cls(matrix, float_type))
+
+    def __call__(
+        self,
+        values: FloatBuffer,  # m values of ``size`` components, flat
+        size: int,  # At most 4
+        known: FloatBuffer | None = None,  # A known product, which is then only attached to the values
+    ) -> FloatBuffer:
+        """Multiply values by the matrix; returns ``n`` values, flat."""
+        product = self.product(dr.detach(values), size) if known is None else known
+        return attached(product, values, partial(self.product, size=size), partial(self.transposed, size=size))
+
+    def product(self, flat: FloatBuffer, size: int = 3) -> FloatBuffer:
+        """The product without derivatives."""
+        return self._product(self._rows, flat, size, self._is_relative)
+
+    def transposed(self, flat: FloatBuffer, size: int = 3) -> FloatBuffer:
+        """The product with the transposed matrix, without derivatives."""
+        return self._product(self.transposed_rows, flat, size, is_relative=False)
+
+    @cached_property
+    def transposed_rows(self) -> tuple:
+        return self._uploaded(self._matrix.T.tocsr())
+
+    def _uploaded(self, matrix: sparse.csr_array) -> tuple:
+        """Number of rows; start of each row; columns and entries."""
+        types = self._types
+        return matrix.shape[0], types.indices(matrix.indptr), types.indices(matrix.indices), types.floats(matrix.data)
+
+    def _product(self, rows: tuple, flat: FloatBuffer, size: int, is_relative: bool) -> FloatBuffer:
+        types = self._types
+        vector, (row_count, starts, columns, entries) = types.vector(size), rows
+        row: Index = dr.arange(types.index, row_count)
+        start: Index = dr.gather(types.index, starts, row)
+        end: Index = dr.gather(types.index, starts, row + 1)
+        zero: Value = dr.zeros(vector, row_count)
+
+        def value(index: Index, active: Mask = True) -> Value:
+            """The value that an entry of the matrix is multiplied by."""
+            column: Index = dr.gather(types.index, columns, index, active)
+            return dr.gather(vector, flat, column, active)
+
+        origin = value(start, start < end) if is_relative else zero
+
+        def add(index, total):
+            entry = dr.gather(types.float, entries, index)
+            return index + 1, dr.fma(value(index) - origin, entry, total)
+
+        _, total = dr.while_loop((start, zero), lambda index, _: index < end, add, label="sparse_matrix")
+        return dr.ravel(origin + total)
+
+
+class WeightBlocks:
+    """Blocks of weights on the device, each a matrix that makes vectors of the control points of a patch.
+
+    There is a lane for each patch of each block. Weights of the first control point are those of the transposed map, as
+    the others are relative to it: they sum to one for the first vector, and to zero for the others.
+    """
+
+    def __init__(
+        self,
+        types: ArrayTypes,
+        weights: Sequence[np.ndarray],  # Blocks (b, m, K) for K control points: m vectors of the same number in all
+        # (n, 4) int: for each block the index of its first control in ``controls``, the stride and the number of the
+        # controls of a patch, and its first row of weights, of which each control point has one
+        columns: np.ndarray,
+        controls: IndexBuffer,  # Indices of control points
+        # (l,) int: block and patch of each lane. Lanes of a block are mostly consecutive, so that they read the same
+        # weights.
+        block: np.ndarray,
+        patch: np.ndarray,
+    ) -> None:
+        self._types, self._controls = types, controls
+        self.width, self.count = weights[0].shape[1], len(block)
+        self._row_size = -(-self.width // PACKET) * PACKET
+        rows = np.zeros((sum(len(part) * part.shape[2] for part in weights), self._row_size), types.numpy_float)
+        end = 0
+        for part in weights:
+            begin, end = end, end + len(part) * part.shape[2]
+            block_rows = rows[begin:end].reshape(len(part), part.shape[2], -1)[:, :, : self.width]
+            block_rows[:] = part.swapaxes(1, 2)
+            block_rows[:, 0] = -part[:, :, 1:].sum(axis=2)
+            block_rows[:, 0, 0] += 1
+        self._lane = types.indices(block), types.indices(patch)
+        self._columns, self._weights = types.indices(columns), types.floats(rows)
+
+    def vectors(self, padded: FloatBuffer) -> tuple[list[Vector3], Vector3, Vector3]:
+        """Compute the vectors of each lane from the padded control points.
+
+        Also returns the first control point of each lane, and the largest distance of the others from it along each
+        axis.
+        """
+        types = self._types
+        control, control_count, row = self._lanes()
+        origin = types.packet(padded, control(types.index(0)))
+
+        def add(k, extent, *sums):
+            relative = types.packet(padded, control(k)) - origin
+            added = (dr.fma(relative, weight, total) for weight, total in zip(self._row(row + k), sums, strict=True))
+            return k + 1, dr.maximum(extent, dr.abs(relative)), *added
+
+        zero: Vector3 = dr.zeros(types.vector3, self.count)
+        start = (dr.full(types.index, 1, self.count), *(types.vector3(zero) for _ in range(self.width + 1)))
+        _, extent, *sums = dr.while_loop(start, lambda k, *_: k < control_count, add, label="coefficients")
+        sums[0] = sums[0] + origin
+        return sums, origin, extent
+
+    def add_transposed(self, vectors: Sequence[Vector3], sums: FloatBuffer) -> None:
+        """Scatter-add vectors of each lane, times the weights, to the control points' packets."""
+        types = self._types
+        control, control_count, row = self._lanes()
+
+        def add(k):
+            total = vectors[0] * 0
+            for vector, weight in zip(vectors, self._row(row + k), strict=True):
+                total = dr.fma(vector, weight, total)
+            dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
+            return (k + 1,)
+
+        start: tuple[Index] = (dr.zeros(types.index, self.count),)
+        dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
+
+    def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index]:
+        """A function that returns the k-th control point of each lane; their number; the first row of weights."""
+        types = self._types
+        lane: Index = dr.arange(types.index, self.count)
+        block, patch = (types.fetch(types.index, indices, lane) for indices in self._lane)
+        first_control, stride, control_count, row = types.fetch(types.index4, self._columns, block)
+        patch_control = first_control + patch
+
+        def control(k: Index) -> Index:
+            return types.fetch(types.index, self._controls, dr.fma(k, stride, patch_control))
+
+        return control, control_count, row
+
+    def _row(self, row: Index) -> list:
+        """Fetch a row of weights, one for each vector."""
+        return self._types.row(self._weights, self._row_size, row)[: self.width]
+
+
+class CoefficientMap:
+    """The map of a piece table from control values to coefficients; differentiable, forward and backward."""
+
+    def __init__(self, table: PieceTable, float_type: type) -> None:
+        self._types = types = ArrayTypes.of(float_type)
+        self._packet_count, refinement, controls = table.packet_count, table.refinement, table.controls
+        # To the control points of the patches, if these are those of the cage refined once
+        self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
+        self._refined_count = table.control_count if refinement is None else refinement.shape[0]
+        # Parts of patches have control points of their own, stored after all others, and so are their indices.
+        point_count, packets_of_piece = self._refined_count, table.packets_of_piece
+        parts, pieces, rings = [], [], []
+        for maps, (first, count, control_count, first_piece, piece_count, first_ring, is_ring) in zip(
+            table.maps, table.classes.tolist(), strict=True
+        ):
+            for begin, stencils, weights in maps:
+                part_first, part_size = first, control_count
+                if stencils is not None:
+                    part_first, part_size = len(controls) + point_count - self._refined_count, len(stencils)
+                    parts.append((stencils[:, None], first, count, control_count, point_count, count, 1))
+                    point_count += count * part_size
+                packet, step = packets_of_piece * (first_piece + begin), packets_of_piece * piece_count
+                pieces.append((weights, part_first, count, part_size, packet, packets_of_piece, step))
+            if is_ring:
+                ring = controls[first : first + count * control_count].reshape(control_count, count).T
+                origin = np.where(np.arange(control_count) == 0, NOTHING, ring[:, :1])
+                packets = first_ring + np.arange(ring.size).reshape(ring.shape)
+                rings.append(np.stack([ring, origin, packets]).reshape(3, -1))
+        self._point_count = point_count
+        all_controls = types.indices(controls, np.arange(self._refined_count, point_count))
+        self._parts, self._pieces = (_packet_blocks(types, added, all_controls) for added in (parts, pieces))
+        # Control points stored among the coefficients: their indices; the indices of their origins, or `NOTHING`; and
+        # their packets.
+        self._rings = [types.indices(column) for column in np.concatenate(rings, axis=1)] if rings else None
+
+    @classmethod
+    def shared(cls, table: PieceTable, float_type: type) -> CoefficientMap:
+        """The map of a table, shared by all callers."""
+        return _MAPS.get((table, float_type), lambda: cls(table, float_type))
+
+    def __call__(
+        self,
+        values: FloatBuffer,  # Control values of ``size`` components, flat
+        size: int = 3,  # At most 3; coefficients are padded to vectors of three components with zeros
+        known: FloatBuffer | None = None,  # Known coefficients, which are then only attached to the values
+    ) -> FloatBuffer:
+        """Compute the coefficients, see `PieceTable`."""
+        points, types = values, self._types
+        if size < 3:
+            components = [values] if size == 1 else [*dr.unravel(types.vector(size), values)]
+            points = dr.ravel(types.vector3(*components, *[0] * (3 - size)))
+        coefficients = self._applied(dr.detach(points)) if known is None else known
+        return attached(coefficients, points, self._applied, self._transposed)
+
+    def _applied(self, points: FloatBuffer) -> FloatBuffer:
+        types = self._types
+        padded = types.padded(points if self._refinement is None else self._refinement.product(points))
+        if self._parts is not None:
+            refined, padded = padded, dr.zeros(types.float, PACKET * self._point_count)
+            index: Index = dr.arange(types.index, self._refined_count)
+            dr.scatter(padded, types.fetch(types.vector4, refined, index), index, mode=NO_CONFLICTS)
+            self._write(self._parts, refined, padded)
+        coefficients: FloatBuffer = dr.zeros(types.float, PACKET * self._packet_count)
+        if self._rings is not None:
+            control, first, packet = self._rings
+            origin = types.fetch(types.vector4, padded, first, first != NOTHING)
+            dr.scatter(coefficients, types.fetch(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
+        if self._pieces is not None:
+            self._write(self._pieces, padded, coefficients)
+        return coefficients
+
+    def _transposed(self, gradient: FloatBuffer) -> FloatBuffer:
+        """Gradient by the control points, from the gradient by the coefficients."""
+        types = self._types
+        sums: FloatBuffer = dr.zeros(types.float, PACKET * self._point_count)
+        if self._rings is not None:
+            control, first, packet = self._rings
+            ring_gradient: Vector4 = types.fetch(types.vector4, gradient, packet)
+            dr.scatter_add(sums, ring_gradient, control)
+            dr.scatter_add(sums, -ring_gradient, first, first != NOTHING)
+        if self._pieces is not None:
+            self._add_transposed(self._pieces, gradient, sums)
+        if self._parts is not None:
+            dr.eval(sums)
+            self._add_transposed(self._parts, type(sums)(sums), sums)
+        points_gradient = types.unpadded(sums, self._refined_count)
+        return points_gradient if self._refinement is None else self._refinement.transposed(points_gradient)
+
+    def _write(self, packet_blocks: PacketBlocks, padded: FloatBuffer, coefficients: FloatBuffer) -> None:
+        """Compute all vectors from the padded control points, and scatter them as packets."""
+        blocks, first = packet_blocks
+        numbers = [number for vector in blocks.vectors(padded)[0] for number in vector]
+        numbers += [self._types.float(0)] * (-len(numbers) % PACKET)
+        for i in range(0, len(numbers), PACKET):
+            packet = self._types.vector4(*numbers[i : i + PACKET])
+            dr.scatter(coefficients, packet, first + i // PACKET, mode=NO_CONFLICTS)
+
+    def _add_transposed(self, packet_blocks: PacketBlocks, gradient: FloatBuffer, sums: FloatBuffer) -> None:
+        """Scatter-add the gradients by all vectors, times the weights, to the control points' packets."""
+        blocks, first = packet_blocks
+        packet_count = piece_packets(blocks.width)
+        numbers = self._types.row(gradient, PACKET * packet_count, first // packet_count)
+        blocks.add_transposed([self._types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(blocks.width)], sums)
+
+
+PacketBlocks = tuple[WeightBlocks, IndexBuffer]
+
+
+def _packet_blocks(
+    types: ArrayTypes,
+    # Blocks of weights (b, m, K); index of the first control, number of patches, number of controls of a patch; first
+    # packet of the results, its distance from one block to the next, and from one patch to the next
+    added: list[tuple[np.ndarray, int, int, int, int, int, int]],
+    controls: IndexBuffer,
+) -> PacketBlocks | None:
+    """Upload blocks of weights for all patches of classes, and the first packet that each lane writes."""
+    weights, table, row_count = {}, [], 0
+    for block_weights, first, count, control_count, *packets in added:
+        if id(block_weights) not in weights:
+            weights[id(block_weights)] = block_weights, row_count
+            row_count += len(block_weights) * control_count
+        _, row = weights[id(block_weights)]
+        table.append((len(block_weights), first, count, control_count, row, *packets))
+    if not table:
+        return None
+    block_counts, *data = np.array(table).T
+    index = ragged.index_in_row(block_counts)
+    first, count, control_count, row, packet, block_step, patch_step = np.repeat(data, block_counts, axis=1)
+    # Successive controls of a patch are as far apart as the class has patches.
+    columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
+    block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
+    blocks = WeightBlocks(types, [part for part, _ in weights.values()], columns, controls, block, patch)
+    return blocks, types.indices((packet + index * block_step)[block] + patch * patch_step[block])
+
+
+class ControlValues:
+    """Values of a cage, or what a linear map makes of them, in one array that kernels gather from."""
+
+    def __init__(
+        self,
+        types: ArrayTypes,
+        size: int,  # Number of components of a value
+        linear_map: SparseMatrix | CoefficientMap | None = None,
+    ) -> None:
+        self._types, self.size, self._map = types, size, linear_map
+        # Never replaced, because other objects may hold a reference to the array.
+        self.flat: FloatBuffer = types.float()
+        # Keeps the array that is shared with objects of equal values.
+        self._shared: SharedArray | LaterArray | None = None
+
+    def load(self, values: NDArray[np.floating]) -> ControlValues:
+        """Set the values ``(n, k)`` of the cage, and return this object.
+
+        Objects with equal values and the same map share the array until `set` is called.
+        """
+        types, linear_map = self._types, self._map
+        if linear_map is None:
+            self._shared = types.shared_floats(values)
+            self.take(self._shared.array)
+        else:
+            self._shared = _MADE.get((linear_map, Content(values)), LaterArray)
+            self.take(self._shared.get(lambda: linear_map(types.floats(values), self.size)))
+        return self
+
+    def set(self, values: FloatBuffer) -> None:
+        """Set the values of the cage, flat. Later lookups are attached to them."""
+        self._shared = None
+        self.take(values if self._map is None else self._map(values, self.size))
+
+    def attach(self, values: FloatBuffer) -> None:
+        """Attach the array to the values of the cage that it was computed from again."""
+        self.take(values if self._map is None else self._map(values, self.size, dr.detach(self.flat)))
+
+    def take(self, flat: FloatBuffer) -> None:
+        """Set the array itself, or attach an equal one to other variables."""
+        # Dr.Jit compiles literals into kernels.
+        dr.make_opaque(flat)
+        self.flat[:] = flat
+
+    @property
+    def are_moving(self) -> bool:
+        """Whether the values are differentiated."""
+        return bool(dr.grad_enabled(self.flat))
+
+    def fetch(self, index: Index, active: Mask = True) -> Value:
+        """Gather the value at an index; zero in inactive lanes."""
+        return self._types.fetch(self._types.vector(self.size), self.flat, index, active)
