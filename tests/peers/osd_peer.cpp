@@ -3,7 +3,6 @@
 //   osd_peer QUERIES ANSWERS [--method far|bfr|refine] [--level n] [--real float|double]
 //            [--scheme catmark|loop|bilinear] [--boundary none|edge_only|edge_and_corner] [--creasing uniform|chaikin]
 //            [--triangles catmark|smooth] [--fvar all|none|boundaries|corners_only|corners_plus1|corners_plus2]
-//            [--repetitions n] [--threads n]
 //
 //   far      adaptive refinement to the level, a patch table with Gregory end caps, EvaluateBasis
 //   bfr      Bfr::Surface of each face that is asked for, which approximates smooth and sharp features at the level

@@ -1,22 +1,19 @@
-// What the programs share: files of named arrays, the cage and the queries in them, options, and timing.
+// Around the surfaces of `osd_peer`: files of named arrays, the cage and the queries in them, and options.
 //
 // A file is a run of records: a name (16 bytes, padded with zeros), a type ('i' int32, 'd' float64; 8 bytes, likewise),
 // a count (int64), and the values. peers.py writes the queries and reads the answers.
 #pragma once
 #include <algorithm>
-#include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <fstream>
-#include <functional>
 #include <limits>
 #include <map>
 #include <memory>
 #include <string>
-#include <thread>
 #include <vector>
 
 namespace peer {
@@ -149,39 +146,11 @@ private:
     std::vector<std::string> values_;
 };
 
-// Median milliseconds of a few calls.
-inline double milliseconds(int repetitions, const std::function<void()> &work) {
-    using Clock = std::chrono::steady_clock;
-    std::vector<double> taken;
-    for (int i = 0; i < repetitions; ++i) {
-        auto start = Clock::now();
-        work();
-        taken.push_back(std::chrono::duration<double, std::milli>(Clock::now() - start).count());
-    }
-    std::sort(taken.begin(), taken.end());
-    return taken[taken.size() / 2];
-}
-
-inline void in_threads(int threads, int count, const std::function<void(int, int)> &work) {
-    if (threads <= 1) return work(0, count);
-    std::vector<std::thread> pool;
-    for (int k = 0; k < threads; ++k)
-        pool.emplace_back(work, int(int64_t(count) * k / threads), int(int64_t(count) * (k + 1) / threads));
-    for (auto &thread : pool) thread.join();
-}
-
-// Makes a `Surface` of the cage, answers all queries with it, and prints what both took.
+// Makes a `Surface` of the cage and answers all queries with it.
 template <class Surface>
 void run(const Arguments &arguments, const Cage &cage, const Queries &queries, Answers &answers) {
-    int repetitions = arguments.number("repetitions", 1), threads = arguments.number("threads", 1);
-    std::unique_ptr<Surface> surface;
-    double setup = milliseconds(repetitions, [&] { surface.reset(new Surface(cage, arguments, queries)); });
-    double evaluation = milliseconds(repetitions, [&] {
-        in_threads(threads, queries.count(), [&](int begin, int end) {
-            for (int i = begin; i < end; ++i) surface->answer(queries, i, answers);
-        });
-    });
-    std::printf("{\"setup_ms\": %.6g, \"evaluation_ms\": %.6g}\n", setup, evaluation);
+    Surface surface(cage, arguments, queries);
+    for (int i = 0; i < queries.count(); ++i) surface.answer(queries, i, answers);
 }
 
 } // namespace peer

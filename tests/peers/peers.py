@@ -1,19 +1,18 @@
-"""Other programs' subdivision surfaces: OpenSubdiv and Embree, at the parameters of this project.
+"""OpenSubdiv's surfaces, at the parameters of this project.
 
-``python tests/peers/peers.py`` compiles both programs and prints where they are. They are kept in the user's cache, by
-a hash of everything they are made from.
+``python tests/peers/peers.py`` compiles the program that answers, and prints where it is. It is kept in the user's
+cache, by a hash of everything it is made from.
 """
 
 import contextlib
 import functools
 import hashlib
-import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -22,64 +21,49 @@ import numpy as np
 from mitsuba_subdivision.figures.peers import read_records, write_records
 from numpy.typing import ArrayLike, NDArray
 
-try:
-    import fcntl
-except ImportError:  # On Windows.
-    fcntl = None
-
-SOURCES = Path(__file__).resolve().parent
-LIBRARIES = {"osd": "osdCPU", "embree": "embree3"}
+SOURCES = [Path(__file__).with_name(name) for name in ("osd_peer.cpp", "peer_common.h")]
 # The answers take milliseconds, and compiling OpenSubdiv's headers with -O3 three times as long as with -O1.
-FLAGS = ["-std=c++17", "-O1", "-march=native", "-DNDEBUG", "-pthread"]
+FLAGS = ["-std=c++17", "-O1", "-DNDEBUG", "-pthread"]
 # Corners of a face that has one domain.
 REGULAR_SIZE = {"catmark": 4, "bilinear": 4, "loop": 3}
+LEVELS = {"far": 10, "bfr": 2, "refine": 6}
 
 
 class PeerError(RuntimeError):
-    """A peer is missing, or did not answer."""
+    """OpenSubdiv's program is missing, or did not answer."""
 
 
 @functools.cache
-def find(name: str) -> Path | str:
-    """Path of a peer's program, compiled if it is not yet; or, in words, why there is none."""
+def find() -> Path | str:
+    """Path of the program, compiled if it is not yet; or, in words, why there is none."""
     compiler = shutil.which("g++")
     if compiler is None:
         return "no compiler g++"
-    # The macros name the compiler's version and the instructions of this processor.
-    preprocess = [compiler, *FLAGS, "-dM", "-E", "-x", "c++", "-"]
-    macros = subprocess.run(preprocess, input=b"", capture_output=True, check=False)
-    files = [SOURCES / "peer_common.h", SOURCES / f"{name}_peer.cpp"]
-    made_from = b"\0".join([macros.stdout, *(file.read_bytes() for file in files), *map(str.encode, FLAGS)])
+    made_from = b"\0".join([*(path.read_bytes() for path in SOURCES), *map(str.encode, FLAGS)])
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
-    program = cache / hashlib.sha256(made_from).hexdigest()[:16] / f"{name}_peer"
+    program = cache / hashlib.sha256(made_from).hexdigest()[:16] / "osd_peer"
     if program.exists():
         return program
     program.parent.mkdir(parents=True, exist_ok=True)
-    with _alone(program.parent), tempfile.TemporaryDirectory(dir=program.parent) as beside:
+    with (program.parent / "lock").open("w") as lock, tempfile.TemporaryDirectory(dir=cache) as beside:
+        with contextlib.suppress(ImportError):  # On Windows.
+            import fcntl
+
+            # Other processes that run tests wait for what this one compiles.
+            fcntl.flock(lock, fcntl.LOCK_EX)
         if program.exists():
             return program
-        new = Path(beside) / program.name
-        command = [compiler, *FLAGS, str(files[1]), "-o", str(new), f"-l{LIBRARIES[name]}"]
+        new, link = Path(beside) / "new", Path(beside) / "link"
+        command = [compiler, *FLAGS, str(SOURCES[0]), "-o", str(new), "-losdCPU"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             wrong = [line for line in done.stderr.splitlines() if "error" in line or "cannot find" in line]
-            return f"{name}_peer.cpp does not compile: {(wrong or ['g++ failed'])[0]}"
+            return f"{SOURCES[0].name} does not compile: {(wrong or ['g++ failed'])[0]}"
         new.replace(program)
-    # A name that figures know leads to the program that was compiled last.
-    with tempfile.TemporaryDirectory(dir=cache) as beside:
-        link = Path(beside) / program.name
+        # A name that figures know leads to the program that was compiled last.
         link.symlink_to(program)
         link.replace(cache / program.name)
     return program
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Let other processes that run tests wait for what this one compiles."""
-    with (folder / "lock").open("w") as lock:
-        if fcntl is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +85,7 @@ class PeerCage:
 
 
 class PeerSamples(NamedTuple):
-    """Samples of a peer's surface; not a number where it has none."""
+    """Samples of OpenSubdiv's surface; not a number where it has none."""
 
     p: NDArray[np.float64]  # (s, 3)
     # (s, 3) derivatives by the sample's own (u, v); by "refine", two tangents of other directions.
@@ -111,7 +95,6 @@ class PeerSamples(NamedTuple):
     # (s,); by "refine", the refined vertex at the sample, and its rule: 1 smooth, 2 dart, 4 crease, 8 corner.
     vertex: NDArray[np.int32]
     rule: NDArray[np.int32]
-    times: dict[str, float]  # ``setup_ms`` and ``evaluation_ms``.
 
     @property
     def n(self) -> NDArray[np.float64]:
@@ -130,21 +113,14 @@ def evaluate(
     method: str = "far",
     level: int | None = None,
     real: str = "double",
-    repetitions: int = 1,
-    threads: int = 1,
 ) -> PeerSamples:
-    """Samples of a cage's limit surface by a peer; ``element``, ``uv`` and ``corner`` as for `LimitSurface.evaluate`.
+    """Samples of a cage's limit surface; ``element``, ``uv`` and ``corner`` as for `LimitSurface.evaluate`.
 
-    The method is "far", OpenSubdiv's patch tables after adaptive refinement; "bfr", its `Bfr` surfaces; "refine",
-    uniform refinement and limit masks, which know vertices of the level only; or "embree", which knows Catmull-Clark
-    without face-varying values only. Embree agrees with OpenSubdiv to single precision but for semi-sharp features
-    (5e-2 of the cage's box), holes, which it leaves out of the neighbourhood, and border vertices with one face and no
-    corner (9e-3). It is always in single precision.
-
-    Levels of refinement are 10 for "far", which can no more, 2 for "bfr", its own default, and 6 for "refine", unless
-    given. For timing, ``repetitions`` and ``threads``: the median of so many runs, evaluated by so many threads.
+    The method is "far", patch tables after adaptive refinement; "bfr", surfaces of single faces; or "refine", uniform
+    refinement and limit masks, which know vertices of the level only. Levels of refinement are 10 for "far", which can
+    no more, 2 for "bfr", its own default, and 6 for "refine", unless given.
     """
-    program = find("embree" if method == "embree" else "osd")
+    program = find()
     if not isinstance(program, Path):
         raise PeerError(program)
     sizes = np.array([len(face) for face in cage.faces])
@@ -172,11 +148,9 @@ def evaluate(
         "sub": np.where(is_whole, 0, corner).astype(np.int32),
         "uv": turned,
     }
-    options = {"boundary": cage.boundary, "repetitions": repetitions, "threads": threads}
-    if method != "embree":
-        options |= {"method": method, "level": {"far": 10, "bfr": 2, "refine": 6}[method] if level is None else level}
-        options |= {"real": real, "scheme": cage.scheme, "creasing": cage.creasing}
-        options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
+    options = {"method": method, "level": LEVELS[method] if level is None else level, "real": real}
+    options |= {"scheme": cage.scheme, "boundary": cage.boundary, "creasing": cage.creasing}
+    options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
         write_records(queries, records)
@@ -189,7 +163,7 @@ def evaluate(
     if method != "refine":
         du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))
     fvar = found["fvar"].reshape(len(element), values.shape[1])
-    return PeerSamples(p, du, dv, fvar, found["vertex"], found["rule"], json.loads(done.stdout))
+    return PeerSamples(p, du, dv, fvar, found["vertex"], found["rule"])
 
 
 def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, NDArray]:
@@ -201,5 +175,4 @@ def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, ND
 
 
 if __name__ == "__main__":
-    for peer in LIBRARIES:
-        sys.stdout.write(f"{peer}: {find(peer)}\n")
+    sys.stdout.write(f"{find()}\n")

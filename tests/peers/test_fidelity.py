@@ -37,7 +37,7 @@ from .fidelity_cages import ISLANDS, SURFACES, bipyramid, book, cube, fan, grid,
 from .peers import PeerCage, evaluate, find
 
 pytestmark = AGAINST_OSD = [
-    pytest.mark.skipif(isinstance(find("osd"), str), reason=str(find("osd"))),
+    pytest.mark.skipif(isinstance(find(), str), reason=str(find())),
     # Cages that are no manifold.
     pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning"),
 ]
