@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
-from mitsuba_subdivision.kernels.element_walk import doublings, in_child
+from mitsuba_subdivision.kernels.locations import doublings, in_child
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 
 MOST = 30

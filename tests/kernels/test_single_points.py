@@ -11,7 +11,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.kernels import line_intersection
 from mitsuba_subdivision.kernels.affine_map import AffineMap
 from mitsuba_subdivision.kernels.line_intersection import ON_LINE
-from mitsuba_subdivision.kernels.triangle_locations import UniformLocations
+from mitsuba_subdivision.kernels.locations import TriangleLocations
 from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal
 from reference.refined_cages import tagged
 
@@ -87,7 +87,7 @@ def test_locations_are_found_beside_holes(scheme, cage):
     """Faces are whole or holes here: none has corners of its own, and nothing is divided by their number."""
     surface = LimitSurface(tagged(cage, holes=[1]), scheme)
     kernel, table = surface.on_device(DOUBLE), surface.sampling(2)
-    locations = UniformLocations(table.grid, kernel.walk, kernel.types)
+    locations = TriangleLocations(table, kernel.walk, kernel.types)
     expected = table.apply(surface.cage.positions)[0]
     for triangle in range(0, len(table.triangles), 5):
         found = kernel.at(locations(kernel.types.index(triangle), kernel.types.float(0), kernel.types.float(0)))

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, surface_named, vectors
-from mitsuba_subdivision.kernels.triangle_locations import UniformLocations
+from mitsuba_subdivision.kernels.locations import TriangleLocations
 
 pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
@@ -18,7 +18,7 @@ CHANGED = 1e-12
 def made(name, rate):
     surface = surface_named(name)
     kernel, table = kernel_named(name, "llvm_ad_rgb_double"), surface.sampling(rate)
-    return surface, kernel, table, UniformLocations(table.grid, kernel.walk, kernel.types)
+    return surface, kernel, table, TriangleLocations(table, kernel.walk, kernel.types)
 
 
 @EVERY_SURFACE

@@ -132,7 +132,7 @@ class ArrayTypes:
         # Copied to memory of Dr.Jit, as frozen functions may replace the array.
         return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(dr.opaque(self.floats(values))))
 
-    def given(self, kind: type, values: Any) -> Any:
+    def converted(self, kind: type, values: Any) -> Any:
         """Convert a user's values to one of these types; a NumPy array of vectors has a row for each component."""
         return mapped(kind, values.T) if isinstance(values, np.ndarray) else kind(values)
 

@@ -18,7 +18,7 @@ from .polynomial import Monomials
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel
-    from .element_walk import ElementWalk, Location
+    from .locations import ElementWalk, Location
 
 # Exponents of the monomials 1, u, v and, on the square, u v.
 _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))

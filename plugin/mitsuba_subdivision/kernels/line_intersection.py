@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 
 from .array_types import ArrayTypes, Float, Index, Mask, Vector3
-from .element_walk import ElementWalk, Location, turned
+from .locations import ElementWalk, Location
 from .piece_kernel import PatchValues
 from .vectors import LONGEST_STEP, STEP_TOLERANCE, dot, over, rounding, step_along
 
@@ -134,15 +134,15 @@ class LineIntersection:
             has_settled = is_finite & (dr.minimum(steps.length, parameter_change) * piece.magnification < last_step)
             # This is also true if the other side is unreachable, beyond a crease.
             is_wrong_side = has_settled & (aim == ON_LINE) & (dot(surface.normal, steps.d) * facing < 0)
-            converges = has_settled & (is_wrong_side == False) & (steps.is_along_surface == False)  # noqa: E712
+            converges = has_settled & ~is_wrong_side & ~steps.is_along_surface
             converges &= (target.half_edge == half_edge) & piece.is_inside(target.u - u, target.v - v, last_step)
             converges &= dr.sqrt(dot(offset, offset)) <= max_distance
             # At a border, successive steps overshoot by nearly the same amount.
             overshoot = dr.maximum(dr.abs(target.u - unclamped.u), dr.abs(target.v - unclamped.v)) * piece.magnification
             holds = converges & (overshoot > BEYOND_BORDER)
 
-            ends = is_held | (aim == MISSED) | (converges & (holds == False))  # noqa: E712 - an array
-            fails = (round_count + 1 >= ROUNDS) & ((ends | holds) == False)  # noqa: E712 - an array
+            ends = is_held | (aim == MISSED) | (converges & ~holds)
+            fails = (round_count + 1 >= ROUNDS) & ~(ends | holds)
             new_side = dr.select(dot(offset, steps.d) < 0, types.float(-1), types.float(1))
             side = dr.select(steps.is_along_surface, side, dr.select(is_wrong_side, new_side, 0))
             side = dr.select(fails, 0, side)
@@ -172,8 +172,7 @@ class LineIntersection:
         aim, _, _, _, _, half_edge, u, v, *values = dr.while_loop(
             state, continues, search, mode="symbolic", label="line_intersection"
         )
-        corner = self._walk.corner(half_edge, active)
-        location_from_first = Location(half_edge - corner, *turned(self._walk.domain, u, v, corner))
+        location_from_first, corner = self._walk.from_first(Location(half_edge, u, v), active)
         return LineHits(
             location_from_first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(self._walk, corner)
         )

@@ -9,7 +9,7 @@ from typing import Any
 import drjit as dr
 
 from .array_types import ArrayTypes, Float, Index, Mask, Vector3
-from .element_walk import ElementWalk, Location, distances
+from .locations import ElementWalk, Location, distances
 from .piece_kernel import PatchValues, Piece
 from .vectors import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
 
@@ -98,9 +98,7 @@ class NearestLocation:
             length = dr.maximum(dr.abs(step_factor * du), dr.abs(step_factor * dv)) * piece.magnification
             is_first = dr.isinf(squared_distance)
             new_u, new_v, along_u, along_v, is_free = self._step(location, values, offset)
-            is_done = (improves & (is_first == False) & (length < last_step)) | (  # noqa: E712 - an array
-                (improves == False) & (length < shortest_step)  # noqa: E712
-            )
+            is_done = (improves & ~is_first & (length < last_step)) | (~improves & (length < shortest_step))
             best_location = Location(half_edge, u, v).chosen(improves, location)
             return (
                 dr.select(is_done, 0, steps_left - 1),
@@ -121,7 +119,7 @@ class NearestLocation:
         state = (*start_state, zero, zero, zero > 1)
         _, half_edge, u, v, *_ = dr.while_loop(state, continues, step, mode="symbolic", label="nearest_location")
         # One more step, which is not taken, determines the directions in which the final location may move.
-        location = self._walk.from_first(Location(half_edge, u, v), active)
+        location, _ = self._walk.from_first(Location(half_edge, u, v), active)
         values = self._piece(location.half_edge, location.u, location.v, active).values(derivatives=2)
         _, _, along_u, along_v, is_free = self._step(location, values, values.value - p)
         return location, NearestPoints(p, along_u, along_v, is_free)
@@ -157,7 +155,7 @@ class NearestLocation:
             )
         is_on_side = side < len(inside)
         # Test only the side that the step crosses furthest.
-        is_free = (is_on_side & self._walk.is_border(location, side, is_on_side)) == False  # noqa: E712 - an array
+        is_free = ~(is_on_side & self._walk.is_border(location, side, is_on_side))
         u, v = types.float(0), types.float(0)
         for k, (along_u, along_v) in enumerate(_SIDES[self._domain.corner_count]):
             u, v = dr.select(side == k, along_u, u), dr.select(side == k, along_v, v)

@@ -31,7 +31,7 @@ from ..patches.piece_table import (
     WHOLE,
 )
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
-from .element_walk import ElementWalk, distances, doublings, in_child, turn_matrix, turned
+from .locations import ElementWalk, distances, doublings, in_child, turn_matrix, turned
 from .polynomial import Monomials
 from .vectors import added, combined, cross, like
 
@@ -309,7 +309,7 @@ class PieceKernel:
             level, child_number, u, v, scale = self._at_level(is_tip, tip_code // LEVEL & LEVELS, u, v, scale)
             number += child_number
             is_deep = active & is_tip & (level >= self._piece_levels)
-            is_piece = active & (is_deep == False)  # noqa: E712 - an array
+            is_piece = active & ~is_deep
             tip = self._tip(patch, block_row, tip_code, level, child_number, is_deep)
         numbers = types.row(buffer, self._numbers, number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
@@ -430,7 +430,7 @@ class PieceKernel:
         if not self._has_frames:
             return tip
         is_rest = level == level_count
-        is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & (is_rest == False)  # noqa: E712 - an array
+        is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
         is_needed = is_uneven | (is_deep & is_rest & (frame != 0))
         # Order of blocks: those of the levels and of the rest, the frame at the point, the frames of uneven levels.
         rest = LEVEL_PIECES * (level_count - self._piece_levels)

@@ -11,9 +11,9 @@ import drjit as dr
 import numpy as np
 
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
-from .element_walk import ElementWalk, Location
 from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
 from .linear_maps import CoefficientMap, ControlValues
+from .locations import ElementWalk, Location
 from .nearest_location import NearestLocation, NearestPoints
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
@@ -164,7 +164,7 @@ class SurfaceKernel:
         element, uv, corner, derivatives
             As for `evaluate`: starting point of the search.
         """
-        points = self.types.given(self.types.vector3, points)
+        points = self.types.converted(self.types.vector3, points)
         search = NearestLocation(self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients)))
         start = self._location(element, uv, corner)
         start = Location(start.half_edge, dr.detach(start.u), dr.detach(start.v))

@@ -8,7 +8,7 @@ import drjit as dr
 
 from .affine_map import AffineMap
 from .array_types import Float, Vector3
-from .element_walk import Location
+from .locations import Location
 from .vectors import over, unit
 
 

@@ -19,7 +19,7 @@ from ..device_arrays import mapped
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Vector3
 from ..kernels.displacement import displaced
-from ..kernels.element_walk import Location
+from ..kernels.locations import Location
 from ..kernels.piece_kernel import PatchValues
 from ..kernels.vectors import unit
 from ..mesh.connectivity import IntArray

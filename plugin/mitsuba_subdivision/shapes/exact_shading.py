@@ -19,9 +19,9 @@ from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, 
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.linear_maps import ControlValues
+from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
-from ..kernels.triangle_locations import SomeTriangles, TriangleLocations, triangle_locations
 from ..kernels.vectors import added, dot, over
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
@@ -114,9 +114,14 @@ class ExactShading:
     def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
         """Set the triangles of the shape before the first hit: all of a table, or those with the indices ``kept``."""
         walk, types = self.kernel.walk, self.kernel.types
-        self._triangles = _TRIANGLES.get((table, walk), lambda: triangle_locations(table, walk, types))
-        if kept is not None:
-            self._triangles = SomeTriangles(self._triangles, kept, types)
+        self._triangles = _TRIANGLES.get((table, walk), lambda: TriangleLocations(table, walk, types))
+        self._kept = None if kept is None else types.indices(kept)
+
+    def _located(self, triangle: Index, b1: Float, b2: Float, active: Mask) -> Location:
+        """The location of a point of a triangle of the shape, see `TriangleLocations`."""
+        if self._kept is not None:
+            triangle = self.kernel.types.fetch(self.kernel.types.index, self._kept, triangle, active)
+        return self._triangles(triangle, b1, b2, active)
 
     def welded_table(self, table: VertexTable) -> AttributeTable:
         """Triangles without copies of vertices, for normals and texture coordinates that are evaluated at hits.
@@ -184,7 +189,7 @@ class ExactShading:
         hit = self._map.inverse_point(vector3(dr.detach(si.p)))
         ray_direction = vector3(dr.detach(ray.d))
         d = self._map.inverse_direction(ray_direction)
-        location = self._triangles(preliminary.prim_index, b1, b2, active)
+        location = self._located(preliminary.prim_index, b1, b2, active)
         # Limit the search to the triangle's size, and to the length of the ray, whose origin is in front of the
         # surface. Both are lengths in world space along the ray, converted to object space.
         sides = vector3(dr.detach(si.dp_du)), vector3(dr.detach(si.dp_dv))
@@ -238,7 +243,7 @@ class ExactShading:
         vector3 = self.kernel.types.vector3
         # The interaction contains the triangle, but not the location. Intersect the line through its point along the
         # ray again; where a BSDF has swapped front and back, along the mirrored ray.
-        start = self._triangles(si.prim_index, 1 / 3, 1 / 3, active)
+        start = self._located(si.prim_index, 1 / 3, 1 / 3, active)
         to_world, wi = self._map, dr.detach(si.wi)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
         direction, mirrored = self._direction(si, wi), self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
@@ -271,7 +276,7 @@ class ExactShading:
             b1, b2 = b2, b1
         types = self.kernel.types
         with dr.suspend_grad():
-            location = self._triangles(types.indices(index), types.floats(b1), types.floats(b2), True)
+            location = self._located(types.indices(index), types.floats(b1), types.floats(b2), True)
             return np.array(self._texcoords(location, True)[0]).T
 
     def _is_moving(self) -> bool:

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, surface_named, vectors
-from mitsuba_subdivision.kernels.element_walk import Location
+from mitsuba_subdivision.kernels.locations import Location
 
 pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
@@ -126,7 +126,7 @@ def test_whole_elements_are_seen_from_their_first_corners(name, np_rng):
     elements, domain = surface.patches.elements, surface.scheme.domain
     half_edge = np.arange(elements.half_edge_count)
     uv = np_rng.dirichlet(np.ones(domain.corner_count), len(half_edge)) @ domain.corners
-    found = kernel.walk.from_first(locations(kernel.types, half_edge, uv))
+    found, _ = kernel.walk.from_first(locations(kernel.types, half_edge, uv))
     dr.eval(found)
     expected = as_seen_from_first(surface, half_edge, uv)
     np.testing.assert_array_equal(np.array(found.half_edge), expected[0])

@@ -1,20 +1,23 @@
-"""Elements on the device: their parameter domains, and transitions of parameters to neighbouring elements."""
+"""Locations on the elements of a surface: how they cross to neighbours, and where triangles of a tessellation lie."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import drjit as dr
+import numpy as np
 
 from ..patches.piece_table import CODE, CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
 from ..schemes.domain import ParameterDomain
+from ..tessellation import UniformGrid
 from .array_types import ArrayTypes, Float, Index, Index4, Mask
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
-    from ..schemes.domain import ParameterDomain
+    from ..tessellation import VertexTable
+    from ..tessellation.adaptive import AdaptiveGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +31,7 @@ class Location:
     def chosen(self, condition: Mask, other: Location) -> Location:
         """Select ``other`` where a condition holds, and this location elsewhere."""
         pairs = (other.half_edge, self.half_edge), (other.u, self.u), (other.v, self.v)
-        return Location(*(dr.select(condition, other_value, value) for other_value, value in pairs))
+        return Location(*(dr.select(condition, *pair) for pair in pairs))
 
 
 class ElementWalk:
@@ -45,22 +48,18 @@ class ElementWalk:
         """The location in an element, from parameters seen from one of its corners."""
         types = self.types
         # Convert numbers of Python and NumPy, which loops of Dr.Jit reject.
-        element, corner = (types.given(types.index, value) for value in (element, corner))
-        u, v = (types.given(types.float, value) for value in (u, v))
+        element, corner = (types.converted(types.index, value) for value in (element, corner))
+        u, v = (types.converted(types.float, value) for value in (u, v))
         return Location(types.fetch(types.index, self._first, element, active) + corner, u, v)
 
     def row(self, half_edge: Index, active: Mask = True) -> Index4:
         """Fetch the row of `PieceTable.half_edges`: twin, following and preceding half-edge, and code."""
         return self.types.fetch(self.types.index4, self._half_edges, half_edge, active)
 
-    def corner(self, half_edge: Index, active: Mask = True) -> Index:
-        """The corner of a whole element where a half-edge begins; 0 in other elements."""
-        return self.row(half_edge, active)[CODE] & CORNERS
-
-    def from_first(self, location: Location, active: Mask = True) -> Location:
-        """The same locations, seen from the first corner in whole elements."""
-        corner = self.corner(location.half_edge, active)
-        return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner))
+    def from_first(self, location: Location, active: Mask = True) -> tuple[Location, Index]:
+        """The same locations, seen from the first corner in whole elements; and the corner they were seen from."""
+        corner = self.row(location.half_edge, active)[CODE] & CORNERS
+        return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner)), corner
 
     def is_whole(self, half_edge: Index, active: Mask = True) -> Mask:
         """Whether the element of a half-edge fits the domain."""
@@ -75,35 +74,37 @@ class ElementWalk:
         """
         if row is None:
             row = self.row(location.half_edge, active)
-        side, depth, t = self._nearest_side(location)
+        u, v = location.u, location.v
+        side, depth, t = self._nearest_side(u, v)
         has_left = active & (depth < 0)
+        edge, is_spoke = self._edge_on_side(location.half_edge, row, side)
         carried = location
-        edge = self._edge_on_side(location, row, side)
-        if not self._all_whole:
+        if is_spoke is not None:
             is_whole = (row[CODE] & WHOLE) != 0
-            is_spoke = (is_whole == False) & ((side == 1) | (side == 2))  # noqa: E712 - an array
-            t = dr.select(is_whole, t, dr.select(side == 0, location.u, 2 - location.v) * 0.5)
+            t = dr.select(is_whole, t, dr.select(side == 0, u, 2 - v) * 0.5)
             depth = dr.select(is_whole, depth, depth * 0.5)
-            carried = carried.chosen(has_left & is_spoke, self._across_spoke(location, row, side))
-            has_left &= is_spoke == False  # noqa: E712
+            is_next = side == 1
+            across = Location(
+                dr.select(is_next, row[FOLLOWING], row[PRECEDING]),
+                dr.select(is_next, v, 2 - v),
+                dr.select(is_next, 2 - u, u),
+            )
+            carried = carried.chosen(has_left & is_spoke, across)
+            has_left &= ~is_spoke
         twin = self.row(edge, has_left)[TWIN]
         has_left &= twin != NOTHING
         carried = carried.chosen(has_left, self._entered(twin, 1 - t, -depth, has_left))
-        u, v = clamped(self.domain, carried.u, carried.v)
-        return Location(carried.half_edge, u, v)
+        return Location(carried.half_edge, *clamped(self.domain, carried.u, carried.v))
 
     def is_border(self, location: Location, side: Index, active: Mask = True) -> Mask:
         """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
-        row = self.row(location.half_edge, active)
-        if not self._all_whole:
-            # Spokes lie inside an element, between its corners.
-            is_spoke = ((row[CODE] & WHOLE) == 0) & ((side == 1) | (side == 2))
-            active = active & (is_spoke == False)  # noqa: E712 - an array
-        return active & (self.row(self._edge_on_side(location, row, side), active)[TWIN] == NOTHING)
+        edge, is_spoke = self._edge_on_side(location.half_edge, self.row(location.half_edge, active), side)
+        if is_spoke is not None:
+            active = active & ~is_spoke
+        return active & (self.row(edge, active)[TWIN] == NOTHING)
 
-    def _nearest_side(self, location: Location) -> tuple[Index, Float, Float]:
+    def _nearest_side(self, u: Float, v: Float) -> tuple[Index, Float, Float]:
         """The nearest side of the domain, the signed distance from it, and the position along it."""
-        u, v = location.u, location.v
         (depth, *depths), (t, *ts) = distances(self.domain, u, v), along_sides(self.domain, u, v)
         side = self.types.index(0)
         for k, (side_depth, side_t) in enumerate(zip(depths, ts, strict=True), start=1):
@@ -112,26 +113,20 @@ class ElementWalk:
             depth = dr.minimum(depth, side_depth)
         return side, depth, t
 
-    def _edge_on_side(self, location: Location, row: Index4, side: Index) -> Index:
-        """The half-edge on a side of a whole element; else that on the first or the last side of a corner."""
-        count = self.domain.corner_count
-        corner = row[CODE] & CORNERS
+    def _edge_on_side(self, half_edge: Index, row: Index4, side: Index) -> tuple[Index, Mask | None]:
+        """The half-edge on a side of a whole element, else that on the first or the last side of a corner.
+
+        Also returns where the side is a spoke, between two corners of the same element; None if all elements are whole.
+        """
+        count, corner = self.domain.corner_count, row[CODE] & CORNERS
         # Half-edges of an element are consecutive.
         end_corner = corner + side
-        edge = location.half_edge - corner + dr.select(end_corner >= count, end_corner - count, end_corner)
+        edge = half_edge - corner + dr.select(end_corner >= count, end_corner - count, end_corner)
         if self._all_whole:
-            return edge
-        corner_edge = dr.select(side == 0, location.half_edge, row[PRECEDING])
-        return dr.select((row[CODE] & WHOLE) != 0, edge, corner_edge)
-
-    def _across_spoke(self, location: Location, row: Index4, side: Index) -> Location:
-        """Locations in the next or the previous corner of the same element."""
-        is_next = side == 1
-        return Location(
-            dr.select(is_next, row[FOLLOWING], row[PRECEDING]),
-            dr.select(is_next, location.v, 2 - location.v),
-            dr.select(is_next, 2 - location.u, location.u),
-        )
+            return edge, None
+        is_whole = (row[CODE] & WHOLE) != 0
+        edge = dr.select(is_whole, edge, dr.select(side == 0, half_edge, row[PRECEDING]))
+        return edge, ~is_whole & ((side == 1) | (side == 2))
 
     def _entered(self, edge: Index, t: Float, depth: Float, active: Mask) -> Location:
         """The location at a position ``t`` along a half-edge and a distance ``depth`` from it."""
@@ -146,6 +141,57 @@ class ElementWalk:
             2 * dr.select(is_near, depth, 1 - t),
         )
         return corner.chosen((row[CODE] & WHOLE) != 0, whole)
+
+
+class TriangleLocations:
+    """Map from points of the triangles of a tessellation to locations on the surface.
+
+    Parameters are stored for each triangle of an adaptive tessellation; of a uniform one, once for the triangles of all
+    whole elements and once for those of all corners of others.
+    """
+
+    def __init__(self, table: VertexTable, walk: ElementWalk, types: ArrayTypes) -> None:
+        self._types, self._walk, self._half_edge, self._element = types, walk, None, None
+        if not isinstance(table.grid, UniformGrid):
+            corner, uv = cast("AdaptiveGrid", table.grid).triangle_locations
+            self._half_edge, self._parameters, self._leave_elements = types.indices(corner), types.floats(uv), True
+            return
+        whole, corner = table.grid.triangle_parameters()
+        self._whole_count, self._corner_count = len(whole), len(corner)
+        self._parameters = types.floats(np.concatenate([whole, corner]))
+        # At odd rates, triangles extend from one corner of a polygon into the next.
+        self._leave_elements = bool((corner > 1).any())
+        counts = table.grid.triangle_counts
+        if not (counts == len(whole)).all():
+            self._element = types.indices(table.grid.element())
+            self._first = types.indices(np.cumsum(counts) - counts)
+
+    def __call__(self, triangle: Index, b1: Float, b2: Float, active: Mask = True) -> Location:
+        """The location of a point of a triangle, by interpolating the parameters of its corners.
+
+        ``b1`` and ``b2`` are barycentric coordinates of the triangle's second and third corner.
+        """
+        types = self._types
+        half_edge, row = self._row(triangle, active)
+        corners = (types.fetch(types.vector2, self._parameters, 3 * row + i, active) for i in range(3))
+        u, v = (dr.fma(b1, b - a, dr.fma(b2, c - a, a)) for a, b, c in zip(*corners, strict=True))
+        location = Location(half_edge, u, v)
+        return self._walk.carried(location, active) if self._leave_elements else location
+
+    def _row(self, triangle: Index, active: Mask) -> tuple[Index, Index]:
+        """The half-edge that the parameters of a triangle are seen from, and their row."""
+        types, walk = self._types, self._walk
+        if self._half_edge is not None:
+            return types.fetch(types.index, self._half_edge, triangle, active), triangle
+        if self._element is None:
+            count = self._whole_count
+            return walk.at(triangle // count, 0, 0, active=active).half_edge, triangle % count
+        element = types.fetch(types.index, self._element, triangle, active)
+        number = triangle - types.fetch(types.index, self._first, element, active)
+        first = walk.at(element, 0, 0, active=active).half_edge
+        is_whole, per_corner = walk.is_whole(first, active), max(self._corner_count, 1)
+        corner = dr.select(is_whole, 0, number // per_corner)
+        return first + corner, dr.select(is_whole, number, self._whole_count + number % per_corner)
 
 
 def distances(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
@@ -168,29 +214,26 @@ def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
 
 
 def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> tuple[Index, Float, Float, Float]:
-    """Find the child domain that contains given parameters.
-
-    This is not the first child where `ParameterDomain.extent` is at least 0.5.
+    """Find the child domain that contains given parameters; not the first one if their extent is at least 0.5.
 
     Returns its index in `ParameterDomain.children`; parameters in the child; and their derivatives by the given
     parameters: 2, or -2 in the middle child of a triangle, which is rotated by 180 degrees.
     """
     right, upper = u >= 0.5, v >= 0.5
-    one, index_type = types.float(1), types.index
-    is_middle = None
-    if domain.corner_count == 3:
-        # Not both at the midpoint of the third side.
-        upper = upper & (right == False)  # noqa: E712 - an array
-        is_middle = ((right | upper) == False) & (u + v >= 0.5)  # noqa: E712
-        first_or_middle = dr.select(is_middle, index_type(3), index_type(0))
-        number = dr.select(right, index_type(1), dr.select(upper, index_type(2), first_or_middle))
-    else:
-        number = dr.select(upper, dr.select(right, index_type(2), 3), dr.select(right, index_type(1), 0))
-    inner_u, inner_v, scale = 2 * u - dr.select(right, one, 0), 2 * v - dr.select(upper, one, 0), 2 * one
-    if is_middle is not None:
-        inner_u, inner_v = dr.select(is_middle, one - 2 * u, inner_u), dr.select(is_middle, one - 2 * v, inner_v)
-        scale = dr.select(is_middle, -scale, scale)
-    return number, inner_u, inner_v, scale
+    one, index = types.float(1), types.index
+    if domain.corner_count == 4:
+        number = dr.select(upper, dr.select(right, index(2), 3), dr.select(right, index(1), 0))
+        return number, 2 * u - dr.select(right, one, 0), 2 * v - dr.select(upper, one, 0), 2 * one
+    # Not both at the midpoint of the third side.
+    upper = upper & ~right
+    is_middle = ~(right | upper) & (u + v >= 0.5)
+    first_or_middle = dr.select(is_middle, index(3), index(0))
+    return (
+        dr.select(right, index(1), dr.select(upper, index(2), first_or_middle)),
+        dr.select(is_middle, one - 2 * u, 2 * u - dr.select(right, one, 0)),
+        dr.select(is_middle, one - 2 * v, 2 * v - dr.select(upper, one, 0)),
+        dr.select(is_middle, -2 * one, 2 * one),
+    )
 
 
 def doublings(
@@ -221,7 +264,7 @@ def turned(domain: ParameterDomain, u: Float, v: Float, turn: Index) -> tuple[Fl
     return (dr.select(by_one, rest, dr.select(by_two, v, u)), dr.select(by_one, u, dr.select(by_two, rest, v)))
 
 
-def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tuple[Float, Float, Float, Float]:
+def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> list[Float]:
     """Derivatives of the parameters seen from the first corner by those seen from corner ``turn``.
 
     Returns float arrays a, b, c, d: derivatives of u by u and v, then of v by u and v.
@@ -233,8 +276,7 @@ def turn_matrix(domain: ParameterDomain, types: ArrayTypes, turn: Index) -> tupl
         for is_this_turn, entry in zip(is_turned, later_entries, strict=True):
             value = dr.select(is_this_turn, types.float(entry), value)
         entries.append(value)
-    a, b, c, d = entries
-    return a, b, c, d
+    return entries
 
 
 @lru_cache(maxsize=8)
