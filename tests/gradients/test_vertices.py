@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gradients.surfaces import ALL
 from mitsuba_subdivision.kernels import VertexKernel
-from mitsuba_subdivision.kernels.affine_map import placed
+from mitsuba_subdivision.kernels.vertex_kernel import placed
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.tessellation import Criterion, Measure
 

@@ -9,7 +9,7 @@ from kernels.surfaces import kernel_named, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.kernels import line_intersection
-from mitsuba_subdivision.kernels.affine_map import AffineMap
+from mitsuba_subdivision.kernels.algebra import AffineMap
 from mitsuba_subdivision.kernels.line_intersection import ON_LINE
 from mitsuba_subdivision.kernels.locations import TriangleLocations
 from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal

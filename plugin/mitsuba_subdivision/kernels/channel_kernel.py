@@ -11,10 +11,10 @@ import numpy as np
 
 from ..patches import LinearChannel, PieceTable
 from ..patches.piece_table import CODE, FOLLOWING, PRECEDING, WHOLE
+from .algebra import Monomials
 from .array_types import ArrayTypes, Float, Index, Mask, Value
 from .linear_maps import CoefficientMap, ControlValues, SparseMatrix
 from .piece_kernel import PatchValues, Piece, PieceKernel
-from .polynomial import Monomials
 
 if TYPE_CHECKING:
     from ..patches import Channel, SubdividedChannel

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Protocol
 
 import drjit as dr
 
+from .algebra import added, cross, dot, like, unit
 from .array_types import Float, Index, Mask, Value
 from .piece_kernel import DIFFERENCE, PatchValues, Piece
-from .vectors import added, cross, dot, like, unit
 
 if TYPE_CHECKING:
     from .channel_kernel import AnyChannelPiece, ChannelKernel

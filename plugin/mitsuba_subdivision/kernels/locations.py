@@ -153,8 +153,8 @@ class TriangleLocations:
     def __init__(self, table: VertexTable, walk: ElementWalk, types: ArrayTypes) -> None:
         self._types, self._walk, self._half_edge, self._element = types, walk, None, None
         if not isinstance(table.grid, UniformGrid):
-            corner, uv = cast("AdaptiveGrid", table.grid).triangle_locations
-            self._half_edge, self._parameters, self._leave_elements = types.indices(corner), types.floats(uv), True
+            half_edge, uv = cast("AdaptiveGrid", table.grid).triangle_locations
+            self._half_edge, self._parameters, self._leave_elements = types.indices(half_edge), types.floats(uv), True
             return
         whole, corner = table.grid.triangle_parameters()
         self._whole_count, self._corner_count = len(whole), len(corner)

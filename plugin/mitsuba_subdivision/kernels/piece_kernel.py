@@ -30,10 +30,9 @@ from ..patches.piece_table import (
     TURN,
     WHOLE,
 )
+from .algebra import Monomials, added, combined, cross, like
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
 from .locations import ElementWalk, distances, doublings, in_child, turn_matrix, turned
-from .polynomial import Monomials
-from .vectors import added, combined, cross, like
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -62,6 +61,11 @@ class PatchValues:
     # the tangent plane. Zero for values other than points.
     normal: Vector3
     second: tuple[Value, ...] = ()  # Derivatives by uu, uv and vv
+
+    @property
+    def first_order(self) -> tuple[Value, ...]:
+        """Value, derivatives and normal."""
+        return self.value, self.du, self.dv, self.normal
 
     def shifted(self, du: Float, dv: Float) -> PatchValues:
         """Attach the value and its first derivatives to parameters that move by ``du`` and ``dv``.

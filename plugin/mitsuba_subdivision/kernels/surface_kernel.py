@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
+from .algebra import cross, over, rounding, unit
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
-from .line_intersection import MISSED, ON_LINE, LineHits, LineIntersection, Lines
+from .line_intersection import MISSED, ON_LINE, LineHits, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
 from .locations import ElementWalk, Location
-from .nearest_location import NearestLocation, NearestPoints
+from .nearest_points import NearestPoints, nearest_locations
 from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
-from .vectors import cross, over, rounding, unit
 from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
@@ -165,10 +165,9 @@ class SurfaceKernel:
             As for `evaluate`: starting point of the search.
         """
         points = self.types.converted(self.types.vector3, points)
-        search = NearestLocation(self.types, self.walk, partial(self._patches.piece, dr.detach(self.coefficients)))
-        start = self._location(element, uv, corner)
-        start = Location(start.half_edge, dr.detach(start.u), dr.detach(start.v))
-        location, nearest = search.found(dr.detach(points), start)
+        start = dr.detach(self._location(element, uv, corner))
+        piece_at = partial(self._patches.piece, dr.detach(self.coefficients))
+        location, nearest = nearest_locations(self.walk, piece_at, dr.detach(points), start)
         surface = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
         return NearestSurfacePoints(**vars(surface), distance=dr.norm(points - surface.p))
 
@@ -290,22 +289,11 @@ class SurfaceKernel:
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
 
-    def line_hits(
-        self,
-        p: Vector3,  # A point of each line, near the surface
-        d: Vector3,  # Direction of each line
-        location: Location,  # Starting point of the search
-        active: Mask = True,
-        *,
-        max_distance: Float = dr.inf,  # Maximum distance of the hit from ``p``
-        # Wanted sign of the dot product of the normal and ``d``; 0 for either. A line that enters a ball also leaves
-        # it, and Newton's method may converge to either hit.
-        facing: Float = 0,
-    ) -> LineHits:
-        """Intersect lines with the surface near given locations, see `LineIntersection`. Results are detached."""
+    def line_hits(self, p: Vector3, d: Vector3, location: Location, active: Mask = True, **limits: Float) -> LineHits:
+        """Intersect lines with the surface near given locations, see `line_hits`. Results are detached."""
         with dr.suspend_grad():
             piece = partial(self._piece, dr.detach(self.coefficients))
-            return LineIntersection(self.types, self.walk, piece).hits(p, d, location, active, max_distance, facing)
+            return line_hits(self.walk, piece, p, d, location, active, **limits)
 
 
 def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vector3]:

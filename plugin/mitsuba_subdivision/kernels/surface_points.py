@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from .affine_map import AffineMap
+from .algebra import AffineMap, over, unit
 from .array_types import Float, Vector3
 from .locations import Location
-from .vectors import over, unit
 
 
 @dataclass(frozen=True, eq=False)

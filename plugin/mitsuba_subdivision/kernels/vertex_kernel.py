@@ -13,9 +13,9 @@ import numpy as np
 from ..evaluation import normals
 from ..mesh import ragged
 from ..patches.piece_table import PACKET
-from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Vector3
+from .algebra import AffineMap, Monomials, unit
+from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Matrix4, Vector3
 from .linear_maps import SparseMatrix, WeightBlocks, attached
-from .polynomial import Monomials
 
 if TYPE_CHECKING:
     from ..tessellation import VertexPolynomials, VertexTable
@@ -219,6 +219,25 @@ class EvaluatedVertices:
         derivatives = (partial(function, self.control_points) for function in (kernel.changes, kernel.gradient))
         positions, normals = attached(values, control_points, *derivatives)
         return kernel.welded(positions), normals
+
+
+def placed(
+    positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4, vector3: type
+) -> tuple[FloatBuffer, FloatBuffer]:
+    """Map flat positions and unit normals; differentiable with respect to these and the matrix."""
+    p: Vector3 = dr.unravel(vector3, positions)
+    n: Vector3 = dr.unravel(vector3, normals)
+    if dr.grad_enabled(matrix):
+        # With Dr.Jit's derivatives, each use of an entry would add a sum over the points, in a separate kernel.
+        zero = dr.zeros(type(matrix), dr.width(p))
+        matrix = attached(dr.detach(matrix) + zero, matrix, lambda change: change + zero, _summed)
+    to_world = AffineMap.of(matrix)
+    return dr.ravel(to_world.point(p)), dr.ravel(unit(to_world.normal(n)))
+
+
+def _summed(gradient: Matrix4) -> Matrix4:
+    dr.eval(gradient)
+    return type(gradient)([[dr.sum(entry) for entry in row] for row in gradient])
 
 
 def coordinates_expected(count: int, control_count: int) -> str:

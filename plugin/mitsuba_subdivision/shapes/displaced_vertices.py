@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ..device_arrays import mapped
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT
+from ..kernels.algebra import unit
 from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Vector3
 from ..kernels.displacement import displaced
 from ..kernels.locations import Location
 from ..kernels.piece_kernel import PatchValues
-from ..kernels.vectors import unit
 from ..mesh.connectivity import IntArray
 from ..patches import PatchSampler, contracts_alike
 from ..schemes.domain import FloatArray

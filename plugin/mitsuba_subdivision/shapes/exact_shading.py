@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import upload
-from ..kernels.affine_map import AffineMap
+from ..kernels.algebra import AffineMap, added, dot, over
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
 from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.line_intersection import ON_LINE, Lines
@@ -22,7 +22,6 @@ from ..kernels.linear_maps import ControlValues
 from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel
 from ..kernels.surface_points import SurfacePoints
-from ..kernels.vectors import added, dot, over
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray

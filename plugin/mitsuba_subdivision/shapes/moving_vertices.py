@@ -229,8 +229,8 @@ def computed_ones(*values: Any) -> set[int]:
 def _placed(positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4) -> tuple[FloatBuffer, FloatBuffer]:
     """Map flat positions and unit normals from object space to world space."""
     if dr.is_jit_v(positions):
-        from ..kernels.affine_map import placed
         from ..kernels.array_types import ArrayTypes
+        from ..kernels.vertex_kernel import placed
 
         types = ArrayTypes.of(type(positions))
         to_world = matrix if dr.is_jit_v(matrix) else types.matrix4(matrix.tolist())

@@ -4,7 +4,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.kernels.vectors import unit
+from mitsuba_subdivision.kernels.algebra import unit
 
 # A few units in the last place of single precision.
 ROUNDING = 1e-6

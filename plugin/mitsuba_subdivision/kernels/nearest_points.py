@@ -1,0 +1,172 @@
+"""Finds the nearest point of a surface from a starting location, by Newton's method across elements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+
+from .algebra import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
+from .array_types import Float, Mask, Vector3
+from .locations import ElementWalk, Location, distances
+from .piece_kernel import PatchValues, Piece
+
+# Maximum number of Newton steps; about five are usual.
+STEPS = 40
+# Factor that shortens a step that has increased the distance; lengths, in parameters of a piece, below which the search
+# stops instead.
+SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
+# Least determinant of the second derivatives of half the squared distance, relative to the product of the squared
+# lengths of the tangents. Below it, a Gauss-Newton step replaces Newton's; its damping, relative to these squared
+# lengths, is for parallel tangents.
+CONVEX, PARALLEL = 1e-4, 1e-6
+# Largest distance of points on a side of the domain from it, in parameters of an element.
+ON_SIDE = 1e-6
+# Directions of the sides of a domain by its number of corners, in the order of `distances`.
+_SIDES = {3: ((1, 0), (1, -1), (0, 1)), 4: ((1, 0), (0, 1), (1, 0), (0, 1))}
+
+
+@dataclass(frozen=True, eq=False)
+class NearestPoints:
+    """Points that constrain their nearest surface points when they or the control points change."""
+
+    p: Vector3
+    # Direction of the border or the crease that a surface point lies on, in parameters; zero at a corner
+    along_u: Float
+    along_v: Float
+    is_free: Mask  # Lanes whose surface point may move in all directions
+
+    def step(self, here: PatchValues) -> tuple[Float, Float]:
+        """Newton step from given values of the surface, whose derivatives follow the nearest point."""
+        offset = here.value - self.p
+        by_u, by_v = dr.dot(offset, here.du), dr.dot(offset, here.dv)
+        free_u, free_v = _newton(dr.detach(here), dr.detach(offset), by_u, by_v)
+        length = _along(dr.detach(here), dr.detach(offset), by_u, by_v, self.along_u, self.along_v)
+        along_u, along_v = length * self.along_u, length * self.along_v
+        return dr.select(self.is_free, free_u, along_u), dr.select(self.is_free, free_v, along_v)
+
+
+def nearest_locations(
+    walk: ElementWalk,  # Elements of the surface
+    piece_at: Callable[..., Piece],  # Function of a half-edge, u, v and a mask, which returns the detached piece
+    p: Vector3,  # Detached
+    start: Location,
+    active: Mask = True,
+) -> tuple[Location, NearestPoints]:
+    """Find the locations nearest to points, seen from the first corner in whole elements."""
+    types = walk.types
+    last_step = STEP_TOLERANCE_DOUBLE if types.is_double else STEP_TOLERANCE
+    shortest_step = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
+    relative_rounding = rounding(types)
+
+    def step(steps_left, half_edge, u, v, squared_distance, du, dv, step_factor, *_):
+        target = Location(half_edge, u + step_factor * du, v + step_factor * dv)
+        location = walk.carried(target, active)
+        piece = piece_at(location.half_edge, location.u, location.v, active)
+        values = piece.values(derivatives=2)
+        offset = values.value - p
+        new_squared = dr.squared_norm(offset)
+        coordinate_size = dr.norm(p) + dr.norm(values.value)
+        improves = new_squared <= squared_distance + relative_rounding * coordinate_size * (
+            dr.sqrt(new_squared) + relative_rounding * coordinate_size
+        )
+        length = dr.maximum(dr.abs(step_factor * du), dr.abs(step_factor * dv)) * piece.magnification
+        is_first = dr.isinf(squared_distance)
+        new_u, new_v, *_ = _step(walk, location, values, offset)
+        is_done = (improves & ~is_first & (length < last_step)) | (~improves & (length < shortest_step))
+        best = Location(half_edge, u, v).chosen(improves, location)
+        return (
+            dr.select(is_done, 0, steps_left - 1),
+            *(best.half_edge, best.u, best.v),
+            dr.select(improves, new_squared, squared_distance),
+            dr.select(improves, new_u, du),
+            dr.select(improves, new_v, dv),
+            dr.select(improves, 1, step_factor * SHORTER),
+        )
+
+    zero = types.float(0)
+    state = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
+    _, half_edge, u, v, *_ = dr.while_loop(
+        state, lambda steps_left, *_: active & (steps_left > 0), step, mode="symbolic", label="nearest_location"
+    )
+    # One more step, which is not taken, determines the directions in which the final location may move.
+    location, _ = walk.from_first(Location(half_edge, u, v), active)
+    values = piece_at(location.half_edge, location.u, location.v, active).values(derivatives=2)
+    _, _, along_u, along_v, is_free = _step(walk, location, values, values.value - p)
+    return location, NearestPoints(p, along_u, along_v, is_free)
+
+
+def _step(
+    walk: ElementWalk, location: Location, values: PatchValues, offset: Vector3
+) -> tuple[Float, Float, Float, Float, Mask]:
+    """Newton step, projected to a border that it would cross; direction of the border; whether there is none."""
+    zero = walk.types.float(0)
+    by_u, by_v = dr.dot(offset, values.du), dr.dot(offset, values.dv)
+    du, dv = _limited(*_newton(values, offset, by_u, by_v))
+    border_u, border_v, is_free = _border(walk, location, du, dv)
+    length = _along(values, offset, by_u, by_v, border_u, border_v)
+    along_u, along_v = _limited(length * border_u, length * border_v)
+    # A step along a border stops at a corner.
+    _, _, may_move = _border(walk, location, along_u, along_v)
+    border_u, border_v, along_u, along_v = (
+        dr.select(may_move, x, zero) for x in (border_u, border_v, along_u, along_v)
+    )
+    return dr.select(is_free, du, along_u), dr.select(is_free, dv, along_v), border_u, border_v, is_free
+
+
+def _border(walk: ElementWalk, location: Location, du: Float, dv: Float) -> tuple[Float, Float, Mask]:
+    """Direction of the border that a step would cross, and whether it crosses none."""
+    types = walk.types
+    inside = distances(walk.domain, location.u, location.v)
+    after = distances(walk.domain, location.u + du, location.v + dv)
+    side, least_distance = types.index(len(inside)), types.float(0)
+    for k, (distance, distance_after) in enumerate(zip(inside, after, strict=True)):
+        leaves = (distance <= ON_SIDE) & (distance_after < least_distance) & (distance_after < distance)
+        side = dr.select(leaves, types.index(k), side)
+        least_distance = dr.select(leaves, distance_after, least_distance)
+    is_on_side = side < len(inside)
+    # Test only the side that the step crosses furthest.
+    is_free = ~(is_on_side & walk.is_border(location, side, is_on_side))
+    u, v = types.float(0), types.float(0)
+    for k, (along_u, along_v) in enumerate(_SIDES[walk.domain.corner_count]):
+        u, v = dr.select(side == k, along_u, u), dr.select(side == k, along_v, v)
+    return u, v, is_free
+
+
+def _limited(du: Float, dv: Float) -> tuple[Float, Float]:
+    factor = LONGEST_STEP / dr.maximum(dr.maximum(dr.abs(du), dr.abs(dv)), LONGEST_STEP)
+    return du * factor, dv * factor
+
+
+def _forms(values: PatchValues, offset: Vector3) -> tuple[tuple[Float, Float, Float], tuple[Float, Float, Float]]:
+    """First fundamental form, and second derivatives of half the squared distance: uu, uv, vv of each."""
+    du, dv = values.du, values.dv
+    first_form = dr.squared_norm(du), dr.dot(du, dv), dr.squared_norm(dv)
+    hessian = tuple(
+        coefficient + dr.dot(offset, second) for coefficient, second in zip(first_form, values.second, strict=True)
+    )
+    return first_form, hessian  # type: ignore[return-value]
+
+
+def _newton(values: PatchValues, offset: Vector3, by_u: Float, by_v: Float) -> tuple[Float, Float]:
+    """Newton step for half the squared distance, from its gradient."""
+    (a, b, c), (h, i, j) = _forms(values, offset)
+    is_convex = (h > 0) & (h * j - i * i > CONVEX * a * c)
+    damped = PARALLEL * (a + c)
+    h, i, j = dr.select(is_convex, h, a + damped), dr.select(is_convex, i, b), dr.select(is_convex, j, c + damped)
+    determinant = h * j - i * i
+    exists = determinant > 0
+    inverse = dr.select(exists, 1 / dr.select(exists, determinant, 1), 0)
+    return (i * by_v - j * by_u) * inverse, (i * by_u - h * by_v) * inverse
+
+
+def _along(values: PatchValues, offset: Vector3, by_u: Float, by_v: Float, along_u: Float, along_v: Float) -> Float:
+    """Length of the Newton step in a given direction; zero if the direction is zero."""
+    first_curvature, curvature = (
+        form[0] * along_u * along_u + 2 * form[1] * along_u * along_v + form[2] * along_v * along_v
+        for form in _forms(values, offset)
+    )
+    divisor = dr.select(curvature > CONVEX * first_curvature, curvature, first_curvature)
+    exists = divisor > 0
+    return dr.select(exists, -(by_u * along_u + by_v * along_v) / dr.select(exists, divisor, 1), 0)
