@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
 from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, regular_signature
-from mitsuba_subdivision.mesh.signature import Signature
+from mitsuba_subdivision.mesh.signature import Fan, Signature
 from mitsuba_subdivision.schemes import scheme_named
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -125,8 +125,9 @@ def test_the_table_of_eigenvalues_is_what_the_rules_give():
     for name, cell, *stated in rows:
         scheme, valence = scheme_named(name), int(cell)
         first, *others = regular_signature(scheme).fans
-        of_face = ((scheme.regular_face_size,) * valence, *others)
-        signature = Signature(scheme.element, of_face if scheme.element == "face" else ((valence, *first[1:]),))
+        is_face = scheme.element == "face"
+        fan = Fan((scheme.regular_face_size,) * valence if is_face else (valence, *first.ahead[1:]))
+        signature = Signature(scheme.element, (fan, *others))
         basis = irregular_patch(scheme, irregular_structure(scheme, signature)).basis
         second, fourth = basis.subdominant, basis.moduli[3]
         assert stated == [f"{value:.4f}" for value in (second, fourth / second, fourth / second**2)], (name, valence)

@@ -8,7 +8,7 @@ from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, lattice_stencils, patch_tree, rotation_order
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.mesh.one_ring import one_ring
-from mitsuba_subdivision.mesh.signature import Signature, signature_at
+from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
 from mitsuba_subdivision.schemes.domain import SQUARE
 from patches.closed_cages import CLOSED_CAGES
@@ -19,12 +19,12 @@ SCHEME = CatmullClark()
 VALENCES = [3, *range(5, 13)]
 # Stencils of a piece are products of at most three refinements, of some tens of weights each.
 ROUNDING = 1e-14
-REGULAR_FAN = (4,) * 4
+REGULAR_FAN = Fan((4,) * 4)
 
 
 def isolated(valence, corner=0):
     """Quad amid quads with one corner of the given valence."""
-    return Signature("face", ((4,) * valence, *(REGULAR_FAN,) * 3)).rotated(-corner % 4)
+    return Signature("face", (Fan((4,) * valence), *(REGULAR_FAN,) * 3)).rotated(-corner % 4)
 
 
 @lru_cache
@@ -81,11 +81,11 @@ def test_a_piece_has_at_most_one_extraordinary_point_at_its_origin_and_all_of_th
         for piece in pieces(signature):
             if piece.patch is not None:
                 fan, *others = piece.patch.structure.signature.fans
-                assert set(fan) == {4}
-                assert len(fan) != 4
+                assert set(fan.ahead) == {4}
+                assert fan.face_count != 4
                 assert others == [REGULAR_FAN] * 3
                 origin = piece.domain.inverse()(np.zeros((1, 2)))[0]
-                found[tuple(origin.tolist()), len(fan)] += 1
+                found[tuple(origin.tolist()), fan.face_count] += 1
         if len(signature.fans) == 4:
             valences = dict(zip(corners, signature.valences, strict=True))
         else:
@@ -147,7 +147,7 @@ def test_regular_control_points_reproduce_the_lattice():
 
 @pytest.mark.parametrize(
     "signature",
-    [isolated(3), isolated(5), Signature("vertex", (REGULAR_FAN,)), Signature("face", ((3,) * 4,) * 3)],
+    [isolated(3), isolated(5), Signature("vertex", (REGULAR_FAN,)), Signature("face", (Fan((3,) * 4),) * 3)],
     ids=["valence 3", "valence 5", "vertex", "triangle"],
 )
 def test_only_the_regular_one_ring_is_regular(signature):
@@ -162,7 +162,7 @@ class NeverIsolates(CatmullClark):
 
 def test_scheme_that_isolates_nothing_is_refused():
     with pytest.raises(SchemeError, match="catmull_clark: refinement leaves a face with fans"):
-        element_stencils(NeverIsolates(), Signature("face", ((5,) * 3,) * 5), np.zeros((1, 2)))
+        element_stencils(NeverIsolates(), Signature("face", (Fan((5,) * 3),) * 5), np.zeros((1, 2)))
 
 
 def test_refined_children_run_the_rules_of_the_scheme():

@@ -4,7 +4,7 @@ from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, eigenbasis
 from mitsuba_subdivision.evaluation.normals import limit_frame
 from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, regular_signature
 from mitsuba_subdivision.mesh.connectivity import VertexRule
-from mitsuba_subdivision.mesh.signature import Signature, TaggedFan
+from mitsuba_subdivision.mesh.signature import Fan, Signature
 from mitsuba_subdivision.schemes import scheme_named
 
 # Eigenvectors are right to this.
@@ -14,10 +14,10 @@ EIGENVECTOR = 1e-10
 def signature_at_corner(scheme, ahead, rule):
     """A face on the border whose first corner is the first of ``ahead`` faces there, and otherwise regular."""
     size, regular = scheme.regular_face_size, scheme.regular_border_faces
-    first, last = TaggedFan((size,) * regular, ()), TaggedFan((size,), (size,) * (regular - 1))
+    first, last = Fan((size,) * regular, ()), Fan((size,), (size,) * (regular - 1))
     inner = list(regular_signature(scheme).fans)
     others = [last, *inner[2:-1], first] if ahead == 1 else [last, *inner[2:]]
-    return Signature("face", (TaggedFan((size,) * ahead, (), rule), *others))
+    return Signature("face", (Fan((size,) * ahead, (), rule), *others))
 
 
 CASES = {

@@ -26,7 +26,7 @@ def signature_of(table, corner):
 
 def turns(signature, corner_count):
     """The same for a whole element, whichever corner it is named by."""
-    corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
+    corners = len(signature.fans) if signature.kind == "face" else signature.fans[0].face_count
     return frozenset(signature.rotated(k) for k in range(corners if corners == corner_count else 1))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.signature import Signature, TaggedFan
+from ..mesh.signature import Signature
 from ..schemes.domain import AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
@@ -110,8 +110,8 @@ class IrregularPatch:
     @property
     def has_own_frame(self) -> bool:
         """Whether normals need a frame in place of the derivatives: on borders, creases, and at sharp vertices."""
-        is_tagged = isinstance(self.structure.signature.fans[0], TaggedFan)
-        return is_tagged or self.contracts_unevenly or self.basis.eigenvalues[2] < 0
+        is_inside = self.structure.signature.fans[0].is_inside
+        return not is_inside or self.contracts_unevenly or self.basis.eigenvalues[2] < 0
 
     @property
     def contracts_unevenly(self) -> bool:

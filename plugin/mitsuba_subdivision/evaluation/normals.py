@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
-from ..mesh.signature import Fan, Signature, TaggedFan, fan_face_count, fan_is_closed
+from ..mesh.signature import Fan, Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .eigenbasis import Eigenbasis
@@ -101,16 +101,16 @@ class _Point:
 
     def frame(self) -> FloatArray:
         """Return the frame: ``(2, K)`` coefficients over the eigen-coordinates."""
-        if not isinstance(self.fan, TaggedFan) or self.fan.rule == VertexRule.DART:
+        if self.fan.is_inside or self.fan.rule == VertexRule.DART:
             # Smooth inner vertices, and darts, where a crease ends.
             return _smooth_frame(self)
         if self.fan.is_closed:
             return _tip_frame(self)
         if self.fan.rule == VertexRule.CORNER:
             # At a wide corner the surface is the tip of a cone.
-            is_narrow = fan_face_count(self.fan) < self.regular_border_faces
+            is_narrow = self.fan.face_count < self.regular_border_faces
             return _narrow_corner_frame(self) if is_narrow else _tip_frame(self)
-        return _lone_face_frame(self) if fan_face_count(self.fan) == 1 else _border_frame(self)
+        return _lone_face_frame(self) if self.fan.face_count == 1 else _border_frame(self)
 
     @property
     def edges(self) -> FloatArray:
@@ -180,8 +180,8 @@ def _tip_frame(point: _Point) -> FloatArray:
     between edges are taken as equal. Inside they add up to a full turn. In a corner each is that of a regular border,
     or less, so that their sum is at most a full turn.
     """
-    turn = 2 * np.pi / fan_face_count(point.fan)
-    if not fan_is_closed(point.fan):
+    turn = 2 * np.pi / point.fan.face_count
+    if not point.fan.is_closed:
         turn = min(turn, np.pi / point.regular_border_faces)
     angles = turn * np.arange(len(point.edges))
     weights = np.stack([np.cos(angles), np.sin(angles)])

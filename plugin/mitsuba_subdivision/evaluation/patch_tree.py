@@ -24,7 +24,7 @@ from numpy.typing import DTypeLike, NDArray
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.sharpness import INFINITE
-from ..mesh.signature import Fan, Signature, TaggedFan
+from ..mesh.signature import Fan, Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
@@ -309,18 +309,19 @@ def isolated_signature(
     """Return the signature of an element whose only irregularity is an extraordinary point at its first corner."""
     regular = _regular_fan(scheme)
     if scheme.element == "vertex":
-        return Signature("vertex", ((valence, *regular[1:]),))
-    return Signature("face", ((scheme.regular_face_size,) * valence, *(regular,) * (scheme.regular_face_size - 1)))
+        return Signature("vertex", (Fan((valence, *regular.ahead[1:])),))
+    fan = Fan((scheme.regular_face_size,) * valence)
+    return Signature("face", (fan, *(regular,) * (scheme.regular_face_size - 1)))
 
 
-def _regular_fan(scheme: Scheme) -> tuple[int, ...]:
-    """Return the face sizes around a regular vertex."""
-    return (scheme.regular_face_size,) * scheme.regular_valence
+def _regular_fan(scheme: Scheme) -> Fan:
+    """Return the faces around a regular vertex."""
+    return Fan((scheme.regular_face_size,) * scheme.regular_valence)
 
 
 def rotation_count(scheme: Scheme, signature: Signature) -> int:
     """Return the number of corners that can be the first: all, or one if the element does not fit the domain."""
-    corners = len(signature.fans) if signature.kind == "face" else len(signature.fans[0])
+    corners = len(signature.fans) if signature.kind == "face" else signature.fans[0].face_count
     return corners if corners == scheme.domain.corner_count else 1
 
 
@@ -373,8 +374,7 @@ def _merged_slots(signature: Signature) -> tuple[int, int] | None:
     At a dart the other end of the sharp edge is two vertices of the one-ring, one on each side of the edge. As separate
     control points they would add an eigenvector that no cage can have.
     """
-    fan = signature.fans[0]
-    if not isinstance(fan, TaggedFan) or fan.rule != VertexRule.DART:
+    if signature.fans[0].rule != VertexRule.DART:
         return None
     first, *_, last = one_ring(signature).edge_neighbours()
     return first, last
@@ -417,9 +417,9 @@ def _phantom_point(scheme: Scheme, stencils: dict, point: tuple[float, float]) -
 
 
 def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
-    if not isinstance(fan, TaggedFan):
+    if fan.is_inside:
         return fan == _regular_fan(scheme)
-    if fan.is_closed or fan.rule == VertexRule.DART or fan.sharpness is not None:
+    if fan.behind is None or fan.rule == VertexRule.DART or fan.is_semi_sharp:
         return False
     face_count = 1 if fan.rule == VertexRule.CORNER else scheme.regular_border_faces
     return fan.ahead + fan.behind == (scheme.regular_face_size,) * face_count

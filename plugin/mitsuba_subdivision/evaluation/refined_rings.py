@@ -68,7 +68,7 @@ class RingPattern:
             topology, kind = self.refinement.topology, self.scheme.element
             fans = fan_half_edges(topology, self.half_edges[number], kind)
             signature = smooth_signature(topology, fans, kind)
-            vertices = one_ring(signature).vertices_around(topology, fans)
+            vertices = one_ring(signature).gather(topology, np.array(self.half_edges[number : number + 1]))[0]
             self._children[number] = signature, vertices, half_edges_around(fans)
         return self._children[number]
 

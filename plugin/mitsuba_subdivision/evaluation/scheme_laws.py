@@ -8,7 +8,7 @@ import numpy as np
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import Fan, Signature, TaggedFan
+from ..mesh.signature import Fan, Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import irregular_patch
@@ -90,7 +90,7 @@ def _check_local_borders(scheme: Scheme) -> None:
     for rule in (VertexRule.AUTOMATIC, VertexRule.CORNER):
         weights = []
         for behind in (3, 5):
-            signature = Signature("face", (TaggedFan(faces * 3, faces * behind, rule), *others))
+            signature = Signature("face", (Fan(faces * 3, faces * behind, rule), *others))
             _, _, stencils = refined_children(scheme, signature)[0]
             first, *_, last = one_ring(signature).edge_neighbours()
             inner = np.abs(np.delete(stencils[0], [0, first, last])).max()
@@ -111,24 +111,24 @@ def _border_signatures(scheme: Scheme) -> Iterator[Signature]:
     if not scheme.has_phantom_points:
         return
     if count == 1:
-        yield Signature("face", (TaggedFan((size,), ()),) * size)
+        yield Signature("face", (Fan((size,), ()),) * size)
         return
-    first, last = TaggedFan((size,) * count, ()), TaggedFan((size,), (size,) * (count - 1))
+    first, last = Fan((size,) * count, ()), Fan((size,), (size,) * (count - 1))
     yield Signature("face", (first, last, *inner[2:]))
     for behind in range(1, count - 1):
-        yield Signature("face", (TaggedFan((size,) * (count - behind), (size,) * behind), *inner[1:]))
-    yield Signature("face", (TaggedFan((size,), (), VertexRule.CORNER), last, *inner[2:-1], first))
+        yield Signature("face", (Fan((size,) * (count - behind), (size,) * behind), *inner[1:]))
+    yield Signature("face", (Fan((size,), (), VertexRule.CORNER), last, *inner[2:-1], first))
 
 
 def _irregular_signatures(scheme: Scheme) -> Iterator[Signature]:
     """Generate signatures of elements with an extraordinary point, and of elements that do not fit the domain."""
     yield from (isolated_signature(scheme, valence) for valence in VALENCES)
     for size in SIZES:
-        fan: Fan = (scheme.regular_face_size,) * size
+        sizes: tuple[int, ...] = (scheme.regular_face_size,) * size
         if scheme.element == "face":
-            fan = (size, *(scheme.regular_face_size,) * (scheme.regular_valence - 1))
+            sizes = (size, *(scheme.regular_face_size,) * (scheme.regular_valence - 1))
         if size != scheme.domain.corner_count:
-            yield Signature(scheme.element, (fan,) * (size if scheme.element == "face" else 1))
+            yield Signature(scheme.element, (Fan(sizes),) * (size if scheme.element == "face" else 1))
 
 
 def _inner(scheme: Scheme) -> FloatArray:

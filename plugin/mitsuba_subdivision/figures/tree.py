@@ -16,7 +16,7 @@ from ..evaluation.polynomials import regular_bernstein
 from ..evaluation.tree_arrays import PIECE_LEVELS
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import Signature
+from ..mesh.signature import Fan, Signature
 from ..schemes import scheme_named
 from ..schemes.domain import AffineMap, FloatArray
 from .characteristic import outline
@@ -34,7 +34,7 @@ REST, EDGE, LINE = "#8d97a1", "#b6bec6", "#2d3a45"
 def draw(options: FigureOptions) -> list[Path]:
     """Draw a face with two extraordinary vertices, its leaves, and the Bernstein coefficients of these as weights."""
     scheme = scheme_named("catmull_clark")
-    signature = Signature("face", tuple((4,) * valence for valence in VALENCES))
+    signature = Signature("face", tuple(Fan((4,) * valence) for valence in VALENCES))
     tree, form, ring = patch_tree(scheme, signature), regular_bernstein(scheme), one_ring(signature)
     # From the parameters of each leaf to those of the face; the level, 0 for regular leaves; rows of weights.
     leaves: list[tuple[AffineMap, int, FloatArray]] = [

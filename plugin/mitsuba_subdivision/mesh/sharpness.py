@@ -1,21 +1,21 @@
 """Sharpness of edges and vertices. It is infinite from 10; below, it lasts for a number of refinements (semi-sharp).
 
-Three classes hold sharpness, each computed from the one before:
+Two classes hold sharpness, the second computed from the first:
 
 `Sharpness` (`cuts`): sharpness of the control cage, from its tags.
     One number for each edge and each vertex, including infinite sharpness.
 `SemiSharpness`: sharpness of a mesh that is cut along its infinitely sharp edges.
     Infinite sharpness is represented by borders and corners of the mesh, so only finite sharpness remains. It is
     computed for each refinement of the mesh (`SemiSharpness.refined`).
-`FanSharpness`: sharpness around one vertex, in order from one of its faces, as a part of a `Signature`.
-    It does not contain indices of vertices and edges, so that elements with equal signatures share limit stencils.
-    `one_ring` converts it to a `SemiSharpness` of the local mesh.
+
+A `Fan` of a signature has that around one vertex, in order from one of its faces, which `one_ring` converts to a
+`SemiSharpness` of the local mesh.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,22 +98,6 @@ class SemiSharpness:
         kept = self.across_refined > 0
         across = self.across_vertex[kept], self.across_refined[kept], self.across_sharpens[kept]
         return SemiSharpness.decaying(origin, edges, vertices, *across, method)
-
-
-# Entry of a smooth edge in `FanSharpness.edges`. One shared tuple, as a fan may have very many smooth edges.
-SMOOTH_EDGE = 0.0, 0.0, 0.0
-
-
-class FanSharpness(NamedTuple):
-    """Semi-sharp features at one vertex of a cut mesh, in an order that does not depend on indices of edges."""
-
-    # (sharpness, refined sharpness of the half at the vertex, refined sharpness of the other half) of the first edge of
-    # each face of the fan, from the most clockwise face on
-    edges: tuple[tuple[float, float, float], ...]
-    vertex: float  # Sharpness of the vertex
-    # (sharpness, refined sharpness of the half at the vertex, whether the edge sharpens the vertex) of semi-sharp edges
-    # across the cut, in increasing order
-    across: tuple[tuple[float, float, bool], ...]
 
 
 def _lowered(sharpness: FloatArray) -> FloatArray:

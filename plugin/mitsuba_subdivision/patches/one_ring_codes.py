@@ -25,7 +25,7 @@ FEW_CODES = 1 << 16
 def fan_codes(
     topology: Topology,
     *,
-    near: bool = False,  # Whether fans consist of the faces of `TaggedFan.near` only
+    near: bool = False,  # Whether fans consist of the faces of `Fan.near` only
 ) -> IntArray:
     """``(n_h,)`` code of the fan around the vertex at which each half-edge begins, seen from the half-edge's face."""
     t = topology
@@ -115,7 +115,7 @@ def _faces_clockwise(topology: Topology) -> IntArray:
 
 
 def _has_far_faces(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_v,)`` whether `TaggedFan.near` leaves out faces of the fan around each vertex."""
+    """``(n_v,)`` whether `Fan.near` leaves out faces of the fan around each vertex."""
     t = topology
     is_large = t.is_border_vertex & (t.vertex_face_count > NEAR_FACES)
     return is_large & (t.vertex_rules != VertexRule.DART) & ~t.is_semi_sharp_vertex if is_large.any() else is_large

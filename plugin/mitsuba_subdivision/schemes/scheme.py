@@ -114,7 +114,7 @@ class Scheme(ABC):
         the convex hull of its one-ring, which saves time in adaptive tessellation. False by default.
     has_local_borders : bool
         Whether the mask of a border vertex or a corner has weights for its neighbours on the border only, and no weight
-        depends on its valence. If so, distant faces of its fan are left out (`TaggedFan.near`), which saves time. False
+        depends on its valence. If so, distant faces of its fan are left out (`Fan.near`), which saves time. False
         by default.
     crease_method : "uniform" or "chaikin", or None
         Decay of semi-sharp features in `refine`. With None, the default, the scheme refuses semi-sharp features.

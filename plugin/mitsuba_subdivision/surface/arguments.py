@@ -95,7 +95,7 @@ def require_valences(cage: ControlCage, scheme: Scheme) -> None:
     is_different = np.zeros(t.vertex_count, dtype=bool)
     if scheme.element == "face":
         is_dart = t.vertex_rules == VertexRule.DART
-        # At a border only near faces matter, see `TaggedFan.near`.
+        # At a border only near faces matter, see `Fan.near`.
         is_near = t.is_border_vertex & ~is_dart & scheme.has_local_borders
         is_different = t.is_semi_sharp_vertex | (t.is_border_vertex & ~is_near)
     else:
