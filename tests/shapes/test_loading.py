@@ -273,6 +273,7 @@ def test_a_file_that_has_just_changed_is_read_again(tmp_path):
     for positions in (cube().positions, cube().positions[::-1]):
         shapes.append(from_file(written(cube().with_positions(positions), tmp_path / "cube.obj", age=0)))
         np.testing.assert_array_equal(cage_of(shapes[-1]).positions, positions)
+    assert cage_of(from_file(str(tmp_path / "cube.obj"))) is not cage_of(shapes[-1])
 
 
 @every_variant
