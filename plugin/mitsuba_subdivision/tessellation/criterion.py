@@ -230,7 +230,8 @@ def least_product(
     Returns (t, 2) int64.
     """
     forms = np.minimum(forms, MOST)
-    a, b, c = np.maximum(forms.max(axis=0), TINY)
+    # Where A and C vanish, the quotient below must not overflow.
+    a, b, c = np.maximum(forms.max(axis=0), 1e-100)
     # The real rates of least product satisfy A / n_u^2 = C / n_v^2.
     rate = np.sqrt(2 + 2 * b / (np.sqrt(a) * np.sqrt(c)))
     tried = []

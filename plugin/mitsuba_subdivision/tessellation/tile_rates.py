@@ -66,9 +66,10 @@ class TileRates:
         corners, ring = times(kind.corners, values), kind.one_ring_points(values)
         lower, upper = ring.min(axis=0), ring.max(axis=0)
         limit = self.criterion.limit(lower, upper, NormalCone.of_any(len(tiles)))
-        if self.criterion.measure is Measure.EDGE:
-            return _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles))) <= limit
         height_range = np.zeros(len(tiles)) if heights is None else np.ptp(heights, axis=(0, 1))
+        if self.criterion.measure is Measure.EDGE:
+            extent = _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles)))
+            return np.hypot(extent, height_range) <= limit
         # The displacement uses up a part of the limit.
         limit = limit - height_range
         # Tiles that fit into the limit as a whole: the only test for tiles that are folded or have no normal.
