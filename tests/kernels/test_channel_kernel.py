@@ -10,7 +10,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.kernels.array_types import float_type_of
-from mitsuba_subdivision.kernels.channel_kernel import LinearChannelKernel, SubdividedChannelKernel, channel_kernel
+from mitsuba_subdivision.kernels.channel_kernel import ChannelKernel, LinearChannelKernel, channel_kernel
 from patches.closed_cages import mixed_torus, triangulated
 from reference.refined_cages import sheet, spokes, tagged
 
@@ -132,4 +132,4 @@ def test_kinds_of_channels_have_kernels_of_their_own():
     surface = LimitSurface(ControlCage(np.eye(3), [[0, 1, 2]], attributes=attributes))
     walk = surface.on_device(DOUBLE).walk
     kinds = [type(channel_kernel(surface.channel(name), walk, float_type_of(DOUBLE))) for name in ("a", "b")]
-    assert kinds == [SubdividedChannelKernel, LinearChannelKernel]
+    assert kinds == [ChannelKernel, LinearChannelKernel]

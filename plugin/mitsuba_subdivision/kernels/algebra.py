@@ -12,7 +12,7 @@ from functools import reduce
 
 import drjit as dr
 
-from .array_types import ArrayTypes, Float, Matrix4, Value, Vector3
+from .array_types import ArrayTypes, Float, Mask, Matrix4, Value, Vector3
 
 # Longest Newton step, in parameters of an element: outside of its element, a polynomial may be far from the surface.
 LONGEST_STEP = 0.5
@@ -55,6 +55,11 @@ def added(a: Vector3, b: Vector3, factor: Float = 1) -> Vector3:
 def combined(a: Sequence[Float], by_a: Float, b: Sequence[Float], by_b: Float) -> list[Float]:
     """Return ``by_a * a + by_b * b`` for vectors of any number of components."""
     return [dr.fma(x, by_a, y * by_b) for x, y in zip(a, b, strict=True)]
+
+
+def selected(condition: Mask, a: Sequence[Float], b: Sequence[Float]) -> list[Float]:
+    """Return ``a`` where a condition holds, and ``b`` elsewhere."""
+    return [dr.select(condition, x, y) for x, y in zip(a, b, strict=True)]
 
 
 def like(components: list, vector: Vector3) -> Vector3:

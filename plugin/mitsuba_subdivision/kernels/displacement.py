@@ -4,7 +4,7 @@
 
 - `displaced` evaluates these formulas for arrays of a kernel, single points, and arrays on the host.
 - `Displacement` contains the heights, a function of a channel's values, and their scale.
-- `DisplacedPiece` is a displaced `Piece` with the same interface, for Newton's method.
+- `DisplacedPiece` is a displaced `Piece`, for Newton's method.
 
 All quantities are in object space. At extraordinary points, where second derivatives do not exist, n_u is set to zero:
 the normal of the displaced surface follows from the limit normal and the slope of the heights. Where curvature
@@ -13,6 +13,7 @@ vanishes, as at valence 3 under Catmull-Clark, that is the limit.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,7 +24,7 @@ from .array_types import Float, Index, Mask, Value
 from .piece_kernel import DIFFERENCE, PatchValues, Piece
 
 if TYPE_CHECKING:
-    from .channel_kernel import AnyChannelPiece, ChannelKernel
+    from .channel_kernel import ChannelKernel
 
 # Minimum cosine of the angle between the normal and the cross product of the derivatives at which these span the
 # tangent plane. Derivatives are parallel at extraordinary points on borders, and their cross product is not normal at
@@ -90,37 +91,26 @@ class Displacement:
 
     def piece(self, surface: Piece, half_edge: Index, u: Float, v: Float, active: Mask) -> DisplacedPiece:
         """Displace the piece of the surface at a location."""
-        return DisplacedPiece(surface, self.channel.piece(half_edge, u, v, active), self, active)
+        channel = self.channel.at(half_edge, u, v, active)
+        return DisplacedPiece(**vars(surface), channel=channel, displacement=self, active=active)
 
 
 @dataclass(frozen=True, eq=False)
-class DisplacedPiece:
-    """A piece of the displaced surface, with the interface of `Piece`."""
+class DisplacedPiece(Piece):
+    """A piece of the displaced surface."""
 
-    surface: Piece  # The undisplaced piece
-    channel: AnyChannelPiece  # Piece of the channel that heights depend on, at the same location
+    channel: Callable[..., PatchValues]  # Values of the channel that heights depend on
     displacement: Displacement
     active: Mask
 
-    @property
-    def magnification(self) -> Float:
-        return self.surface.magnification
-
-    @property
-    def is_deep(self) -> Mask | None:
-        return self.surface.is_deep
-
-    def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
-        return self.surface.is_inside(du, dv, tolerance)
-
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
         """See `Piece.values`; second derivatives are detached finite differences of the first derivatives."""
-        surface, channel = self.surface.values(du, dv, 2), self.channel.values(du, dv)
+        surface, channel = super().values(du, dv, 2), self.channel(du, dv)
         height = self.displacement.heights(channel.value, channel.du, channel.dv, self.active)
         h, h_u, h_v = (self.displacement.scale * component for component in height)
-        displaced_values = displaced(surface, (h, h_u, h_v))
+        values = displaced(surface, (h, h_u, h_v))
         if derivatives == 1:
-            return displaced_values
+            return values
         step = DIFFERENCE * dr.rcp(self.magnification)
         with dr.suspend_grad():
             by_u, by_v = (
@@ -131,4 +121,4 @@ class DisplacedPiece:
             (getattr(after, name) - getattr(before, name)) * inverse
             for (after, before), name in ((by_u, "du"), (by_v, "du"), (by_v, "dv"))
         )
-        return replace(displaced_values, second=(uu, uv, vv))
+        return replace(values, second=(uu, uv, vv))

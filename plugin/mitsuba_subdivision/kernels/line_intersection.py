@@ -15,20 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from .algebra import LONGEST_STEP, STEP_TOLERANCE, dot, over, rounding, step_along
 from .array_types import ArrayTypes, Float, Index, Mask, Vector3
 from .locations import ElementWalk, Location
-from .piece_kernel import PatchValues
-
-if TYPE_CHECKING:
-    from .displacement import DisplacedPiece
-    from .piece_kernel import Piece
-
-    AnyPiece = Piece | DisplacedPiece
+from .piece_kernel import PatchValues, Piece
 
 # Maximum number of rounds for each aim, and number of Newton steps in a round.
 ROUNDS = 12
@@ -69,7 +62,7 @@ class Lines:
 def line_hits(
     walk: ElementWalk,  # Elements of the surface
     # Function of a half-edge, u, v, a mask and the row of the half-edge, which returns the piece of the surface
-    piece_at: Callable[..., AnyPiece],
+    piece_at: Callable[..., Piece],
     p: Vector3,  # A point of each line, near the surface
     d: Vector3,  # Direction of each line
     location: Location,  # Starting point of the search
@@ -141,7 +134,7 @@ def line_hits(
 
 def piece_hits(
     types: ArrayTypes,
-    piece: AnyPiece,
+    piece: Piece,
     p: Vector3,  # A point of each line
     d: Vector3,  # Direction of each line
     *,

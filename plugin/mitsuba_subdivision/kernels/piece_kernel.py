@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import reduce
+from operator import add
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 
@@ -30,7 +32,7 @@ from ..patches.piece_table import (
     TURN,
     WHOLE,
 )
-from .algebra import Monomials, added, combined, cross, like
+from .algebra import Monomials, added, combined, cross, like, selected
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
 from .locations import ElementWalk, distances, doublings, in_child, turn_matrix, turned
 
@@ -97,24 +99,17 @@ class PatchValues:
         return PatchValues(self.value, like(du, self.value), like(dv, self.value), self.normal)
 
 
-@dataclass(frozen=True, eq=False)
-class Tip:
+class Tip(NamedTuple):
     """Terms to sum at the levels of a tip that have no pieces, see `TreeArrays.blocks`."""
 
     control_count: Index  # Size of the one-ring; 0 where the sample lies in a piece
     ring: Index  # First packet of the control points
     row: Index  # First row of the block
-    frame: TipFrame | None  # Tangent frame; None if derivatives span the tangent plane in all tips
-
-
-@dataclass(frozen=True, eq=False)
-class TipFrame:
-    """Tangents where derivatives do not span the tangent plane."""
-
-    row: Index  # First row of the block whose derivatives are the tangents
-    # Lanes that need a tangent frame, and lanes that need `uneven_frame`
-    is_needed: Mask
-    is_uneven: Mask
+    # First row of the block whose derivatives are the tangents where those of the surface do not span the tangent
+    # plane; the lanes that need these tangents, and those that need `uneven_frame`. None if no tip has such lanes.
+    frame_row: Index = None
+    needs_frame: Mask = None
+    is_uneven: Mask = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +126,7 @@ class Piece:
     jacobian: tuple[Float, Float, Float, Float]  # ds/du, ds/dv, dt/du, dt/dv for the given parameters u, v
     magnification: Float  # Absolute scale of s and t relative to u and v: a power of two
     tip: Tip | None
-    size: int = 3  # Number of components of a value
+    size: int  # Number of components of a value
 
     @property
     def is_deep(self) -> Mask | None:
@@ -141,10 +136,8 @@ class Piece:
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """Whether parameters offset by ``du`` and ``dv`` lie in the piece, or within a tolerance of it."""
         s, t = self._parameters(du, dv)
-        smallest, *other_distances = distances(self.kernel.domain, s + self.kernel.centre[0], t + self.kernel.centre[1])
-        for distance in other_distances:
-            smallest = dr.minimum(smallest, distance)
-        return smallest >= -tolerance
+        centre_s, centre_t = self.kernel.centre
+        return reduce(dr.minimum, distances(self.kernel.domain, s + centre_s, t + centre_t)) >= -tolerance
 
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
         """Evaluate at parameters offset by ``du`` and ``dv``, which may lie outside of the piece.
@@ -159,17 +152,13 @@ class Piece:
         if self.tip is not None:
             value, partials, frame = self._with_tip(self.tip, value, partials, s, t, derivatives)
         a, b, c, d = self.jacobian
+
+        def along(by_s: list, by_t: list) -> tuple[list, list]:
+            return combined(by_s, a, by_t, c), combined(by_s, b, by_t, d)
+
         by_s, by_t, *second = partials
-        tangent_u, tangent_v = combined(by_s, a, by_t, c), combined(by_s, b, by_t, d)
-        tangents = [tangent_u, tangent_v]
-        if frame is not None:
-            is_needed, frame_s, frame_t = frame
-            frame_tangents = combined(frame_s, a, frame_t, c), combined(frame_s, b, frame_t, d)
-            tangents = [
-                [dr.select(is_needed, x, y) for x, y in zip(*pair, strict=True)]
-                for pair in zip(frame_tangents, tangents, strict=True)
-            ]
-        normal = cross(*tangents) if self.size == 3 else [0] * self.size
+        du, dv = along(by_s, by_t)
+        normal = cross(*((du, dv) if frame is None else along(*frame))) if self.size == 3 else [0] * self.size
         if second:
             ss, st, tt = second
             second = [
@@ -177,8 +166,8 @@ class Piece:
                 for (i, j), (k, m) in (((a, c), (a, c)), ((a, c), (b, d)), ((b, d), (b, d)))
             ]
         vector = kernel.types.vector(self.size)
-        value, tangent_u, tangent_v, normal = (vector(*each) for each in (value, tangent_u, tangent_v, normal))
-        return PatchValues(value, tangent_u, tangent_v, normal, tuple(vector(*each) for each in second))
+        value, du, dv, normal, *second = (vector(*components) for components in (value, du, dv, normal, *second))
+        return PatchValues(value, du, dv, normal, tuple(second))
 
     def _parameters(self, du: Float, dv: Float) -> tuple[Float, Float]:
         a, b, c, d = self.jacobian
@@ -186,57 +175,57 @@ class Piece:
 
     def _with_tip(
         self, tip: Tip, value: list, partials: list[list], s: Float, t: Float, derivatives: int
-    ) -> tuple[list, list[list], tuple[Mask, list, list] | None]:
+    ) -> tuple[list, list[list], tuple[list, list] | None]:
         """Add the sums over a tip's one-ring to the value and the derivatives.
 
-        Returns both, and of the tangent frame the lanes that need it and its tangents by s and t.
+        Returns both, and tangents by s and t that span the tangent plane if derivatives do not everywhere.
         """
         kernel, types, size = self.kernel, self.kernel.types, self.size
-        evaluate, frame = kernel.monomials.values, tip.frame
+        evaluate, has_frame = kernel.monomials.values, tip.frame_row is not None
 
-        def add(k: Index, *totals: Float) -> tuple:
+        def control(index: Index, active: Mask = True) -> list[Float]:
+            return [*types.fetch(types.vector4, self.buffer, tip.ring + index, active)][:size]
+
+        def add_control(k, *totals):
             weights = evaluate(kernel.weights(tip.row + k), s, t, derivatives)
-            if frame is not None:
-                weights += evaluate(kernel.weights(frame.row + k, frame.is_needed), s, t)[1:]
-            products = itertools.product(weights, kernel.control(self.buffer, tip.ring + k, size))
+            if has_frame:
+                weights += evaluate(kernel.weights(tip.frame_row + k, tip.needs_frame), s, t)[1:]
+            products = itertools.product(weights, control(k))
             return k + 1, *(dr.fma(x, weight, total) for (weight, x), total in zip(products, totals, strict=True))
 
-        sum_count = size * (1 + len(partials) + (0 if frame is None else 2))
+        sum_count = size * (1 + len(partials) + 2 * has_frame)
         # The loop only computes sums: ``max_iterations=-1`` lets reverse mode run without storing its iterations.
         keywords: dict[str, Any] = {"max_iterations": -1} if dr.grad_enabled(self.buffer) else {}
         _, *totals = dr.while_loop(
             # Start with the second control point, as the others are relative to the first.
             (types.index(1), *(types.float(0) for _ in range(sum_count))),
             lambda k, *_: k < tip.control_count,
-            add,
+            add_control,
             mode="symbolic",
             label="tip",
             **keywords,
         )
         value_sum, *derivative_sums = (totals[i : i + size] for i in range(0, sum_count, size))
         is_deep = tip.control_count > 0
-        point = added(kernel.control(self.buffer, tip.ring, size, is_deep), value_sum)
+        point = added(control(types.index(0), is_deep), value_sum)
         value, *partials = (
             added(vector, change) for vector, change in zip((value, *partials), (point, *derivative_sums), strict=False)
         )
-        if kernel.first_term is not None:
-            value_error, s_error, t_error = kernel.first_term(s, t, is_deep)
-            value, partials[0], partials[1] = (
-                added(value, point, value_error),
-                added(partials[0], point, s_error),
-                added(partials[1], point, t_error),
+        if kernel.basis_functions is not None:
+            errors = (dr.select(is_deep, error, 0) for error in kernel.first_term(s, t))
+            value, *partials[:2] = (
+                added(vector, point, error) for vector, error in zip((value, *partials[:2]), errors, strict=True)
             )
-        if frame is None:
+        if not has_frame:
             return value, partials, None
-        derivative_s, derivative_t, tangent_s, tangent_t = *partials[:2], *derivative_sums[-2:]
-        _, slow_s, slow_t = evaluate(kernel.weights(tip.row, frame.is_uneven), s, t)
-        uneven_s, uneven_t = (
-            combined(derivative_s, slow_s, derivative_t, slow_t),
-            combined(tangent_t, slow_s, tangent_s, -slow_t),
+        by_s, by_t, tangent_s, tangent_t = *partials[:2], *derivative_sums[-2:]
+        _, slow_s, slow_t = evaluate(kernel.weights(tip.row, tip.is_uneven), s, t)
+        uneven = combined(by_s, slow_s, by_t, slow_t), combined(tangent_t, slow_s, tangent_s, -slow_t)
+        frame_s, frame_t = (
+            selected(tip.needs_frame, selected(tip.is_uneven, *frame), derivative)
+            for *frame, derivative in zip(uneven, (tangent_s, tangent_t), (by_s, by_t), strict=True)
         )
-        frame_s = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_s, tangent_s, strict=True)]
-        frame_t = [dr.select(frame.is_uneven, x, y) for x, y in zip(uneven_t, tangent_t, strict=True)]
-        return value, partials, (frame.is_needed, frame_s, frame_t)
+        return value, partials, (frame_s, frame_t)
 
 
 class PieceKernel:
@@ -254,11 +243,11 @@ class PieceKernel:
             raise ValueError("a table with levels of tips that are pieces; expected one made for Stam's form")
         self.types = types = ArrayTypes.of(float_type)
         scheme = table.patches.scheme
-        self.domain = scheme.domain
-        basis = polynomial_basis(scheme)
+        self.domain, basis = scheme.domain, polynomial_basis(scheme)
         self.monomials = Monomials(basis.powers.tolist())
         self.centre = tuple(basis.centre.tolist())  # The middle of the domain
-        self.first_term = FirstTerm(basis.matrix.T.tolist(), self.monomials) if use_stam else None
+        # Coefficients of each function of the scheme's basis, for Stam's form
+        self.basis_functions = basis.matrix.T.tolist() if use_stam else None
         self.walk = ElementWalk(table, types)  # Over the table's elements
         self._count = len(basis.powers)
         self._numbers, self._row_size = PACKET * table.packets_of_piece, -(-self._count // PACKET) * PACKET
@@ -304,17 +293,30 @@ class PieceKernel:
         first_piece, node = types.fetch(types.index2, self._patch_starts, patch, active)
         if self._is_divided:
             node, turn, u, v, scale = self._leaf(node, turn, u, v, scale, active)
-        kind, piece_number, block_row, tip_code = types.fetch(types.index4, self._nodes, node, active)
+        kind, number, block_row, tip_code = types.fetch(types.index4, self._nodes, node, active)
         turn = (turn + kind // TURN) % domain.corner_count
         u, v = turned(domain, u, v, turn)
-        number, is_piece, tip = first_piece + piece_number, active, None
+        number, is_piece, tip = first_piece + number, active, None
         if self._has_tips:
             is_tip = (kind & KINDS) == _TIP
-            level, child_number, u, v, scale = self._at_level(is_tip, tip_code // LEVEL & LEVELS, u, v, scale)
-            number += child_number
+            level_count = tip_code // LEVEL & LEVELS
+            level, child, u, v, scale = self._at_level(is_tip, level_count, u, v, scale)
+            number += child
             is_deep = active & is_tip & (level >= self._piece_levels)
             is_piece = active & ~is_deep
-            tip = self._tip(patch, block_row, tip_code, level, child_number, is_deep)
+            block, is_rest = child - LEVEL_PIECES * self._piece_levels, level == level_count
+            control_count = tip_code // CONTROL
+            ring = types.fetch(types.index, self._rings, patch, is_deep)
+            row_of_block = dr.fma(block, control_count, block_row)
+            tip = Tip(dr.select(is_deep, control_count, types.index(0)), ring, row_of_block)
+            if self._has_frames:
+                frame = tip_code & FRAMES
+                is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
+                needs_frame = is_uneven | (is_deep & is_rest & (frame != 0))
+                # Blocks of the levels and of the rest, the frame at the point, then the frames of uneven levels.
+                first_frame = LEVEL_PIECES * (level_count - self._piece_levels) + 1
+                frame_block = first_frame + dr.select(is_uneven, block + 1, types.index(0))
+                tip = Tip(*tip[:3], dr.fma(frame_block, control_count, block_row), needs_frame, is_uneven)
         numbers = types.row(buffer, self._numbers, number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(
@@ -329,13 +331,25 @@ class PieceKernel:
             size,
         )
 
-    def control(self, buffer: FloatBuffer, packet: Index, size: int, active: Mask = True) -> list[Float]:
-        """Fetch the control value in a packet of the coefficients."""
-        return [*self.types.fetch(self.types.vector4, buffer, packet, active)][:size]
-
     def weights(self, row: Index, active: Mask = True) -> list:
         """Fetch a row of the blocks, with one weight for each monomial."""
         return self.types.row(self._weights, self._row_size, row, active)[: self._count]
+
+    def first_term(self, s: Float, t: Float) -> list[Float]:
+        """Rounding errors of the first terms of (9) and (11), which (10) and (12) avoid.
+
+        All components of the first eigenvector are one. So the first term of the point is ``ĉ_1`` times the sum of the
+        basis functions, which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times the sums of the derivatives of
+        the basis functions, which are zero. In single precision, both sums have rounding errors.
+
+        Returns the factors of the point ``ĉ_1`` in the errors of the point and of its derivatives by s and t.
+        """
+        functions = (
+            self.monomials.values([s * 0 + x for x in coefficients], s, t)
+            for coefficients in self.basis_functions or []
+        )
+        value, by_s, by_t = (reduce(add, terms, s * 0) for terms in zip(*functions, strict=True))
+        return [value - 1, by_s, by_t]
 
     def _split(
         self, half_edge: Index, row: Index4, u: Float, v: Float, active: Mask
@@ -370,13 +384,10 @@ class PieceKernel:
         """
         types, count = self.types, self.domain.corner_count
 
-        def node_at(node: Index) -> Index4:
+        def node_at(node):
             return types.fetch(types.index4, self._nodes, node, active)
 
-        def is_inner(node: Index, *_: Any) -> Mask:
-            return active & ((node_at(node)[0] & KINDS) < _REGULAR)
-
-        def descend(node: Index, turn: Index, u: Float, v: Float, scale: Float) -> tuple:
+        def descend(node, turn, u, v, scale):
             kind, first, _, _ = node_at(node)
             turn = (turn + kind // TURN) % count
             number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
@@ -391,7 +402,13 @@ class PieceKernel:
                 dr.select(is_only, scale, scale * inner_scale),
             )
 
-        return dr.while_loop((node, turn, u, v, scale), is_inner, descend, mode="symbolic", label="tree_arrays")
+        return dr.while_loop(
+            (node, turn, u, v, scale),
+            lambda node, *_: active & ((node_at(node)[0] & KINDS) < _REGULAR),
+            descend,
+            mode="symbolic",
+            label="tree_arrays",
+        )
 
     def _at_level(
         self, is_tip: Mask, level_count: Index, u: Float, v: Float, scale: Float
@@ -408,60 +425,13 @@ class PieceKernel:
         u, v, scale = u * power, v * power, scale * power
         number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
         is_child = is_tip & (level < level_count)
-        child_number = dr.select(is_child, dr.fma(level, LEVEL_PIECES, number - 1), level * LEVEL_PIECES)
         return (
             level,
-            child_number,
+            dr.select(is_child, dr.fma(level, LEVEL_PIECES, number - 1), level * LEVEL_PIECES),
             dr.select(is_child, inner_u, u),
             dr.select(is_child, inner_v, v),
             dr.select(is_child, scale * inner_scale, scale),
         )
-
-    def _tip(
-        self, patch: Index, block_row: Index, tip_code: Index, level: Index, child_number: Index, is_deep: Mask
-    ) -> Tip:
-        """Terms to sum in lanes without a piece; ``tip_code`` is the last column of `PieceTable.nodes`."""
-        types = self.types
-        frame, level_count, control_count = tip_code & FRAMES, tip_code // LEVEL & LEVELS, tip_code // CONTROL
-        block_number = child_number - LEVEL_PIECES * self._piece_levels
-        ring = types.fetch(types.index, self._rings, patch, is_deep)
-        tip = Tip(
-            dr.select(is_deep, control_count, types.index(0)),
-            ring,
-            dr.fma(block_number, control_count, block_row),
-            None,
-        )
-        if not self._has_frames:
-            return tip
-        is_rest = level == level_count
-        is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
-        is_needed = is_uneven | (is_deep & is_rest & (frame != 0))
-        # Order of blocks: those of the levels and of the rest, the frame at the point, the frames of uneven levels.
-        rest = LEVEL_PIECES * (level_count - self._piece_levels)
-        frame_block = rest + 1 + dr.select(is_uneven, block_number + 1, types.index(0))
-        return replace(tip, frame=TipFrame(dr.fma(frame_block, control_count, block_row), is_needed, is_uneven))
-
-
-@dataclass(frozen=True)
-class FirstTerm:
-    """Rounding errors of the first terms of (9) and (11), which (10) and (12) avoid.
-
-    All components of the first eigenvector are one. So the first term of the point is ``ĉ_1`` times the sum of the
-    basis functions, which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times the sums of the derivatives of the
-    basis functions, which are zero. In single precision, both sums have rounding errors.
-    """
-
-    functions: list[list[float]]  # Coefficients of each function of the scheme's basis
-    monomials: Monomials
-
-    def __call__(self, s: Float, t: Float, active: Mask) -> tuple[Float, Float, Float]:
-        """Factors of the point ``ĉ_1`` in the errors of the point and of its derivatives by s and t."""
-        sums = (s * 0,) * 3
-        for coefficients in self.functions:
-            function = self.monomials.values([s * 0 + x for x in coefficients], s, t)
-            sums = tuple(a + b for a, b in zip(sums, function, strict=True))  # type: ignore[assignment]
-        value_error, s_error, t_error = (dr.select(active, x, 0) for x in (sums[0] - 1, sums[1], sums[2]))
-        return value_error, s_error, t_error
 
 
 _KERNELS: Shared[PieceKernel] = Shared()

@@ -16,14 +16,13 @@ from .line_intersection import MISSED, ON_LINE, LineHits, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
 from .locations import ElementWalk, Location
 from .nearest_points import NearestPoints, nearest_locations
-from .piece_kernel import DIFFERENCE, PatchValues, PieceKernel
+from .piece_kernel import DIFFERENCE, PatchValues, Piece, PieceKernel
 from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplingCells
     from .displacement import Displacement
-    from .line_intersection import AnyPiece
 
 # Largest distance of a hit from its line, relative to the longest derivative of the surface; used by `intersect`.
 NEAR_LINE = 1e-4
@@ -284,7 +283,7 @@ class SurfaceKernel:
         v: Float,
         active: Mask = True,
         row: Index4 | None = None,
-    ) -> AnyPiece:
+    ) -> Piece:
         """The piece of the surface that contains given parameters, displaced if there is a displacement."""
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
@@ -305,7 +304,7 @@ def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vecto
     return dn_du, dn_dv
 
 
-def _second_normal_derivatives(piece: AnyPiece) -> tuple[list, list]:
+def _second_normal_derivatives(piece: Piece) -> tuple[list, list]:
     """Second derivatives of the unit normal as finite differences, detached: those by u, then those by v."""
     step = DIFFERENCE * dr.rcp(piece.magnification)
 
