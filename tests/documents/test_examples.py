@@ -32,7 +32,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.rules import RULES
 from mitsuba_subdivision.figures import FIGURES
 from mitsuba_subdivision.files.formats import FORMATS
-from mitsuba_subdivision.files.obj_tags import ObjTags, parse_tag
+from mitsuba_subdivision.files.obj_reader import read_obj
 from mitsuba_subdivision.regression.tiers import TIERS
 from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 
@@ -359,20 +359,25 @@ def test_the_table_of_formats_has_every_suffix_and_its_extra():
     assert {extra for row in rows for extra in named(row[2])} <= set(EXTRAS)
 
 
-def test_statements_of_the_table_of_tags_mean_what_it_says():
-    tags = ObjTags()
-    for number, (statement, meaning) in enumerate(rows_below(GUIDE / "files.md", "tags")):
-        (line,) = named(statement)
-        parse_tag(tags, "table", number, line.removeprefix("t "))
+def test_statements_of_the_table_of_tags_mean_what_it_says(tmp_path):
+    path = tmp_path / "cage.obj"
+
+    def contents(*statements):
+        path.write_text("\n".join(["v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", *statements]))
+        return read_obj(path)
+
+    statements = []
+    for statement, meaning in rows_below(GUIDE / "files.md", "tags"):
+        statements += named(statement)
         if "`" in meaning:
             rule, *values = named(meaning)
-            assert tags.rules[rule] == values[-1]
+            assert contents(*statements).rules[rule] == values[-1]
             assert set(RULES[rule]) <= set(values)
-    contents = tags.as_contents()
-    assert contents["creases"].tolist() == [[0, 1, 3.5]]
-    assert contents["corners"].tolist() == [[7, 10]]
-    assert contents["holes"].tolist() == [5]
-    assert contents["rules"].keys() == RULES.keys()
+    found = contents(*statements)
+    assert found.creases.tolist() == [[0, 1, 3.5]]
+    assert found.corners.tolist() == [[7, 10]]
+    assert found.holes.tolist() == [5]
+    assert found.rules.keys() == RULES.keys()
 
 
 def test_the_tables_of_tiers_and_of_figures_have_all_and_their_formats_and_options():

@@ -80,9 +80,7 @@ def assert_reads_as(content, path):
         np.testing.assert_array_equal(found.texcoords.indices, indices)
 
 
-@pytest.mark.parametrize("few_breaks", [0, 1000])
-def test_file_with_every_feature(obj_file, monkeypatch, few_breaks):
-    monkeypatch.setattr("mitsuba_subdivision.files.obj_text.FEW_BREAKS", few_breaks)
+def test_file_with_every_feature(obj_file):
     content = EVERY_FEATURE + (
         b"f 1/1/1 -2/2 3/-1\n"
         b"v 1 \\\n  -1 \\\r\n-1\r\n"

@@ -10,8 +10,7 @@ import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.files.ply_reader import grouped, read_ply
-from mitsuba_subdivision.files.ply_writer import write_polygons
+from mitsuba_subdivision.files.ply import grouped, read_ply, write_polygons
 
 plyfile = pytest.importorskip("plyfile")
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 import errno
 import importlib
 import os
-import stat
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -22,8 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@dataclass(frozen=True, eq=False)
-class Format:
+class Format(NamedTuple):
     """Functions that read and write files of one format.
 
     Each is named "module:function", as entry points of Python packages are, with a module of this package. The module
@@ -45,7 +42,7 @@ _USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_u
 # Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
 FORMATS = {
     ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles"),
-    ".ply": Format("ply_reader:read_ply", "ply_writer:write_ply", "ply_writer:write_ply_triangles", up="z"),
+    ".ply": Format("ply:read_ply", "ply:write_ply", "ply:write_ply_triangles", up="z"),
     ".usd": _USD,
     ".usda": _USD,
     ".usdc": _USD,
@@ -56,37 +53,39 @@ FORMATS = {
 
 def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
     """Read a file of any known format; the parameters are those of `ControlCage.from_file`."""
-    found = FORMATS[_known_suffix(path, list(FORMATS))]
-    _require_no_folder(path)
+    found = FORMATS[_known_suffix(path, FORMATS)]
+    # What else keeps a file from being opened is an OSError of the reader.
+    if os.path.isdir(path):
+        raise CageError(f'"{path}" is a folder; expected a file')
+    try:
+        os.stat(path)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise CageError(f'"{path}" is a link that leads back to itself; expected a file') from None
     read = function_named(found.read)
     if found.has_prims:
         return read(path, prim, time, rules)
     for name, value in (("prim", prim), ("time", time)):
         if value is not None:
-            suffixes = ", ".join(suffix for suffix, each in FORMATS.items() if each.has_prims)
+            suffixes = ", ".join(suffix for suffix, known in FORMATS.items() if known.has_prims)
             raise CageError(f'"{path}": {name} {value!r} was given; expected it for USD files only ({suffixes})')
     return read(path)
 
 
 def write_file(contents: CageContents, path: str | Path) -> None:
     """Write a file of any known format; see `ControlCage.save`."""
-    writers = {suffix: each.write for suffix, each in FORMATS.items() if each.write is not None}
-    function_named(writers[_known_suffix(path, list(writers))])(contents, path)
+    writers = {suffix: known.write for suffix, known in FORMATS.items() if known.write is not None}
+    function_named(writers[_known_suffix(path, writers)])(contents, path)
 
 
 def triangle_writers() -> dict[str, str]:
     """Names of the functions that write triangles, by the suffixes of their formats."""
-    return {suffix: each.write_triangles for suffix, each in FORMATS.items() if each.write_triangles is not None}
+    return {suffix: known.write_triangles for suffix, known in FORMATS.items() if known.write_triangles is not None}
 
 
 def require_triangle_format(path: str | Path) -> str:
     """The suffix of a file of triangles. Raises ValueError if the format is unknown."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"path {path!r}; expected a str or Path")
-    suffix, known = os.path.splitext(path)[1].lower(), triangle_writers()
-    if suffix not in known:
-        raise ValueError(f'"{path}": unknown format "{suffix}" of triangles; expected one of {", ".join(known)}')
-    return suffix
+    return _known_suffix(path, triangle_writers(), 'format "{}" of triangles', ValueError)
 
 
 def write_triangles(
@@ -125,24 +124,12 @@ def function_named(name: str) -> Callable[..., Any]:
     return getattr(importlib.import_module(f".{module}", __package__), function)
 
 
-def _require_no_folder(path: str | Path) -> None:
-    """Refuse folders and circles of links. What else keeps a file from being opened is an OSError of the reader."""
-    try:
-        is_folder = stat.S_ISDIR(os.stat(path).st_mode)
-    except OSError as error:
-        if error.errno != errno.ELOOP:
-            return
-        raise CageError(f'"{path}" is a link that leads back to itself; expected a file') from None
-    except ValueError:  # Such as a zero in the path.
-        return
-    if is_folder:
-        raise CageError(f'"{path}" is a folder; expected a file')
-
-
-def _known_suffix(path: str | Path, known: list[str]) -> str:
+def _known_suffix(
+    path: str | Path, known: Iterable[str], what: str = 'cage format "{}"', error: type[ValueError] = CageError
+) -> str:
     if not isinstance(path, (str, os.PathLike)):
-        raise CageError(f"path {path!r}; expected a str or Path")
+        raise error(f"path {path!r}; expected a str or Path")
     suffix = os.path.splitext(path)[1].lower()
     if suffix not in known:
-        raise CageError(f'"{path}": unknown cage format "{suffix}"; expected one of {", ".join(known)}')
+        raise error(f'"{path}": unknown {what.format(suffix)}; expected one of {", ".join(known)}')
     return suffix

@@ -17,6 +17,14 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 
 Value = TypeVar("Value")
+# Arrays of a cage whose rows are those parts of a mesh.
+_PARTS = {
+    "vertices": "positions",
+    "faces": "face_sizes",
+    "creases": "creases",
+    "corners": "corners",
+    "holes": "holes",
+}
 
 
 def joined(
@@ -42,11 +50,7 @@ def joined(
     for mesh in meshes:
         _require_own_indices(mesh)
     starts = {
-        "vertices": _starts([len(mesh.positions) for mesh in meshes]),
-        "faces": _starts([len(mesh.face_sizes) for mesh in meshes]),
-        "creases": _starts([len(mesh.creases) for mesh in meshes]),
-        "corners": _starts([len(mesh.corners) for mesh in meshes]),
-        "holes": _starts([len(mesh.holes) for mesh in meshes]),
+        part: ragged.starts(np.array([len(getattr(mesh, rows)) for mesh in meshes])) for part, rows in _PARTS.items()
     }
     # Each mesh with the number of its first vertex, and of its first face.
     by_vertex = list(zip(meshes, starts["vertices"].tolist(), strict=True))
@@ -63,9 +67,7 @@ def joined(
         attributes=attributes,
         rules=rules,
         scheme=scheme,
-        source=_JoinedSource(
-            f"{name}, {len(meshes)} meshes", parts=tuple(each.source for each in meshes), starts=starts
-        ),
+        source=_JoinedSource(f"{name}, {len(meshes)} meshes", meshes=[mesh.source for mesh in meshes], starts=starts),
     )
 
 
@@ -80,51 +82,41 @@ def _common(rule: str, meshes: Sequence[CageContents], values: Sequence[Value]) 
     return values[0]
 
 
-def _starts(counts: Sequence[int]) -> IntArray:
-    """Number of the first one of each mesh, in the cage."""
-    return ragged.starts(np.array(counts))
-
-
 def _require_own_indices(mesh: CageContents) -> None:
     """Raise an error if an index is out of the mesh's range or data has the wrong length.
 
     In the joined arrays, such an index would mean a part of another mesh, and the data of all later meshes would begin
     too early or too late.
     """
-    source, vertex_count, face_count = mesh.source.name, len(mesh.positions), len(mesh.face_sizes)
-    corner_count = len(mesh.face_vertices)
-    for what, indices, count in (("face corners", mesh.face_vertices, vertex_count), ("holes", mesh.holes, face_count)):
-        require_range(indices, count, f"{source}: {what} have")
-    data = {**mesh.attributes, **({} if mesh.texcoords is None else {"texcoords": mesh.texcoords})}
-    for name, attribute in data.items():
+    source, vertex_count = mesh.source.name, len(mesh.positions)
+    require_range(mesh.face_vertices, vertex_count, f"{source}: face corners have")
+    require_range(mesh.holes, len(mesh.face_sizes), f"{source}: holes have")
+    for name, attribute in {**mesh.attributes, "texcoords": mesh.texcoords}.items():
+        if attribute is None:
+            continue
         where = f'{source}: attribute "{shortened(name)}" has'
         if attribute.indices is not None:
             require_range(attribute.indices, len(attribute.values), where)
-        is_face_varying = attribute.interpolation == "face_varying"
         found = len(attribute.values if attribute.indices is None else attribute.indices)
-        expected = corner_count if is_face_varying else vertex_count
+        expected, per = vertex_count, "vertex"
+        if attribute.interpolation == "face_varying":
+            expected, per = len(mesh.face_vertices), "face corner"
         if found != expected:
-            per = "face corner" if is_face_varying else "vertex"
             raise CageError(f"{where} {found} values or indices; expected {expected}, one per {per}")
 
 
 def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:
     """Texture coordinates and attributes that all meshes have."""
-    found, lost = {}, []
     texcoords = _joined_attribute([mesh.texcoords for mesh in meshes])
+    names = dict.fromkeys(attribute for mesh in meshes for attribute in mesh.attributes)
+    joined = {attribute: _joined_attribute([mesh.attributes.get(attribute) for mesh in meshes]) for attribute in names}
+    lost = [f'"{attribute}"' for attribute, values in joined.items() if values is None]
     if texcoords is None and any(mesh.texcoords is not None for mesh in meshes):
-        lost.append("texture coordinates")
-    for attribute in dict.fromkeys(attribute for mesh in meshes for attribute in mesh.attributes):
-        whole = _joined_attribute([mesh.attributes.get(attribute) for mesh in meshes])
-        if whole is None:
-            lost.append(f'"{attribute}"')
-        else:
-            found[attribute] = whole
+        lost.insert(0, "texture coordinates")
     if lost:
-        shown = shortened(", ".join(lost), 200)
         everywhere = f"in all {len(meshes)} meshes, with the same interpolation and width"
-        warn(f"{name}: {shown} left out; expected them {everywhere}")
-    return texcoords, found
+        warn(f"{name}: {shortened(', '.join(lost), 200)} left out; expected them {everywhere}")
+    return texcoords, {attribute: values for attribute, values in joined.items() if values is not None}
 
 
 def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
@@ -135,9 +127,9 @@ def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
     values = np.concatenate([part.values for part in parts])
     if parts[0].interpolation != "face_varying":
         return Attribute(values, parts[0].interpolation)
-    starts = _starts([len(part.values) for part in parts]).tolist()
+    starts = ragged.starts(np.array([len(part.values) for part in parts])).tolist()
     indices = [np.arange(len(part.values)) if part.indices is None else part.indices for part in parts]
-    rows = np.concatenate([own + start for own, start in zip(indices, starts, strict=True)])
+    rows = np.concatenate([rows + start for rows, start in zip(indices, starts, strict=True)])
     return Attribute(values, "face_varying", rows)
 
 
@@ -145,42 +137,41 @@ def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
 class _JoinedSource(CageSource):
     """Source of a cage that was joined from several meshes: names the mesh, and the number in this mesh."""
 
-    parts: tuple[CageSource, ...] = ()  # Of the meshes
-    # (len(parts),) int each: number of the first one of the "vertices", "faces", "creases", "corners" and "holes" of
-    # each mesh
+    meshes: Sequence[CageSource] = ()
+    # By the names of `_PARTS`, (len(meshes),) int: number of the first part of each mesh in the cage
     starts: Mapping[str, IntArray] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:
-        part, own = self._part("faces", face)
-        return part.at_face(own)
+        mesh, number = self._in_mesh("faces", face)
+        return mesh.at_face(number)
 
     def at_vertex(self, vertex: int) -> str:
-        part, own = self._part("vertices", vertex)
-        return part.at_vertex(own)
+        mesh, number = self._in_mesh("vertices", vertex)
+        return mesh.at_vertex(number)
 
     def at_tag(self, kind: str, row: int) -> str:
-        part, own = self._part(kind, row)
-        return part.at_tag(kind, own)
+        mesh, number = self._in_mesh(kind, row)
+        return mesh.at_tag(kind, number)
 
     def vertex(self, vertex: int) -> str:
-        part, own = self._part("vertices", vertex)
-        return f"{part.vertex(own)} of {_prim(part)}"
+        mesh, number = self._in_mesh("vertices", vertex)
+        return f"{mesh.vertex(number)} of {_prim(mesh)}"
 
     def edge(self, start: int, end: int) -> str:
-        part, own = self._part("vertices", start)
-        return f"{part.edge(own, int(end) - int(start) + own)} of {_prim(part)}"
+        mesh, number = self._in_mesh("vertices", start)
+        return f"{mesh.edge(number, int(end) - int(start) + number)} of {_prim(mesh)}"
 
     def faces(self, faces: IntArray, shown: int = 6) -> str:
-        places = [self._part("faces", face) for face in faces[:shown]]
+        places = [self._in_mesh("faces", face) for face in faces[:shown]]
         more = f" and {len(faces) - shown} more" if len(faces) > shown else ""
-        return ", ".join(f"{part.faces(np.array([own]))} of {_prim(part)}" for part, own in places) + more
+        return ", ".join(f"{mesh.faces(np.array([number]))} of {_prim(mesh)}" for mesh, number in places) + more
 
-    def _part(self, kind: str, index: int) -> tuple[CageSource, int]:
-        """Source of the mesh to which a vertex, face, crease, corner or hole belongs, and its number there."""
-        part = int(np.searchsorted(self.starts[kind], index, side="right")) - 1
-        return self.parts[part], int(index) - int(self.starts[kind][part])
+    def _in_mesh(self, part: str, index: int) -> tuple[CageSource, int]:
+        """Source of the mesh to which a part belongs, and its number there."""
+        mesh = int(np.searchsorted(self.starts[part], index, side="right")) - 1
+        return self.meshes[mesh], int(index) - int(self.starts[part][mesh])
 
 
-def _prim(part: CageSource) -> str:
+def _prim(mesh: CageSource) -> str:
     """Path of a mesh in its file."""
-    return part.name.rpartition(", prim ")[2]
+    return mesh.name.rpartition(", prim ")[2]

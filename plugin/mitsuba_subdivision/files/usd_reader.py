@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
 from ..cage.rules import RULES
@@ -18,11 +21,10 @@ from ..cage.tags import require_sharpness
 from ..cage.validation import require_range, validated_face_indices
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
+from . import usd_stage
 from .joined_meshes import joined
-from .usd_primvars import PrimvarChoice, read_primvars
 from .usd_skinning import Skinning
-from .usd_stage import chosen_meshes, open_stage, require_usd, usd_errors_at, usd_messages_of
-from .usd_values import FLAT_SCHEMES, RULE_ATTRIBUTES, SCHEMES, local_to_world, rule_name, time_of, token, value_at
+from .usd_stage import FLAT_SCHEMES, INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, time_of, value_at
 
 if TYPE_CHECKING:
     from pxr import Usd, UsdGeom
@@ -59,21 +61,30 @@ def read_usd(
         raise CageError(f"{name}: time {time}; expected a finite number, a time code")
     with Path(path).open("rb"):
         pass  # So that a missing file is an OSError, as for other formats.
-    require_usd(name)
+    usd_stage.require_usd(name)
     from pxr import Usd
 
     rules, code = rules or {}, Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
-    with usd_errors_at(name), usd_messages_of(name):
-        stage = open_stage(path, name)
-        meshes = chosen_meshes(stage, prim, name, code, rules.get("scheme"))
+    with usd_stage.usd_errors_at(name), usd_stage.usd_messages_of(name):
+        stage = usd_stage.open_stage(path, name)
+        meshes = usd_stage.chosen_meshes(stage, prim, name, code, rules.get("scheme"))
         locations = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
         skinning = Skinning(code, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))
-    found = []
+    contents = []
     for mesh, location in zip(meshes, locations, strict=True):
         # When the cage is validated, numbers that are not finite become errors that name their location.
-        with usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-            found.append(MeshReader(mesh, location, skinning, rules).contents())
-    return joined(found, name)
+        with usd_stage.usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
+            contents.append(MeshReader(mesh, location, skinning, rules).contents())
+    return joined(contents, name)
+
+
+@dataclass(frozen=True)
+class PrimvarChoice:
+    """Which primvars of a mesh are read, where not all are."""
+
+    texcoords: Sequence[str] = ()  # Names that texture coordinates are looked up by first
+    # Names of the attributes that are read; values of whole faces become values of their corners
+    attributes: Collection[str] = ()
 
 
 class MeshReader:
@@ -90,7 +101,7 @@ class MeshReader:
         report: Callable[[str, object], None] | None = None,
     ) -> None:
         self.mesh, self.location, self.skinning = mesh, location, skinning
-        self.rules, self._report = rules or {}, report
+        self._rules, self._report = rules or {}, report
 
     def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
         """The mesh as contents of a cage in the world's space, or its own; by default, all primvars are read.
@@ -102,10 +113,10 @@ class MeshReader:
         sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
         vertices = self.array(mesh.GetFaceVertexIndicesAttr(), np.int64, required=True)
         if (sizes < 0).any() or sizes.sum() != len(vertices):
-            found = f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries"
-            raise self.error(found, "as many")
+            problem = f"faceVertexCounts add up to {sizes.sum()}, but faceVertexIndices has {len(vertices)} entries"
+            raise self.error(problem, "as many")
         points = self.skinning.points(mesh, points)
-        matrix = np.eye(4) if is_local else self.local_to_world()
+        matrix = np.eye(4) if is_local else self._local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
         order = None
         if mirrors != self.is_left_handed():
@@ -120,18 +131,18 @@ class MeshReader:
             if not np.isfinite(points).all():
                 raise self.error("there are points that are not finite", "finite numbers")
             topology = Topology(len(points), sizes, vertices)
+        count, left_out = len(points), "the {} are left out".format
+        no_holes: IntArray = np.zeros(0, np.int64)
         creases = self.fitting(
-            mesh.GetCreaseIndicesAttr(), "the creases are left out", lambda: self.creases(len(points)), np.zeros((0, 3))
+            mesh.GetCreaseIndicesAttr(), left_out("creases"), partial(self._creases, count), np.zeros((0, 3))
         )
         corners = self.fitting(
-            mesh.GetCornerIndicesAttr(), "the corners are left out", lambda: self.corners(len(points)), np.zeros((0, 2))
+            mesh.GetCornerIndicesAttr(), left_out("corners"), partial(self._corners, count), np.zeros((0, 2))
         )
-        no_faces: IntArray = np.zeros(0, np.int64)
-        holes = self.fitting(
-            mesh.GetHoleIndicesAttr(), "the holes are left out", lambda: self.holes(topology), no_faces
-        )
-        rules = {rule: self.rule(rule) for rule in RULE_ATTRIBUTES if rule not in self.rules}
-        texcoords, attributes = read_primvars(self, order, topology, choice)
+        holes = self.fitting(mesh.GetHoleIndicesAttr(), left_out("holes"), partial(self._holes, topology), no_holes)
+        rules = {rule: self._rule(rule) for rule in RULE_ATTRIBUTES if rule not in self._rules}
+        texcoords, attributes = self._primvars(order, topology, choice)
+        is_flat = str(self.value(mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
         return CageContents(
             points,
             sizes,
@@ -142,7 +153,7 @@ class MeshReader:
             texcoords=texcoords,
             attributes=attributes,
             rules=rules,
-            scheme=None if is_local and self.is_flat() else self.scheme(),
+            scheme=None if is_local and is_flat else self._scheme(),
             source=CageSource(self.location),
         )
 
@@ -157,10 +168,10 @@ class MeshReader:
         except CageError as error:
             if self._report is None:
                 raise
-            self.tell(f"{error}; {consequence}", attribute.GetPath())
+            self._tell(f"{error}; {consequence}", attribute.GetPath())
             return otherwise
 
-    def tell(self, message: str, path: object) -> None:
+    def _tell(self, message: str, path: object) -> None:
         """Report a message about a prim or an attribute; by default, as a `CageWarning`."""
         if self._report is None:
             warn(message)
@@ -171,27 +182,26 @@ class MeshReader:
         return CageError(f"{self.location}: {problem}; expected {expected}")
 
     def value(self, attribute: Usd.Attribute) -> Any:
-        """Value of an attribute at `time_of` it."""
-        return attribute.Get(self.time_of(attribute))
+        """Value of an attribute; see `read_usd` for its time."""
+        return attribute.Get(self._time_of(attribute))
 
-    def time_of(self, attribute: Usd.Attribute) -> Usd.TimeCode:
-        """Time code at which an attribute is read; see `read_usd`."""
+    def _time_of(self, attribute: Usd.Attribute) -> Usd.TimeCode:
         from pxr import Usd
 
-        if self.first_time is not None and attribute.GetNumTimeSamples():
-            return Usd.TimeCode(self.first_time)
+        if self._first_time is not None and attribute.GetNumTimeSamples():
+            return Usd.TimeCode(self._first_time)
         return time_of(attribute, self.skinning.time)
 
     @cached_property
-    def first_time(self) -> float | None:
+    def _first_time(self) -> float | None:
         """First time at which the mesh has points and faces; None if it has them anyway, or a time is given."""
         mesh, code = self.mesh, self.skinning.time
         # Points come last, as they take longest to read.
         needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
-        if not code.IsEarliestTime() or all(_size(value_at(each, code)) for each in needed):
+        if not code.IsEarliestTime() or all(_size(value_at(attribute, code)) for attribute in needed):
             return None
-        times = sorted({time for each in needed for time in each.GetTimeSamples()})
-        return next((time for time in times if all(_size(each.Get(time)) for each in needed)), None)
+        times = sorted({time for attribute in needed for time in attribute.GetTimeSamples()})
+        return next((time for time in times if all(_size(attribute.Get(time)) for attribute in needed)), None)
 
     def array(self, attribute: Usd.Attribute, kind: type, required: bool = False, width: int | None = None) -> NDArray:
         """Values of an array attribute, ``(n,)`` or ``(n, width)``, as int64 or float64."""
@@ -210,7 +220,7 @@ class MeshReader:
             raise self.error(f"{attribute.GetName()} is of the type {type(value).__name__}", f"an array of {what}")
         return array.astype(kind)
 
-    def token(self, attribute: Usd.Attribute, known: Sequence[str]) -> str:
+    def _token(self, attribute: Usd.Attribute, known: Sequence[str]) -> str:
         """Value of an attribute that must be one of the known ones, of which the first is the schema's fallback."""
 
         def read() -> str:
@@ -223,21 +233,18 @@ class MeshReader:
 
     def is_left_handed(self) -> bool:
         """Whether faces are clockwise from outside."""
-        return self.token(self.mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"
+        return self._token(self.mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"
 
-    def is_flat(self) -> bool:
-        """Whether the mesh is not to be smoothed."""
-        return str(self.value(self.mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
-
-    def rule(self, rule: str) -> str:
+    def _rule(self, rule: str) -> str:
         """Value of a rule, as `RULES` names it."""
         attribute = self.mesh.GetPrim().GetAttribute(RULE_ATTRIBUTES[rule])
-        return rule_name(self.token(attribute, [token(name) for name in RULES[rule]]))
+        value = self._token(attribute, [usd_stage.token(name) for name in RULES[rule]])
+        return re.sub("([A-Z])", lambda match: f"_{match[1].lower()}", value)
 
-    def scheme(self) -> str:
+    def _scheme(self) -> str:
         """The mesh's scheme, or the one that replaces it."""
-        given = self.rules.get("scheme")
-        asked = self.token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, *FLAT_SCHEMES])
+        given = self._rules.get("scheme")
+        asked = self._token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, *FLAT_SCHEMES])
         if given is None:
             if asked not in SCHEMES:
                 what = "is not to be subdivided" if asked == "none" else "is to be subdivided without smoothing"
@@ -248,7 +255,7 @@ class MeshReader:
             warn(f'{self.location}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
         return given
 
-    def creases(self, vertex_count: int) -> NDArray[np.float64]:
+    def _creases(self, vertex_count: int) -> NDArray[np.float64]:
         """Rows (vertex, vertex, sharpness)."""
         mesh = self.mesh
         indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
@@ -256,12 +263,11 @@ class MeshReader:
         sharpness = self.array(mesh.GetCreaseSharpnessesAttr(), np.float64)
         if not len(indices) and not len(lengths) and not len(sharpness):
             return np.zeros((0, 3))
-        if (lengths < 2).any():
-            first = int(np.argmax(lengths < 2))
-            raise self.error(f"creaseLengths has the value {lengths[first]} at {first}", "2 or more vertices")
+        for short in np.flatnonzero(lengths < 2)[:1]:
+            raise self.error(f"creaseLengths has the value {lengths[short]} at {short}", "2 or more vertices")
         if lengths.sum() != len(indices):
-            found = f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries"
-            raise self.error(found, "as many")
+            problem = f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries"
+            raise self.error(problem, "as many")
         edges = lengths - 1
         require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of creaseSharpnesses")
         if len(sharpness) == len(lengths):
@@ -269,49 +275,170 @@ class MeshReader:
         elif len(sharpness) != edges.sum():
             expected = f"{len(lengths)}, one per crease, or {edges.sum()}, one per edge"
             raise self.error(f"creaseSharpnesses has {len(sharpness)} entries", expected)
-        is_start = np.ones(len(indices), dtype=bool)
-        is_start[np.cumsum(lengths) - 1] = False
-        start = np.flatnonzero(is_start)
-        rows = np.stack([indices[start], indices[start + 1], sharpness], axis=1)
-        return self._own_rows(rows, vertex_count, "crease")
+        start = np.delete(np.arange(len(indices)), np.cumsum(lengths) - 1)
+        return self._rows_of_mesh(np.stack([indices[start], indices[start + 1], sharpness], 1), vertex_count, "crease")
 
-    def corners(self, vertex_count: int) -> NDArray[np.float64]:
+    def _corners(self, vertex_count: int) -> NDArray[np.float64]:
         """Rows (vertex, sharpness)."""
         indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
         sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
         if not len(indices) and not len(sharpness):
             return np.zeros((0, 2))
         if len(indices) != len(sharpness):
-            found = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
-            raise self.error(found, "as many")
+            problem = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
+            raise self.error(problem, "as many")
         require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
-        return self._own_rows(np.stack([indices, sharpness], axis=1), vertex_count, "corner")
+        return self._rows_of_mesh(np.stack([indices, sharpness], axis=1), vertex_count, "corner")
 
-    def _own_rows(self, rows: NDArray[np.float64], vertex_count: int, noun: str) -> NDArray[np.float64]:
+    def _rows_of_mesh(self, rows: NDArray[np.float64], vertex_count: int, noun: str) -> NDArray[np.float64]:
         """Rows of creases or corners that name vertices of the mesh; among other meshes, others would be theirs."""
         vertices = rows[:, :-1]
-        is_own = ((vertices >= 0) & (vertices < vertex_count)).all(axis=1)
-        for row in np.flatnonzero(~is_own)[:1]:
+        is_inside = ((vertices >= 0) & (vertices < vertex_count)).all(axis=1)
+        for row in np.flatnonzero(~is_inside)[:1]:
             numbers = ", ".join(f"{vertex:.0f}" for vertex in vertices[row])
-            such = number_of_such(int((~is_own).sum()), noun)
+            such = number_of_such(int((~is_inside).sum()), noun)
             expected = f"expected vertices from 0 to {vertex_count - 1}"
             path = self.mesh.GetPrim().GetAttribute(f"{noun}Indices").GetPath()
-            self.tell(f"{self.location}: {noun} at ({numbers}) is ignored; {expected} ({such})", path)
-        return rows[is_own]
+            self._tell(f"{self.location}: {noun} at ({numbers}) is ignored; {expected} ({such})", path)
+        return rows[is_inside]
 
-    def holes(self, topology: Topology | None) -> IntArray:
+    def _holes(self, topology: Topology | None) -> IntArray:
         """Faces that are holes; checked against a topology if there is one."""
         holes = self.array(self.mesh.GetHoleIndicesAttr(), np.int64)
         return holes if topology is None else validated_face_indices(topology, holes, "hole", CageSource(self.location))
 
-    def local_to_world(self) -> NDArray[np.float64]:
+    def _local_to_world(self) -> NDArray[np.float64]:
         """The transform to world space, as a matrix for row vectors."""
-        matrix = np.array(local_to_world(self.mesh.GetPrim(), self.time_of))
+        matrix = np.array(usd_stage.local_to_world(self.mesh.GetPrim(), self._time_of))
         # The determinant says nothing about a matrix that is not finite.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
-            found = f"the transform to world space is {shortened(str(matrix.tolist()), 200)}"
-            raise self.error(found, "an invertible matrix")
+            problem = f"the transform to world space is {shortened(str(matrix.tolist()), 200)}"
+            raise self.error(problem, "an invertible matrix")
         return matrix
+
+    def _primvars(
+        self,
+        # (n_h,) int64, if the orientation of faces is reversed: which face corner of the file becomes each face corner
+        order: IntArray | None,
+        topology: Topology | None,  # What values are checked against. By default, the cage does so later.
+        choice: PrimvarChoice | None,  # By default, all primvars are read
+    ) -> tuple[Attribute | None, dict[str, Attribute]]:
+        """Texture coordinates and attributes.
+
+        Primvars of floating-point numbers are read. The first of "st", "UVMap" and "texcoords" that there is gives the
+        texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
+        which follow from the surface, joints and their weights, and primvars with a single value for the whole mesh.
+        Warns if primvars have other types, or one value per face, and are not read.
+        """
+        from pxr import UsdGeom
+
+        preferred = (*(choice.texcoords if choice else ()), *TEXCOORDS)
+        known = (*INTERPOLATIONS, "uniform") if choice else INTERPOLATIONS
+        attributes: dict[str, Attribute] = {}
+        pairs: list[str] = []
+        left_out: dict[str, str] = {}
+        for primvar in UsdGeom.PrimvarsAPI(self.mesh).GetPrimvarsWithAuthoredValues():
+            name, kind, interpolation = primvar.GetPrimvarName(), str(primvar.GetTypeName()), primvar.GetInterpolation()
+            if interpolation == UsdGeom.Tokens.constant or name == "normals" or name.startswith("skel:"):
+                continue
+            is_pair = kind.startswith("texCoord2")
+            if choice and not (is_pair or name in preferred or name in choice.attributes):
+                continue
+            attribute = primvar.GetAttr()
+            table = _table(self.value(attribute), primvar.GetElementSize())
+            if table is None or interpolation not in known:
+                left_out[str(attribute.GetPath())] = f'"{name}" ({kind}, {interpolation})'
+                continue
+            width = 2 if choice and name in choice.texcoords else None
+            read = partial(self._primvar, primvar, table, order, topology, width)
+            values = self.fitting(attribute, "the primvar is left out", read, None)
+            if values is not None:
+                attributes[name] = values
+                pairs += [name] if is_pair else []
+        if left_out:
+            shown = shortened(", ".join(left_out.values()), 200)
+            message = f"{self.location}: primvars {shown} left out; expected floats, at vertices or face corners"
+            self._tell(message, ", ".join(left_out))
+        pair_names = (
+            name for name in (*preferred, *pairs) if name in attributes and attributes[name].values.shape[1] == 2
+        )
+        first = next(pair_names, None)
+        texcoords = None if first is None else attributes[first]
+        kept = choice.attributes if choice else attributes.keys() - {first}
+        return texcoords, {name: values for name, values in attributes.items() if name in kept}
+
+    def _primvar(
+        self,
+        primvar: UsdGeom.Primvar,
+        values: NDArray[np.float64],
+        order: IntArray | None,
+        topology: Topology | None,
+        width: int | None,
+    ) -> Attribute:
+        """A primvar as an attribute, checked against a topology if there is one."""
+        where = f'{self.location}: primvar "{shortened(primvar.GetPrimvarName())}"'
+        indices = self.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
+        interpolation = primvar.GetInterpolation()
+        if interpolation in ("vertex", "varying"):
+            if indices is not None:
+                require_range(indices, len(values), f"{where} has")
+                values = values[indices]
+            attribute = Attribute(values, INTERPOLATIONS[interpolation])
+        else:
+            sizes = self.array(self.mesh.GetFaceVertexCountsAttr(), np.int64)
+            vertices = self.array(self.mesh.GetFaceVertexIndicesAttr(), np.int64)
+            rows, count, per = order, len(vertices), "face corner"
+            if interpolation == "uniform":
+                # Values of faces become those of their corners, which a change of the orientation leaves as they are.
+                rows, count, per = np.repeat(np.arange(len(sizes)), sizes), len(sizes), "face"
+            elif indices is None:
+                values, indices = _with_shared_values(values, sizes, vertices)
+            if rows is not None:
+                indices = np.arange(len(values)) if indices is None else indices
+                if len(indices) != count:
+                    raise CageError(f"{where} has {len(indices)} values or indices; expected {count}, one per {per}")
+                indices = indices[rows]
+            attribute = Attribute(values, "face_varying", indices)
+        if topology is None:
+            return attribute
+        return attribute.validated(primvar.GetPrimvarName(), topology, CageSource(self.location), width)
+
+
+def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
+    """Table with one row per element; None if the values are not floating-point numbers."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        return None
+    if array.dtype.kind != "f" or array.ndim not in (1, 2) or not len(array):
+        return None
+    width = max(element_size, 1) * (array.shape[1] if array.ndim == 2 else 1)
+    return array.astype(np.float64).reshape(-1, width) if array.size % width == 0 else None
+
+
+def _with_shared_values(
+    values: NDArray[np.float64], sizes: IntArray, vertices: IntArray
+) -> tuple[NDArray[np.float64], IntArray | None]:
+    """Distinct values and the index of each face corner, where corners of a vertex share equal values.
+
+    As in Blender, pairs of numbers are only shared by faces that have the same winding in their plane: a mirrored half
+    of a texture is an island of its own. Without as many values as corners, they are returned as they are.
+    """
+    if len(values) != len(vertices) or sizes.sum() != len(vertices) or not sizes.all():
+        return values, None
+    keys = [vertices, *(values + 0.0).T]
+    if values.shape[1] == 2:
+        starts = np.cumsum(sizes) - sizes
+        after = np.arange(1, len(vertices) + 1)
+        after[starts + sizes - 1] = starts
+        (u, v), (next_u, next_v) = values.T, values[after].T
+        keys.append(np.repeat(np.add.reduceat(u * next_v - v * next_u, starts) > 0, sizes))
+    order = np.lexsort(keys)
+    is_first = np.ones(len(order), dtype=bool)
+    is_first[1:] = np.any([key[order[1:]] != key[order[:-1]] for key in keys], axis=0)
+    indices = np.empty(len(order), dtype=np.int64)
+    indices[order] = np.cumsum(is_first) - 1
+    return values[order[is_first]], indices
 
 
 def reversed_order(sizes: IntArray) -> IntArray:

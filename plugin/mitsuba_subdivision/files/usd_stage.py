@@ -1,4 +1,8 @@
-"""Opening USD files, and choosing the meshes to read."""
+"""USD stages: opening files, values and transforms at a time, and choosing the meshes to read.
+
+Without a time, which the time code `EarliestTime` stands for, a value is the default, which does not depend on time, or
+else the first sample. USD itself takes the sample first, and takes the schema's fallback before it at the default time.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,26 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..cage.attributes import Interpolation
 from ..cage.errors import CageError, shortened, warn
-from .usd_values import FLAT_SCHEMES, HIDDEN_PURPOSES, SCHEMES, value_at
 
 if TYPE_CHECKING:
-    from pxr import Usd, UsdGeom
+    from pxr import Gf, Sdf, Usd, UsdGeom
 
+# Attributes of a mesh that are rules of a cage. Chaikin's rule has none.
+RULE_ATTRIBUTES = {
+    "boundary": "interpolateBoundary",
+    "triangle_rule": "triangleSubdivisionRule",
+    "face_varying": "faceVaryingLinearInterpolation",
+}
+# Values of subdivisionScheme, for surfaces that are smooth and for those that are not.
+SCHEMES = {"catmullClark": "catmull_clark", "loop": "loop"}
+FLAT_SCHEMES = ("none", "bilinear")
+INTERPOLATIONS: dict[str, Interpolation] = {"vertex": "vertex", "varying": "varying", "faceVarying": "face_varying"}
+# Primvars that are texture coordinates by their name; the first is written.
+TEXCOORDS = ("st", "UVMap", "texcoords")
+# Values of purpose for prims that renderers do not show.
+HIDDEN_PURPOSES = ("guide", "proxy")
 # Value of `prim` that selects every mesh in the file.
 ALL = "*"
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
@@ -21,16 +39,15 @@ _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
 # The function of the library that reports composition errors, which `open_stage` names.
 _REPORTS_COMPOSITION = "_ReportErrors"
-_OUT_OF_MEMORY = ("std::bad_alloc", "cannot create std::vector")
 
 
-def require_usd(name: str) -> None:
+def require_usd(name: str, use: str = "reads") -> None:
     """Raise CageError if the package usd-core is missing; the message begins with the name of a file."""
     try:
         import pxr  # noqa: F401 - only to find out whether it is missing
     except ImportError:
         raise CageError(
-            f'{name}: the package usd-core, which reads USD files, is missing; pip install "mitsuba-subdivision[files]"'
+            f'{name}: the package usd-core, which {use} USD files, is missing; pip install "mitsuba-subdivision[files]"'
         ) from None
 
 
@@ -51,16 +68,22 @@ def open_stage(
         if completed is not None:
             stage = completed(stage, name)
     except Tf.ErrorException as error:
-        raise CageError(f"{_where_and_why(error, path, name)}; expected a USD file (is it damaged?)") from None
+        reason = _commentary(error)
+        where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
+        if where:
+            # The parser names the rules of its grammar, which are in C++.
+            what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
+            name, reason = f"{name}, line {where[1]}", what
+        raise CageError(f"{name}: {_clear(reason)}; expected a USD file (is it damaged?)") from None
     _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
     return stage
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:
     """Warn of assets that a stage refers to and that could not be opened, in one line for each kind."""
-    documents = [found[1] for found in map(_MATERIALX.search, errors) if found]
+    documents = [match[1] for match in map(_MATERIALX.search, errors) if match]
     if documents:
-        files = _listed(sorted({Path(each).name for each in documents}), 3)
+        files = _listed(sorted({Path(document).name for document in documents}), 3)
         count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
         warn(
             f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "
@@ -113,13 +136,92 @@ def usd_messages_of(name: str) -> Iterator[None]:
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
-        found = delegate.TakeUncoalescedDiagnostics()
+        reports = delegate.TakeUncoalescedDiagnostics()
     finally:
         del delegate
-    texts = {_clear(each.commentary): None for each in found if not each.sourceFunction.endswith(_REPORTS_COMPOSITION)}
+    texts = [_clear(each.commentary) for each in reports if not each.sourceFunction.endswith(_REPORTS_COMPOSITION)]
     if texts:
-        more = f" (and {len(texts) - 1} other messages)" if len(texts) > 1 else ""
-        warn(f"{name}: the USD library reports: {next(iter(texts))}{more}")
+        count = len(set(texts)) - 1
+        more = f" (and {count} other messages)" if count else ""
+        warn(f"{name}: the USD library reports: {texts[0]}{more}")
+
+
+def _commentary(error: Exception) -> str:
+    """Text of the first error of the library, which is the most telling one."""
+    try:
+        return error.args[0].commentary.strip()[:_MOST_SEARCHED]
+    except UnicodeError:
+        return "there are bytes that are not UTF-8"
+
+
+def _clear(reason: str) -> str:
+    """A short reason, without terms of C++ and without the path, which the message names already."""
+    if "std::bad_alloc" in reason or "cannot create std::vector" in reason:
+        return "a number in the file asks for more memory than there is"
+    what = re.sub(", while reading @[^@]*@$", "", reason.removeprefix("Encountered: "))
+    return shortened(" ".join(what.split()), _MOST_SHOWN)
+
+
+def time_of(attribute: Usd.Attribute, time: Usd.TimeCode) -> Usd.TimeCode:
+    """Time code at which an attribute is read."""
+    from pxr import Usd
+
+    if not time.IsEarliestTime():
+        return time
+    default = Usd.TimeCode.Default()
+    if not attribute.HasAuthoredValue():
+        return default
+    return default if attribute.GetResolveInfo(default).GetSource() == Usd.ResolveInfoSourceDefault else time
+
+
+def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
+    """Value of an attribute; None if there is no such attribute."""
+    return attribute.Get(time_of(attribute, time)) if attribute else None
+
+
+def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
+    """Raise TypeError unless values of a prim's attributes have the types of its schema; USD reads others as none."""
+    for attribute in prim.GetAuthoredAttributes():
+        value, declared = value_at(attribute, time), attribute.GetTypeName().defaultValue
+        are_numbers = isinstance(value, (int, float)) and isinstance(declared, (int, float))
+        if value is not None and declared is not None and not are_numbers and not isinstance(value, type(declared)):
+            kind, expected = type(value).__name__, type(declared).__name__
+            raise TypeError(f"{attribute.GetName()} is of the type {kind}; expected {expected}")
+
+
+def local_to_world(
+    prim: Usd.Prim,
+    # Time code at which an attribute is read. Operations may have different ones.
+    time_of: Callable[[Usd.Attribute], Usd.TimeCode],
+    # Transforms by path, to which those of the prim and the prims above are added
+    known: dict[str, Gf.Matrix4d] | None = None,
+) -> Gf.Matrix4d:
+    """Transform of a prim to world space, for row vectors."""
+    from pxr import Gf, UsdGeom
+
+    path, known = str(prim.GetPath()), {} if known is None else known
+    if path not in known:
+        matrix, resets = Gf.Matrix4d(1), prim.IsPseudoRoot()
+        here = UsdGeom.Xformable(prim)
+        if here:
+            # Times of samples are not asked for: with timeCodesPerSecond = 0, USD looks for them for ever.
+            for operation in reversed(here.GetOrderedXformOps()):
+                matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
+            resets = here.GetResetXformStack()
+        known[path] = matrix if resets else matrix * local_to_world(prim.GetParent(), time_of, known)
+    return known[path]
+
+
+def token(name: str) -> str:
+    """USD's name of a rule: ``edgeAndCorner`` for ``edge_and_corner``."""
+    return re.sub("_(.)", lambda match: match[1].upper(), name)
+
+
+def is_possible(name: str) -> bool:
+    """Whether a primvar can have this name."""
+    from pxr import Sdf
+
+    return Sdf.Path.IsValidNamespacedIdentifier(name)
 
 
 def chosen_meshes(
@@ -143,74 +245,46 @@ def chosen_meshes(
     meshes = {prim.GetPath(): UsdGeom.Mesh(prim) for prim in prims if prim.IsA(UsdGeom.Mesh)}
     if not meshes:
         raise CageError(f"{name}: there are no meshes; expected a prim of the type Mesh")
-    if path is None or path == ALL:
-        below = list(meshes)
-    else:
+    below = list(meshes)
+    if path not in (None, ALL):
         if not Sdf.Path.IsValidPathString(path):
             raise CageError(f'{name}: prim "{path}" is no path; expected one such as {_listed(meshes)}')
         wanted = Sdf.Path(path)
-        below = [wanted] if wanted in meshes else [found for found in meshes if found.HasPrefix(wanted)]
+        below = [wanted] if wanted in meshes else [mesh for mesh in meshes if mesh.HasPrefix(wanted)]
     if not below:
-        found = stage.GetPrimAtPath(path)
-        what = f'is a prim of the type "{found.GetTypeName()}" without meshes' if found else "is not in the file"
+        prim = stage.GetPrimAtPath(path)
+        what = f'is a prim of the type "{prim.GetTypeName()}" without meshes' if prim else "is not in the file"
         raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
+
+    def without(paths: list[Sdf.Path], is_skipped: Callable[[UsdGeom.Mesh], bool], why: str) -> list[Sdf.Path]:
+        """The meshes that are not skipped, with a warning about the others; all if all would be skipped."""
+        skipped = {mesh for mesh in paths if is_skipped(meshes[mesh])}
+        if not skipped or len(skipped) == len(paths):
+            return paths
+        warn(f"{name}: meshes {_listed(mesh for mesh in paths if mesh in skipped)} left out, as {why}")
+        return [mesh for mesh in paths if mesh not in skipped]
+
     if path == ALL:
-        hidden = {each for each in below if not _is_shown(meshes[each], time)}
-        below = _without(below, hidden, "as they are invisible, guides or proxies; expected meshes to be seen", name)
+        why = "they are invisible, guides or proxies; expected meshes to be seen"
+        below = without(below, lambda mesh: not _is_shown(mesh, time), why)
     if scheme is None:
-        flat = {each for each in below if str(value_at(meshes[each].GetSubdivisionSchemeAttr(), time)) in FLAT_SCHEMES}
-        given, expected = " or ".join(FLAT_SCHEMES), " or ".join(SCHEMES)
-        why = f"as their subdivisionScheme is {given}; expected {expected}, or a scheme given"
-        below = _without(below, flat, why, name)
+        flat, smooth = " or ".join(FLAT_SCHEMES), " or ".join(SCHEMES)
+        why = f"their subdivisionScheme is {flat}; expected {smooth}, or a scheme given"
+        below = without(below, lambda mesh: str(value_at(mesh.GetSubdivisionSchemeAttr(), time)) in FLAT_SCHEMES, why)
     if len(below) > 1 and path != ALL:
         where = f" below {path}" if path else ""
         raise CageError(
             f'{name}: there are {len(below)} meshes{where}; expected prim to name one of {_listed(below)}, or "{ALL}" '
             "for all"
         )
-    return [meshes[each] for each in below]
+    return [meshes[mesh] for mesh in below]
 
 
 def _is_shown(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> bool:
     return mesh.ComputeVisibility(time) != "invisible" and mesh.ComputePurpose() not in HIDDEN_PURPOSES
 
 
-def _without(paths: list[Any], skipped: set[Any], why: str, name: str) -> list[Any]:
-    """The paths of meshes that are not skipped, with a warning about the others; all paths if all would be skipped."""
-    if not skipped or len(skipped) == len(paths):
-        return paths
-    warn(f"{name}: meshes {_listed(path for path in paths if path in skipped)} left out, {why}")
-    return [path for path in paths if path not in skipped]
-
-
 def _listed(paths: Iterable[Any], shown: int = 20) -> str:
     names = [str(path) for path in paths]
     listed = shortened(", ".join(names[:shown]), _MOST_SHOWN)
     return listed + (f" and {len(names) - shown} more" if len(names) > shown else "")
-
-
-def _where_and_why(error: Exception, path: str | Path, name: str) -> str:
-    """Beginning of a message: where in a file, and why, the USD library failed."""
-    reason = _commentary(error)
-    where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
-    if not where:
-        return f"{name}: {_clear(reason)}"
-    # The parser names the rules of its grammar, which are in C++.
-    what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
-    return f"{name}, line {where[1]}: {_clear(what)}"
-
-
-def _commentary(error: Exception) -> str:
-    """Text of the first error of the library, which is the most telling one."""
-    try:
-        return error.args[0].commentary.strip()[:_MOST_SEARCHED]
-    except UnicodeError:
-        return "there are bytes that are not UTF-8"
-
-
-def _clear(reason: str) -> str:
-    """A short reason, without terms of C++ and without the path, which the message names already."""
-    if any(words in reason for words in _OUT_OF_MEMORY):
-        return "a number in the file asks for more memory than there is"
-    what = re.sub(", while reading @[^@]*@$", "", reason.removeprefix("Encountered: "))
-    return shortened(" ".join(what.split()), _MOST_SHOWN)

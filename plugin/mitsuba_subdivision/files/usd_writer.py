@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from ..cage.attributes import Attribute
 from ..cage.contents import CageContents
-from ..cage.errors import CageError
 from ..cage.rules import RULES
 from ..whole_file import whole_file
 from .formats import warn_of_losses
-from .usd_values import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, token
+from .usd_stage import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, require_usd, token
 
 if TYPE_CHECKING:
     from pxr import UsdGeom
@@ -32,7 +31,7 @@ def write_usd(contents: CageContents, path: str | Path) -> None:
     names cannot be names of primvars.
     """
     with _new_mesh(path, "cage", contents.positions, contents.face_sizes, contents.face_vertices) as mesh:
-        attributes = {name: each for name, each in contents.attributes.items() if is_possible(name)}
+        attributes = {name: values for name, values in contents.attributes.items() if is_possible(name)}
         warn_of_losses(
             path,
             {
@@ -84,13 +83,9 @@ def _new_mesh(
     path: str | Path, name: str, points: NDArray, sizes: NDArray, vertices: NDArray
 ) -> Iterator[UsdGeom.Mesh]:
     """The only mesh of a new file, which is written when the ``with`` block ends, whole or not at all."""
-    try:
-        from pxr import Tf, Usd, UsdGeom
-    except ImportError:
-        raise CageError(
-            f'"{path}": the package usd-core, which writes USD files, is missing; '
-            'pip install "mitsuba-subdivision[files]"'
-        ) from None
+    require_usd(f'"{path}"', "writes")
+    from pxr import Tf, Usd, UsdGeom
+
     with whole_file(Path(path)) as beside:
         try:
             stage = Usd.Stage.CreateNew(str(beside))
@@ -103,7 +98,7 @@ def _new_mesh(
             yield mesh
             stage.Save()
         except Tf.ErrorException as error:
-            reason = "; ".join(found.commentary.strip() for found in error.args)
+            reason = "; ".join(part.commentary.strip() for part in error.args)
             raise OSError(f'"{path}": {reason}') from None
 
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.ply_writer import write_polygons
+from ..files.ply import write_polygons
 from ..mesh.connectivity import IntArray
 from ..mitsuba_mesh import mitsuba_mesh
 from ..variants import SceneNode

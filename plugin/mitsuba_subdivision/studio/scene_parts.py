@@ -17,7 +17,7 @@ import numpy as np
 from ..cage import CageError, CageWarning, ControlCage
 from ..cage.contents import CageContents
 from ..cage.rules import RULES
-from ..files import ply_reader, usd_values
+from ..files import ply, usd_stage
 from ..files.formats import write_file
 from ..shapes.parameters import is_attribute_parameter, read_attributes
 from ..variants import SceneNode
@@ -126,7 +126,7 @@ def _suffix_for(name: str, contents: CageContents) -> str:
         return ".obj"
     has_tags = any(len(tags) for tags in (contents.creases, contents.corners, contents.holes))
     is_plain = not has_tags and all(each.interpolation == "vertex" for each in data.values())
-    if is_plain and all(map(ply_reader.is_possible, contents.attributes)) and importlib.util.find_spec("plyfile"):
+    if is_plain and all(map(ply.is_possible, contents.attributes)) and importlib.util.find_spec("plyfile"):
         return ".ply"
     first = next(iter(data))
     if not importlib.util.find_spec("pxr"):
@@ -135,10 +135,10 @@ def _suffix_for(name: str, contents: CageContents) -> str:
             'it as USD: pip install "mitsuba-subdivision[files]"'
         )
     for key in contents.attributes:
-        if not usd_values.is_possible(key) or key in usd_values.TEXCOORDS:
+        if not usd_stage.is_possible(key) or key in usd_stage.TEXCOORDS:
             raise CageError(
                 f'attribute "{key}" of "{name}" cannot be written to a file; expected a name of letters, digits and '
-                f'"_" other than {", ".join(usd_values.TEXCOORDS)}'
+                f'"_" other than {", ".join(usd_stage.TEXCOORDS)}'
             )
     return ".usda"
 

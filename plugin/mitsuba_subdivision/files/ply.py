@@ -1,0 +1,358 @@
+"""Reader of PLY control cages, through the package plyfile, and writers of binary PLY files."""
+
+from __future__ import annotations
+
+import io
+import re
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cage.attributes import Attribute
+from ..cage.contents import CageContents
+from ..cage.errors import CageError, CageSource, shortened, warn
+from ..cage.rules import RULES
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray
+from ..whole_file import whole_file
+from .formats import warn_of_losses
+
+if TYPE_CHECKING:
+    from plyfile import PlyElement
+
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+_POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+# Colours and their opacity; of several in a file, the first in this order is read.
+_COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"))
+# Pairs for texture coordinates; of several pairs in a file, the first in this order is read, and the first is written.
+_TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
+# Properties of faces for their material, of common files and of MeshLab; the first one in a file is read.
+_MATERIAL = ("material_index", "material_id", "texnumber")
+_RESERVED = {*_POSITION, *_NORMAL, *chain(*_COLORS, *_TEXCOORDS)} - {"alpha"}
+_NUMBER = "0|[1-9][0-9]{0,8}"
+# Endings of three columns of one attribute, and what follows the attribute's name.
+_LETTERS = {"xyz": "", "rgb": "_color"}
+_TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}
+
+
+def read_ply(path: str | Path) -> CageContents:
+    """Read polygons and data at vertices of a PLY file, ASCII or binary.
+
+    The list ``vertex_indices`` or ``vertex_index`` of the element ``face`` gives the polygons. The properties of the
+    element ``vertex`` are read as follows:
+
+    - ``x``, ``y`` and ``z`` are the position.
+    - ``s`` and ``t``, or ``u`` and ``v``, or ``texture_u`` and ``texture_v`` are texture coordinates.
+    - ``red``, ``green`` and ``blue``, or ``r``, ``g`` and ``b``, are the attribute "color", and ``alpha`` or ``a``
+      beside them the attribute "alpha"; unsigned integers are scaled to 0 to 1.
+    - ``nx``, ``ny`` and ``nz`` are dropped, as the normals of the surface follow from its points.
+    - ``name_0``, ``name_1`` and so on, from 0 or from 1, and ``name_x``, ``name_y`` and ``name_z`` are one attribute
+      "name"; ``name_r``, ``name_g`` and ``name_b`` are "name_color".
+    - Any other number is an attribute of its own.
+
+    Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
+    or "" for negative numbers.
+
+    Raises CageError if the package plyfile is missing, or the file is malformed. The cage itself is not validated.
+    Raises OSError if the file cannot be read. Warns if faces have other data, or vertices have lists, which are not
+    read.
+    """
+    name, content = f'"{path}"', Path(path).read_bytes()
+    header = content[: max(0, content.find(b"end_header"))]
+    binary = re.search(rb"[\r\n]format\s+binary", header) is not None
+    lines: dict[str, IntArray] = {}
+    first = 2 + len(header.splitlines())
+    for word, digits in re.findall(rb"[\r\n]element\s+(\S+)\s+(\d+)", header):
+        # Plyfile makes an array of as many rows as the header announces.
+        if len(digits) > 18 or int(digits) > len(content):
+            rows = shortened(f"{digits.decode()} rows of {word.decode('ascii', 'replace')}", 200)
+            raise CageError(f"{name}: {rows} do not fit into the file; expected fewer")
+        if not binary:
+            # A row is a line.
+            lines[word.decode("ascii", "replace")] = first + np.arange(int(digits))
+            first += int(digits)
+    # When the cage is validated, numbers that are not finite become errors that name their place.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _contents(_elements(content, name, lines, binary), name, lines)
+
+
+def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: bool) -> dict[str, PlyElement]:
+    try:
+        from plyfile import PlyData
+    except ImportError:
+        raise CageError(
+            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[files]"'
+        ) from None
+    with warnings.catch_warnings():
+        # For elements without rows NumPy warns, and plyfile then raises an error.
+        warnings.simplefilter("ignore", UserWarning)
+        # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
+        warnings.simplefilter("error", DeprecationWarning)
+        # Plyfile maps lists of one known length, and reads all others row by row, in a hundred times as long. It maps
+        # a file of our own, as the process would end if another program cut a mapped file.
+        if binary:
+            with suppress(OSError), tempfile.TemporaryFile() as file:
+                file.write(content)
+                for corners in (3, 4):
+                    lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
+                    with suppress(Exception):
+                        file.seek(0)
+                        return {element.name: element for element in PlyData.read(file, known_list_len=lengths)}
+        try:
+            return {element.name: element for element in PlyData.read(io.BytesIO(content), mmap=False)}
+        except UnicodeDecodeError:
+            raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
+        # Damaged files make plyfile raise errors of its own, of Python and of NumPy.
+        except Exception as error:
+            cut = " (is the file cut short?)" if "early end" in str(error) else ""
+            row, element, line = (getattr(error, attribute, None) for attribute in ("row", "element", "line"))
+            if element is not None and row is not None and element.name in lines:
+                line = lines[element.name][min(row, len(lines[element.name]) - 1)]
+            where = name if line is None else f"{name}, line {line}"
+            what = re.sub(r"^line \d+: ", "", str(error))
+            raise CageError(f"{where}: {shortened(what, 200)}{cut}; expected a PLY file") from None
+
+
+def _contents(elements: dict[str, PlyElement], name: str, lines: dict[str, IntArray]) -> CageContents:
+    for wanted in ("vertex", "face"):
+        if wanted not in elements or not len(elements[wanted].data):
+            found = _listed([f"{element.name} ({len(element.data)})" for element in elements.values()]) or "none"
+            raise CageError(f'{name}: there is no element "{wanted}" with rows; the file has {found}')
+    vertex, face = elements["vertex"], elements["face"]
+    numbers, lists = _properties(vertex)
+    for axis in _POSITION:
+        if axis not in numbers:
+            there = _listed(numbers)
+            raise CageError(f'{name}: the element "vertex" has no property "{axis}"; expected x, y, z among {there}')
+    of_faces, lists_of_faces = _properties(face)
+    polygons = next((known for known in _FACE_LISTS if known in lists_of_faces), None)
+    if polygons is None:
+        raise CageError(
+            f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; expected one, a list of '
+            f"integers, among {_listed([*of_faces, *lists_of_faces])}"
+        )
+    owner = next((known for known in _MATERIAL if known in of_faces and face.data[known].dtype.kind in "iu"), None)
+    left_out = [f'"{other}" of faces' for other in face.data.dtype.names if other not in (polygons, owner)]
+    left_out += [f'the list "{other}" of vertices' for other in lists]
+    if left_out:
+        warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
+    # Each face is a row of a table or an array of its own.
+    table = face.data[polygons]
+    sizes = np.full(len(table), table.shape[1]) if table.ndim == 2 else np.array([len(row) for row in table])
+    vertices = table.astype(table.dtype.newbyteorder("=")).ravel() if table.ndim == 2 else np.concatenate(list(table))
+    if vertices.dtype.kind not in "iu":
+        raise CageError(f"{name}: the vertex indices of faces have type {vertices.dtype}; expected integers")
+    texcoords, attributes = _vertex_data(vertex.data, numbers)
+    return CageContents(
+        _columns(vertex.data, _POSITION),
+        sizes,
+        vertices,
+        texcoords=texcoords,
+        attributes=attributes,
+        materials={} if owner is None else _materials(face.data[owner]),
+        source=CageSource(name, 0, lines.get("vertex"), lines.get("face")),
+    )
+
+
+def _properties(element: PlyElement) -> tuple[list[str], list[str]]:
+    """Names of an element's properties that are numbers, and of those that are lists."""
+    lists = [known.name for known in element.properties if hasattr(known, "len_dtype")]
+    return [known.name for known in element.properties if known.name not in lists], lists
+
+
+def _listed(names: Sequence[str]) -> str:
+    return shortened(", ".join(names), 200)
+
+
+def _materials(numbers: NDArray) -> dict[str, IntArray]:
+    """Faces of each material, by its name."""
+    numbers = np.maximum(np.asarray(numbers).astype(np.int64), -1)
+    distinct, counts = np.unique(numbers, return_counts=True)
+    faces = np.split(np.argsort(numbers, kind="stable"), np.cumsum(counts)[:-1])
+    names = ["" if number < 0 else f"material_{number}" for number in distinct.tolist()]
+    return dict(zip(names, faces, strict=True))
+
+
+def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | None, dict[str, Attribute]]:
+    """Texture coordinates and attributes, which are among the properties that are numbers."""
+    names = [name for name in numbers if name not in (*_POSITION, *_NORMAL)]
+    pair = next((pair for pair in _TEXCOORDS if set(pair) <= set(names)), ())
+    names = [name for name in names if name not in pair]
+    color = _color_of(names)
+    attributes = {}
+    for name, columns in grouped(names).items():
+        is_color = {*columns} <= {*color} or name.endswith("_color")
+        attributes[name] = Attribute(_columns(data, columns, scaled=is_color))
+    return Attribute(_columns(data, pair)) if pair else None, attributes
+
+
+def _columns(data: NDArray, names: Sequence[str], scaled: bool = False) -> NDArray[np.float64]:
+    """Table of some properties as float64; if ``scaled``, the range of unsigned integers becomes 0 to 1."""
+    columns = []
+    for name in names:
+        column = data[name]
+        highest = np.iinfo(column.dtype).max if scaled and column.dtype.kind == "u" else 1
+        columns.append(column.astype(np.float64) / highest)
+    return np.stack(columns, axis=1)
+
+
+def _color_of(names: Sequence[str]) -> tuple[str, ...]:
+    """Properties of a colour: three, or four with its opacity; none if one is missing."""
+    color = next((color for color in _COLORS if {*color[:3]} <= {*names}), ())
+    return tuple(name for name in color if name in names)
+
+
+def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Properties of each attribute, by the attribute's name, as Mitsuba's ``ply`` names them; see `read_ply`.
+
+    Numbered columns are one attribute if their numbers are complete. An attribute of one column may end like the first
+    of several.
+    """
+    color = _color_of(names)
+    possible = {"color": color[:3]} if color else {}
+    if color[3:]:
+        possible["alpha"] = color[3:]
+    stems: dict[str, dict[str, str]] = {}
+    for name in names:
+        stem, _, ending = name.rpartition("_")
+        if stem:
+            stems.setdefault(stem, {})[ending] = name
+    for stem, members in stems.items():
+        numbers = sorted(int(ending) for ending in members if re.fullmatch(_NUMBER, ending))
+        if numbers and numbers in ([*range(len(numbers))], [*range(1, len(numbers) + 1)]):
+            possible.setdefault(stem, tuple(members[str(number)] for number in numbers))
+        for letters, ending in _LETTERS.items():
+            letter_count = sum(letter in members for letter in letters)
+            if letters[0] in members and letter_count in (1, 3):
+                possible.setdefault(f"{stem}{ending}", tuple(members[letter] for letter in letters[:letter_count]))
+    # A property that is itself called ``name`` keeps the name to itself.
+    chosen = {name: columns for name, columns in possible.items() if name in columns or name not in names}
+    owner = {column: name for name, columns in chosen.items() for column in columns}
+    return {owner.get(name, name): chosen.get(owner.get(name, name), (name,)) for name in names}
+
+
+def write_ply(contents: CageContents, path: str | Path) -> None:
+    """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
+
+    Raises OSError if the file cannot be written. Warns if the cage has more than PLY files can hold: creases, corners,
+    holes, rules other than the default, a scheme, data that is varying or face-varying, attributes whose names cannot
+    be names of properties, several materials of one face, or names of materials other than "material_0" and so on.
+    """
+    texcoords = contents.texcoords
+    if texcoords is not None and texcoords.interpolation != "vertex":
+        texcoords = None
+    attributes = {
+        name: attribute.values
+        for name, attribute in contents.attributes.items()
+        if attribute.interpolation == "vertex" and is_possible(name)
+    }
+    # Numbers of materials, as names of files that were read have them; None if a name has none.
+    matches = {name: re.fullmatch(f"material_({_NUMBER})", name) for name in contents.materials}
+    numbers = {name: int(match[1]) if match else None if name else -1 for name, match in matches.items()}
+    owner = contents.material_of_face
+    warn_of_losses(
+        path,
+        {
+            "creases": bool(len(contents.creases)),
+            "corners": bool(len(contents.corners)),
+            "holes": bool(len(contents.holes)),
+            **{rule: contents.rules.get(rule, values[0]) != values[0] for rule, values in RULES.items()},
+            "scheme": contents.scheme is not None,
+            **{f'the name of material "{name}"': number is None for name, number in numbers.items()},
+            "further materials of a face": sum(map(len, contents.materials.values())) > (owner >= 0).sum(),
+            "texcoords": contents.texcoords is not texcoords,
+            **{f'attribute "{name}"': name not in attributes for name in contents.attributes},
+        },
+    )
+    properties = dict(zip(_POSITION, contents.positions.T, strict=True))
+    if texcoords is not None:
+        properties.update(zip(_TEXCOORDS[0], texcoords.values.T, strict=True))
+    materials = None
+    if numbers:
+        free = (number for number in count() if number not in numbers.values())
+        # The last one is of faces without a material, whose index is -1.
+        table = [next(free) if number is None else number for number in numbers.values()]
+        materials = np.array([*table, -1])[owner]
+    properties |= _columns_of(attributes)
+    write_polygons(path, properties, contents.face_sizes, contents.face_vertices, materials)
+
+
+def write_ply_triangles(
+    path: str | Path,
+    positions: NDArray,
+    normals: NDArray,
+    triangles: NDArray,
+    texcoords: NDArray | None,
+    attributes: Mapping[str, NDArray],
+) -> None:
+    """Write triangles to a PLY file in single precision; see `formats.write_triangles`."""
+    possible = {name: value for name, value in attributes.items() if is_possible(name)}
+    warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
+    properties = dict(zip((*_POSITION, *_NORMAL), [*positions.T, *normals.T], strict=True))
+    if texcoords is not None:
+        properties.update(zip(_TEXCOORDS[0], texcoords.T, strict=True))
+    properties = {name: values.astype(np.float32) for name, values in {**properties, **_columns_of(possible)}.items()}
+    write_polygons(path, properties, np.full(len(triangles), 3), triangles.ravel())
+
+
+def is_possible(name: str) -> bool:
+    """Whether an attribute can be written so that it is read back as it was."""
+    return bool(re.fullmatch(r"[!-~]+", name))
+
+
+def _columns_of(attributes: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Columns of attributes ``(n, k)``, by the names of their properties."""
+    columns: dict[str, NDArray] = {}
+    for name, values in attributes.items():
+        width, names = values.shape[1], [name]
+        if name == "color" and width == 3:
+            names = [*_COLORS[0][:3]]
+        elif width > 1 or name in _RESERVED or re.search(f"_({_NUMBER}|[xyzrgb])$", name):
+            names = [f"{name}_{i}" for i in range(width)]
+        columns.update(zip(names, np.asarray(values).T, strict=True))
+    return columns
+
+
+def write_polygons(
+    path: str | Path,
+    properties: Mapping[str, NDArray],  # dict of str to (n,) float32 or float64 array: properties of vertices by name
+    face_sizes: NDArray,  # (n_f,) int
+    face_vertices: NDArray,  # (sum of face_sizes,) int: 0-based
+    materials: NDArray | None = None,  # (n_f,) int: number of each face's material; negative for none
+) -> None:
+    """Write polygons to a binary PLY file, whole or not at all. Raises OSError if the file cannot be written."""
+    types = {name: values.dtype.newbyteorder("<") for name, values in properties.items()}
+    vertices = np.empty(len(next(iter(properties.values()))), dtype=list(types.items()))
+    for name, values in properties.items():
+        vertices[name] = values
+    size_type = np.dtype("u1" if face_sizes.max() < 256 else "<i4")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property {_TYPES[kind]} {name}" for name, kind in types.items()),
+        f"element face {len(face_sizes)}",
+        f"property list {_TYPES[size_type]} int vertex_indices",
+        *([] if materials is None else [f"property int {_MATERIAL[0]}"]),
+        "end_header\n",
+    ]
+    # Of each face its size, followed by its vertices and its material.
+    sizes, numbers = face_sizes.astype(size_type), face_vertices.astype("<i4")
+    if materials is not None:
+        numbers = np.insert(numbers, np.cumsum(face_sizes, dtype=np.int64), materials)
+    lengths = sizes.itemsize + numbers.itemsize * (face_sizes.astype(np.int64) + (materials is not None))
+    is_size = np.zeros(lengths.sum(), dtype=bool)
+    is_size[ragged.starts(lengths)[:, None] + np.arange(sizes.itemsize)] = True
+    faces = np.empty(len(is_size), dtype=np.uint8)
+    faces[is_size], faces[~is_size] = sizes.view(np.uint8), numbers.view(np.uint8)
+    with whole_file(Path(path)) as beside, beside.open("wb") as stream:
+        stream.write("\n".join(header).encode("ascii"))
+        stream.write(vertices.tobytes())
+        stream.write(faces.tobytes())
