@@ -4,6 +4,11 @@ import json
 import subprocess
 import sys
 from operator import attrgetter
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parents[1]))
+    import quick_kernels  # noqa: F401 - before drjit, as it chooses the LLVM library
 
 # Before Mitsuba, for an LLVM library that works.
 import mitsuba_subdivision as msub  # isort: skip
@@ -74,7 +79,7 @@ def wrong_parts(scheme, by):
         dr.eval(found)
         return found
 
-    ahead, behind = (fields(mi.Float(sign * STEP)) for sign in (1, -1))
+    ahead, behind = (fields(dr.opaque(mi.Float, sign * STEP)) for sign in (1, -1))
     step = mi.Float(0)
     dr.enable_grad(step)
     found = fields(step)
@@ -106,4 +111,5 @@ def test_every_field_follows_the_hit(scheme):
 
 if __name__ == "__main__":
     mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(1)
     print(json.dumps({by: wrong_parts(sys.argv[1], by) for by in BY[sys.argv[1]]}))  # noqa: T201
