@@ -31,3 +31,14 @@ def textured(**tags):
     return cube(
         texcoords=Attribute(np.vstack([np.add(islands, [face, 0]) for face in range(6)]), "face_varying"), **tags
     )
+
+
+def with_attributes(**tags):
+    """A cube with an attribute of every interpolation, and an island of texture coordinates on each face."""
+    rng = np.random.default_rng(0)
+    attributes = {
+        "colour": Attribute(rng.random((8, 3))),
+        "weight": Attribute(rng.random((8, 1)), "varying"),
+        "label": Attribute(rng.random((24, 1)), "face_varying", np.arange(24)[::-1]),
+    }
+    return cube(texcoords=ISLANDS, attributes=attributes, **tags)

@@ -11,51 +11,32 @@ from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from mitsuba_subdivision.shapes.cage_attributes import mesh_attributes
 from reference.refined_cages import tagged
-from shapes.cages import ISLANDS, cube, described, load, textured
-from shapes.scenes import SINGLE, WIDTHS, buffer, film, hit, perspective, vertices
+from shapes.cages import ISLANDS, cube, described, load, textured, with_attributes
+from shapes.scenes import SINGLE, buffer, down, film, hit, perspective, scene_with
 from shapes.updates import differentiated, update
-from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, mirrors, shadings
-
-
-def textured_cube(rng, **options):
-    attributes = {
-        "colour": Attribute(rng.random((8, 3))),
-        "weight": Attribute(rng.random((8, 1)), "varying"),
-        "label": Attribute(rng.random((24, 1)), "face_varying", np.arange(24)[::-1]),
-    }
-    return cube(texcoords=ISLANDS, attributes=attributes, **options)
+from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, shadings
 
 
 def make(cage, **parameters):
     return load(cage, **{"tessellation_rate": 4, **parameters})
 
 
-@mirrors
 @every_variant
-def test_buffers_are_the_tessellation(np_rng, mirror):
-    cage = textured_cube(np_rng)
-    shape = make(cage, to_world=mi.ScalarTransform4f().scale([mirror, 1, 1]))
-    expected = LimitSurface(cage).tessellate(4)
-    assert shape.vertex_count() == len(expected.positions)
-    positions, normals = vertices(shape)
-    np.testing.assert_allclose(positions, expected.positions * [mirror, 1, 1], atol=SINGLE)
-    np.testing.assert_allclose(normals, expected.normals * [mirror, 1, 1], atol=50 * SINGLE)
-    for name, values in {"texcoords": expected.texcoords, **expected.attributes}.items():
-        assert values.shape[1] == WIDTHS.get(f"vertex_{name}", 3)
-        np.testing.assert_allclose(buffer(shape, f"vertex_{name}"), values, atol=SINGLE)
+def test_properties_give_the_same_cage_to_every_evaluator_and_flat_faces(np_rng):
+    def assert_textured(cage, **parameters):
+        shape, expected = make(cage, **parameters), LimitSurface(cage).tessellate(4).texcoords
+        assert shape.vertex_count() == len(expected)
+        np.testing.assert_allclose(buffer(shape, "vertex_texcoords"), expected, atol=SINGLE)
 
-
-@every_variant
-def test_properties_give_the_same_cage(np_rng):
     for each in (ISLANDS, *(Attribute(np_rng.random((8, 2)), kind) for kind in ("vertex", "varying"))):
-        cage = cube(texcoords=each, face_varying="none")
-        expected = LimitSurface(cage).tessellate(4)
-        np.testing.assert_allclose(buffer(make(cage), "vertex_texcoords"), expected.texcoords, atol=SINGLE)
+        assert_textured(cube(texcoords=each, face_varying="none"))
+    assert_textured(with_attributes(), evaluator="stam", sample_offset=1e-3)
+    assert_textured(with_attributes(), face_normals=True)
 
 
 @every_variant
-def test_hits_follow_the_texture_coordinates(np_rng):
-    shape, step = make(textured_cube(np_rng), tessellation_rate=32), 0.05
+def test_hits_follow_the_texture_coordinates():
+    shape, step = make(with_attributes(), tessellation_rate=32), 0.05
     # The islands run along x and y on the top.
     si, beside = hit(shape), hit(shape, 0.1 + step)
     moved = np.array(beside.p - si.p).ravel()
@@ -67,9 +48,9 @@ def test_hits_follow_the_texture_coordinates(np_rng):
 
 
 @llvm
-def test_rendering_takes_the_same_kernels_wherever_arrays_lie(np_rng):
+def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
     """Texture coordinates are read in packets where they are aligned, and one by one where they are not."""
-    cage = textured_cube(np_rng)
+    cage = with_attributes()
     # Shapes that still live are part of kernels, too.
     gc.collect()
     found, kept = set(), []
@@ -87,8 +68,8 @@ def test_rendering_takes_the_same_kernels_wherever_arrays_lie(np_rng):
 
 
 @every_variant
-def test_values_stay_when_control_points_move(np_rng):
-    shape = make(textured_cube(np_rng))
+def test_values_stay_when_control_points_move():
+    shape = make(with_attributes())
     names = ("vertex_texcoords", "vertex_colour", "faces", "vertex_normals", "vertex_positions")
     before = [buffer(shape, name) for name in names]
     update(shape, control_points=mi.traverse(shape)["control_points"] * 2)
@@ -98,9 +79,9 @@ def test_values_stay_when_control_points_move(np_rng):
 
 
 @every_ad_variant
-def test_gradients_reach_the_control_points_across_seams(np_rng):
+def test_gradients_reach_the_control_points_across_seams():
     gradients = []
-    for cage in (textured_cube(np_rng), cube()):
+    for cage in (with_attributes(), cube()):
         parameters = mi.traverse(make(cage))
         points = differentiated(parameters, "control_points")
         # Triangles' corners are the same places with and without copies of vertices.
@@ -114,26 +95,16 @@ def test_gradients_reach_the_control_points_across_seams(np_rng):
 
 
 @every_variant
-def test_other_evaluators_and_flat_faces_have_texture_coordinates(np_rng):
-    cage = textured_cube(np_rng)
-    expected = LimitSurface(cage).tessellate(4).texcoords
-    for parameters in ({"evaluator": "stam", "sample_offset": 1e-3}, {"face_normals": True}):
-        shape = make(cage, **parameters)
-        assert shape.vertex_count() == len(expected)
-        np.testing.assert_allclose(buffer(shape, "vertex_texcoords"), expected, atol=SINGLE)
-
-
-@pytest.mark.parametrize(
-    ("name", "width", "message"),
-    [
-        ("pair", 2, 'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'),
-        ("normals", 3, 'attribute "normals" is left out; every Mitsuba mesh has "normals" already'),
-    ],
-)
-def test_attributes_that_mitsuba_cannot_evaluate_are_told_of(name, width, message):
-    cage = cube(attributes={"colour": cube().positions, name: np.ones((8, width))})
-    with pytest.warns(CageWarning, match=message):
-        assert mesh_attributes(cage) == {"colour": 3}
+def test_attributes_that_mitsuba_cannot_evaluate_are_told_of_and_no_parameters():
+    pair = 'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'
+    normals = 'attribute "normals" is left out; every Mitsuba mesh has "normals" already'
+    for name, width, message in (("normals", 3, normals), ("pair", 2, pair)):
+        cage = cube(attributes={"colour": cube().positions, name: np.ones((8, width))})
+        with pytest.warns(CageWarning, match=message):
+            assert mesh_attributes(cage) == {"colour": 3}
+    with pytest.warns(CageWarning, match=pair):
+        shown = mi.traverse(load(cage)).keys()
+    assert {key for key in shown if key.startswith("cage_")} == {"cage_colour"}
 
 
 @every_variant
@@ -159,21 +130,6 @@ def test_a_texture_is_seen():
     assert 0.3 < is_white.mean() < 0.7
 
 
-# The square that both faces cover, with its corners; values linear in x and y, which subdivision keeps.
-SQUARE = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-{properties}
-element face 2
-property list uchar int vertex_indices
-end_header
-{rows}
-3 0 1 2
-3 0 2 3
-"""
 OF_MITSUBA = {
     "color": ["r", "g", "b"],
     "k_color": ["k_r", "k_g", "k_b"],
@@ -189,14 +145,16 @@ SPECTRUM = 1e-5
 
 @pytest.fixture
 def square(tmp_path):
-    """The path of the file of a square."""
+    """The path of a file: two faces cover a square with its corners; values are linear in x and y, which stays so."""
+    names = ["x", "y", "z", *(name for columns in OF_MITSUBA.values() for name in columns)]
+    header = ["ply", "format ascii 1.0", "element vertex 4", *(f"property float {name}" for name in names)]
+    header += ["element face 2", "property list uchar int vertex_indices", "end_header"]
     rows = []
     for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
         linear = [0.5 + 0.25 * x, 0.5 - 0.1 * y, 0.3 + 0.1 * (x + y)]
         rows.append([x, y, 0, 0.2, 0.5, 0.1, 0.3, 0.3, 0.3, *linear, *linear, linear[2]])
-    properties = "\n".join(f"property float {name}" for columns in OF_MITSUBA.values() for name in columns)
     path = tmp_path / "square.ply"
-    path.write_text(SQUARE.format(properties=properties, rows="\n".join(" ".join(map(str, row)) for row in rows)))
+    path.write_text("\n".join([*header, *(" ".join(map(str, row)) for row in rows), "3 0 1 2", "3 0 2 3", ""]))
     return str(path)
 
 
@@ -211,7 +169,7 @@ def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
     wavelengths = [450, 500, 550, 600] if mi.is_spectral else []
     found = []
     for shape in (ours, own):
-        scene = mi.load_dict({"type": "scene", "shape": shape})
+        scene = scene_with(shape=shape)
         si = scene.ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, wavelengths))
         values = {}
         for name, columns in OF_MITSUBA.items():
@@ -238,7 +196,7 @@ def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
 def test_spectra_have_derivatives_by_colours(square, shading):
     """Of one constant colour, against differences."""
     shape = square_shape(square, shading)
-    scene = mi.load_dict({"type": "scene", "shape": shape})
+    scene = scene_with(shape=shape)
 
     def spectrum(color):
         update(shape, cage_color=dr.ravel(mi.Color3f(color) + dr.zeros(mi.Color3f, 4)))
@@ -277,7 +235,7 @@ def test_meshes_of_polygons_have_spectra_as_well(name, count):
 @pytest.mark.usefixtures("variant_llvm_ad_spectral", "no_other_scene")
 def test_frozen_functions_look_up_spectra(square):
     shape = {"type": "subdivision", "filename": square, "shading": "exact"}
-    scene = mi.load_dict({"type": "scene", "shape": shape})
+    scene = scene_with(shape=shape)
     parameters = mi.traverse(scene)
 
     def spectrum(scene, x):
@@ -307,8 +265,8 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
         radiance = {"data": upload(mi.TensorXf, texels), "raw": True} if kind == "bitmap" else {}
         emitter = {"type": "area", "radiance": {"type": kind, **radiance}}
         shape = make(cage, shading=shading, emitter=emitter, **displacement)
-        scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "shape": shape, **seen})
-        si = scene.ray_intersect(mi.Ray3f([1.9, 0.3, 4], [0, 0, -1]))
+        scene = scene_with(integrator={"type": "path"}, shape=shape, **seen)
+        si = scene.ray_intersect(down(1.9, 0.3, 4))
         drawn = (scene.sample_emitter_direction(si, mi.Point2f(*xy), False)[0] for xy in ([0.2, 0.7], [0.9, 0.4]))
         points.append([np.array(each.p).ravel() for each in drawn])
         means.append(np.array(mi.render(scene, spp=256)).mean())

@@ -5,12 +5,12 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface, upload
+from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
 from reference.refined_cages import refine_first, tagged
 from shapes.cages import MIXED_FACES, cube, load
-from shapes.scenes import SINGLE, buffer, perspective
+from shapes.scenes import SINGLE, buffer, down, perspective, rays, scene_with
 from shapes.updates import MODES, assign_cage, derivative, differentiated, update
 from shapes.variants import every_ad_variant, every_array_variant, every_variant, exact, llvm, shadings
 
@@ -81,22 +81,6 @@ def assert_alike(shape, expected):
         np.testing.assert_allclose(buffer(shape, name), buffer(expected, name), rtol=0, atol=SINGLE, err_msg=name)
 
 
-# What follows
-
-
-@every_variant
-def test_equal_values_share_their_memory_until_those_of_one_shape_change():
-    first, second = (mi.traverse(make(creased())) for _ in range(2))
-    for name in NAMES:
-        one, other = first[f"cage_{name}"], second[f"cage_{name}"]
-        assert not dr.is_jit_v(one) or one.index == other.index
-    before = np.array(second["cage_texcoords"])
-    dr.scatter(first["cage_texcoords"], 7.0, dr.uint32_array_t(type(first["cage_texcoords"]))(0))
-    first.update()
-    assert np.array(first["cage_texcoords"])[0] == 7
-    np.testing.assert_array_equal(np.array(second["cage_texcoords"]), before)
-
-
 @shadings
 @llvm
 @pytest.mark.parametrize("interpolation", ["vertex", "varying"])
@@ -106,11 +90,11 @@ def test_a_frozen_function_sees_new_values(shading, interpolation, by):
     rng = np.random.default_rng(0)
     texcoords, heat = (Attribute(rng.random((8, size)), kind) for size, kind in ((2, "vertex"), (1, interpolation)))
     shape = load(cube(texcoords=texcoords, attributes={"heat": heat}), shading=shading)
-    scene = mi.load_dict({"type": "scene", "shape": shape})
+    scene = scene_with(shape=shape)
     parameters, x = mi.traverse(shape), upload(mi.Float, np.linspace(-0.4, 0.4, 9, dtype=np.float32))
 
     def seen(scene, x):
-        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.1, 5), mi.Vector3f(0, 0, -1)))
+        si = scene.ray_intersect(down(x, 0.1))
         return si.uv.x if by == "texcoords" else si.shape.eval_attribute_1("vertex_heat", si)
 
     frozen, before = dr.freeze(seen), None
@@ -142,23 +126,14 @@ def test_values_are_shown_as_they_were_given_and_an_update_of_them_equals_a_new_
 
 def hits(shape):
     """What is asked of the surface at some hits: texture coordinates, their directions, attributes."""
-    scene, found = mi.load_dict({"type": "scene", "shape": shape}), []
-    places, is_jit = np.array([(0.05, 0.11), (0.31, -0.2), (-0.17, 0.27)], dtype=np.float32), dr.is_jit_v(mi.Float)
-    origins = np.insert(places, 2, 5, axis=1)
-    origins = [upload(mi.Point3f, origins)] if is_jit else origins.tolist()
-    for origin in origins:
-        si = scene.ray_intersect(mi.Ray3f(origin, [0, 0, -1]))
-        each = [si.uv.x, si.uv.y, *si.dp_du, *si.dp_dv]
-        if is_jit:
-            # In scalar variants they are interpolated between vertices.
-            each += [*shape.eval_attribute_3("vertex_colour", si), shape.eval_attribute_1("vertex_weight", si)]
-            each.append(shape.eval_attribute_1("vertex_label", si))
-        valid = si.is_valid()
-        # In one kernel.
-        dr.eval(valid, each)
-        assert dr.all(valid)
-        found += each
-    return np.array([np.array(each).ravel() for each in found])
+    si = scene_with(shape=shape).ray_intersect(down([0.05, 0.31, -0.17], [0.11, -0.2, 0.27]))
+    attributes = *shape.eval_attribute_3("vertex_colour", si), shape.eval_attribute_1("vertex_weight", si)
+    found = [si.uv.x, si.uv.y, *si.dp_du, *si.dp_dv, *attributes, shape.eval_attribute_1("vertex_label", si)]
+    valid = si.is_valid()
+    # In one kernel.
+    dr.eval(valid, found)
+    assert dr.all(valid)
+    return np.array([np.array(each) for each in found])
 
 
 # Vertices of the other cages follow in the test above by updates; hits compile kernels for seconds.
@@ -191,12 +166,16 @@ def test_values_stay_when_triangles_are_chosen_anew(shading):
 
 
 @every_variant
-def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated():
+def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated_for_which_alone_weights_are_made(monkeypatch):
     shape = make(creased())
     parameters = mi.traverse(shape)
     own = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
     update(parameters, vertex_colour=own, cage_weight=parameters["cage_weight"] * 2)
-    update(parameters, control_points=parameters["control_points"] * 2)
+    with monkeypatch.context() as patched:
+        for kind in (SubdividedChannel, LinearChannel):
+            patched.setattr(kind, "weights", None)
+        update(parameters, control_points=parameters["control_points"] * 2)
+        update(make(creased()), control_points=parameters["control_points"])
     np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(own))
     parameters["cage_colour"] = parameters["cage_colour"] * 1
     parameters.set_dirty("cage_colour")
@@ -204,34 +183,7 @@ def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated():
     np.testing.assert_allclose(np.array(mi.traverse(shape)["vertex_colour"]), 2 * np.array(own), atol=SINGLE)
 
 
-@every_variant
-def test_no_weights_are_made_where_no_value_changes(monkeypatch):
-    made = []
-    for kind in (SubdividedChannel, LinearChannel):
-        monkeypatch.setattr(kind, "weights", lambda *_, kind=kind: made.append(kind))
-    parameters = mi.traverse(make(creased()))
-    update(parameters, control_points=parameters["control_points"] * 2)
-    assert made == []
-
-
-@every_variant
-def test_attributes_that_a_mesh_has_no_place_for_are_no_parameters():
-    with pytest.warns(CageWarning, match='attribute "pair" has 2 numbers per value and is left out'):
-        shape = make(cube(attributes={"pair": np.ones((8, 2)), "colour": np.ones((8, 3))}))
-    found = {key for key in mi.traverse(shape).keys() if key.startswith("cage_")}  # noqa: SIM118 - it iterates over pairs
-    assert found == {"cage_colour"}
-
-
 # Gradients
-
-
-def weights_of(cage, name, scheme):
-    """Of an attribute's values in those at the tessellation's vertices: what unit vectors become."""
-    given = cage.texcoords if name == "texcoords" else cage.attributes[name]
-    attributes = {**cage.attributes, "unit": Attribute(np.eye(len(given.values)), given.interpolation, given.indices)}
-    creases = cage.tags.creases(cage.topology)
-    cage = tagged(cage, creases=creases, texcoords=cage.texcoords, attributes=attributes)
-    return LimitSurface(cage, scheme).tessellate(4).attributes["unit"]
 
 
 @pytest.mark.usefixtures("no_other_scene", "variants_all_ad_rgb")
@@ -244,8 +196,14 @@ def test_gradients_of_sums_over_vertices_are_column_sums_of_weights(cage, np_rng
         parameters.set_dirty(f"cage_{name}")
     parameters.update()
     loss, expected = mi.Float(0), {}
+    cage = made()
+    creases = cage.tags.creases(cage.topology)
     for name, size in NAMES.items():
-        weights = weights_of(made(), name, options.get("scheme"))
+        # What unit vectors become: the weights of an attribute's values in those at the vertices.
+        given = cage.texcoords if name == "texcoords" else cage.attributes[name]
+        unit = {"unit": Attribute(np.eye(len(given.values)), given.interpolation, given.indices)}
+        units = tagged(cage, creases=creases, texcoords=cage.texcoords, attributes=cage.attributes | unit)
+        weights = LimitSurface(units, options.get("scheme")).tessellate(4).attributes["unit"]
         factors = np_rng.random((len(weights), size)).astype(np.float32)
         loss += dr.sum(parameters[f"vertex_{name}"] * upload(mi.Float, factors))
         expected[name] = weights.T @ factors
@@ -272,7 +230,7 @@ def picture_of(cage, name, **parameters):
     sensors = {view: perspective(RESOLUTION, eye, fov=30) for view, eye in eyes.items()}
     # Directions that a BSDF samples turn with the texture coordinates, and may meet the shape or not.
     integrator, sky = {"type": "direct", "bsdf_samples": 0}, {"type": "constant"}
-    return mi.load_dict({"type": "scene", "integrator": integrator, **sensors, "sky": sky, "shape": shape})
+    return scene_with(integrator=integrator, **sensors, sky=sky, shape=shape)
 
 
 # Where weights make what hits look up: of linear interpolation over polygons, and of cages that are refined once.
@@ -362,23 +320,21 @@ def test_control_points_and_colours_have_gradients_together():
 MOVED, MOVED_DIFFERENCE = 1e-3, 2e-3
 
 
-@pytest.mark.parametrize("mode", ["forward", "backward"])
 @pytest.mark.parametrize("by", ["control_points", "to_world"])
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 @shadings
 @llvm
-def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, mode, np_rng):
+def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, np_rng):
     """Under exact shading they left out that it moves: a surface moving along its colours had a gradient of zero."""
     cage = named_cages.extraordinary_triangles(5) if scheme == "loop" else cube()
     weights = np.linspace(0, 1, cage.vertex_count)[:, None]
     cage = tagged(cage, attributes={"weight": weights, "colour": np.hstack([weights, 1 - weights, weights**2])})
     shape = make(cage, scheme=scheme, shading=shading)
-    scene = mi.load_dict({"type": "scene", "shape": shape})
+    scene = scene_with(shape=shape)
     parameters, by = mi.traverse(scene), f"{shape.id()}.{by}"
     inside = LimitSurface(cage, scheme).sample(64, 1)
     targets = cage.positions.mean(axis=0) + 0.9 * (inside.p - cage.positions.mean(axis=0))
-    o, d = inside.p + inside.n, targets - inside.p - inside.n
-    ray = mi.Ray3f(upload(mi.Point3f, o.T), upload(mi.Vector3f, d.T))
+    ray = rays(inside.p + inside.n, targets - inside.p - inside.n)
     moves, given = np_rng.normal(size=len(cage.positions) * 3), type(parameters[by])(parameters[by])
 
     def values(step):
@@ -402,12 +358,11 @@ def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, mode, np_rn
     assert same.mean() > 0.5
     differences = differences[same]
     tolerance = MOVED_DIFFERENCE * np.abs(differences).max()
-    if mode == "forward":
-        dr.set_grad(step, 1)
-        derivative = np.array(dr.forward_to(found))[same]
-    else:
-        # The mean over the same rays as the differences.
-        signs = np.where(same, np_rng.choice([-1, 1], 64), 0)
-        dr.backward(dr.sum(found * upload(mi.Float, signs)))
-        derivative, differences = np.array(dr.grad(step)) / same.sum(), (differences * signs[same]).mean()
-    np.testing.assert_allclose(derivative, differences, rtol=0, atol=tolerance)
+    # The mean over the same rays as the differences.
+    signs = np.where(same, np_rng.choice([-1, 1], 64), 0)
+    dr.backward(dr.sum(found * upload(mi.Float, signs)), flags=dr.ADFlag.ClearNone)
+    backward = np.array(dr.grad(step)) / same.sum()
+    np.testing.assert_allclose(backward, (differences * signs[same]).mean(), rtol=0, atol=tolerance)
+    found, _, _ = values(step)
+    dr.set_grad(step, 1)
+    np.testing.assert_allclose(np.array(dr.forward_to(found))[same], differences, rtol=0, atol=tolerance)

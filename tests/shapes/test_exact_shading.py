@@ -10,6 +10,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface, example_file, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
 from reference.refined_cages import sheet
+from scipy import ndimage
 from shapes.cages import MIXED_FACES, RING, cube, described, textured
 from shapes.scenes import down, perspective, rays, rows, scene_with
 from shapes.updates import MODES, derivative, moving, update
@@ -113,11 +114,8 @@ def inside(si, other, resolution=RESOLUTION):
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis, append=0)) > 0.5
         jumps |= step | np.roll(step, 1, axis)
-    mask = np.pad(both & ~jumps, 1)
     # Twice without the pixels next to others.
-    for _ in range(2):
-        mask[1:-1, 1:-1] &= mask[:-2, 1:-1] & mask[2:, 1:-1] & mask[1:-1, :-2] & mask[1:-1, 2:]
-    return mask[1:-1, 1:-1].ravel()
+    return ndimage.binary_erosion(both & ~jumps, iterations=2).ravel()
 
 
 # Hits
@@ -239,13 +237,13 @@ def matte():
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}}
 
 
-POINT = {"type": "point", "position": [-3, -1, 2.5], "intensity": 10.0}
-DIRECTIONAL = {"type": "directional", "direction": [1, 0.3, -0.4]}
-
-
 @pytest.mark.parametrize(
     ("name", "integrator", "light"),
-    [("cube", "direct", POINT), ("icosahedron", "path", None), ("Doo-Sabin tetrahedron", "direct", DIRECTIONAL)],
+    [
+        ("cube", "direct", {"type": "point", "position": [-3, -1, 2.5], "intensity": 10.0}),
+        ("icosahedron", "path", None),
+        ("Doo-Sabin tetrahedron", "direct", {"type": "directional", "direction": [1, 0.3, -0.4]}),
+    ],
     ids=["point", "sky", "directional"],
 )
 def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
@@ -397,14 +395,11 @@ def floor(**more):
 DARK = {"type": "constant", "radiance": 1e-6}
 
 
-def test_emitters_light_a_floor():
-    view = {"origin": (0, -4, 3), "target": (0, 0, -1)}
-    found = images((8, 16), cube(), {"emitter": light()}, light=DARK, view=view, spp=256, floor=floor())
-    assert found[0].mean() == pytest.approx(found[1].mean(), rel=ENERGY)
-
-
-def test_both_strategies_find_the_same_light_of_coarse_triangles():
+def test_emitters_light_a_floor_whichever_strategy_finds_them():
     """Emitters are sampled on triangles; what hits them counts with the weight of that place and normal."""
+    view = {"origin": (0, -4, 3), "target": (0, 0, -1)}
+    coarse, fine = images((8, 16), cube(), {"emitter": light()}, light=DARK, view=view, spp=256, floor=floor())
+    assert coarse.mean() == pytest.approx(fine.mean(), rel=ENERGY)
     shape = make(cube(), tessellation_rate=1, emitter=light())
     view, rough = {"origin": (0, -4, 1), "target": (0, 0, -1.2), "fov": 12}, {"type": "roughconductor", "alpha": 0.3}
     strategies = [{"type": "direct", "emitter_samples": e, "bsdf_samples": b} for e, b in ((1, 0), (0, 1), (1, 1))]
@@ -561,49 +556,26 @@ def test_stams_form_goes_wrong_as_it_is_published(valence, np_rng):
 POINTS = "shape.control_points"
 
 
-def derivatives(scene, parameters, assign, modes, spp):
-    """Of the mean of an image."""
-
-    def mean():
-        return dr.mean(mi.render(scene, parameters, spp=spp, seed=1), axis=None)
-
-    return [derivative(mode, assign, mean, 5e-3) for mode in modes]
-
-
 # Of directions that the diffuse material chooses, the variance near a valence of 3 would be hundreds of times as much:
 # they turn with the tangents, whose derivatives have no bound there.
 @pytest.mark.parametrize(
     ("by", "bsdf", "samples", "noise"),
-    [
-        (POINTS, "diffuse", {"bsdf_samples": 0}, 2e-3),
-        (POINTS, "conductor", {}, 2e-3),
-        ("shape.to_world", "diffuse", {"bsdf_samples": 0}, 4e-3),
-    ],
-    ids=["diffuse", "mirror", "placement"],
+    [(POINTS, "conductor", {}, 2e-3), ("shape.to_world", "diffuse", {"bsdf_samples": 0}, 4e-3)],
+    ids=["mirror", "placement"],
 )
 def test_gradients_inside_an_outline_are_differences(by, bsdf, samples, noise):
     shape = make(cube(), bsdf={"type": bsdf})
     scene = scene_of(shape, {"type": "direct", **samples}, sky(), {"fov": 10, "resolution": 16})
     parameters = mi.traverse(scene)
     assign = moving(parameters, by, np.random.default_rng(1))
-    backward, forward, difference = derivatives(scene, parameters, assign, MODES, 256)
+
+    def mean():
+        return dr.mean(mi.render(scene, parameters, spp=256, seed=1), axis=None)
+
+    backward, forward, difference = (derivative(mode, assign, mean, 5e-3) for mode in MODES)
     assert forward == pytest.approx(backward, rel=1e-3)
     # Two standard deviations of either, and the kinks of the sky's interpolation in a mirror.
     assert backward == pytest.approx(difference, rel=0.03, abs=noise)
-
-
-def test_gradients_of_outlines_are_differences():
-    cage = cube(creases=RING, texcoords=textured().texcoords)
-    integrator = {"type": "direct_projective", "sppi": 0}
-    scene = scene_of(make(cage, tessellation_rate=4), integrator, view={"resolution": 24})
-    parameters, points = mi.traverse(scene), upload(mi.Float, cage.positions)
-
-    def grow(step):
-        update(parameters, {POINTS: points * (1 + step)})
-
-    backward, difference = derivatives(scene, parameters, grow, ("backward", "difference"), 512)
-    # Noise of about one per cent.
-    assert backward == pytest.approx(difference, rel=0.03)
 
 
 @pytest.mark.usefixtures("no_other_scene")

@@ -9,7 +9,7 @@ from mitsuba_subdivision.shapes.heights import AttributeHeights, TextureHeights
 from shapes.cages import cube, load
 from shapes.scenes import waves
 from shapes.updates import update
-from shapes.variants import every_variant
+from shapes.variants import every_ad_variant, every_variant
 
 IMAGE = np.random.default_rng(5).random((4, 7, 1)).astype(np.float32)
 # Central differences in single precision.
@@ -24,8 +24,6 @@ TO_UV = {
     "sheared": lambda: mi.ScalarTransform3f(np.array([[1.5, 0.4, 0.1], [-0.2, 0.7, 0.3], [0, 0, 1]])),
 }
 
-pytestmark = every_variant
-
 
 def bitmap(image=IMAGE, **more):
     return {"type": "bitmap", "data": upload(mi.TensorXf, image), "raw": True, **more}
@@ -38,11 +36,6 @@ def heights_of(texture):
 def arrays(*values):
     kind = mi.Float if dr.is_jit_v(mi.Float) else dr.scalar.ArrayXf64
     return [upload(kind, value) for value in values]
-
-
-def needs_derivatives():
-    if not dr.is_diff_v(mi.Float):
-        pytest.skip("only variants of arrays have derivatives")
 
 
 def attached_slopes(heights, s, t):
@@ -63,24 +56,24 @@ def differences(heights, s, t):
     return np.array([between(STEP, 0), between(0, STEP)])
 
 
-def places(count=50):
-    """Points that are no nearer to lines between texels than a step."""
-    return np.random.default_rng(2).random((2, count))
+# Points that are no nearer to lines between texels than a step.
+PLACES = np.random.default_rng(2).random((2, 50))
 
 
 @pytest.mark.parametrize("turn", TO_UV)
 @pytest.mark.parametrize("channels", [1, 3])
+@every_variant
 def test_slopes_of_bitmaps_are_differences(turn, channels):
     heights = heights_of(bitmap(np.repeat(IMAGE, channels, axis=2) * np.arange(1, channels + 1), to_uv=TO_UV[turn]()))
-    off = np.abs(slopes(heights, *places()) - differences(heights, *places())).max(axis=0)
+    off = np.abs(slopes(heights, *PLACES) - differences(heights, *PLACES)).max(axis=0)
     # But for some steps that lead across a line between texels.
     assert np.quantile(off, 0.9) < DIFFERENCE * 5
 
 
 @pytest.mark.parametrize("turn", [0, 90])
+@every_ad_variant
 def test_slopes_of_a_bitmap_turn_with_texture_coordinates(turn):
     """Of a bitmap of texels of a quadratic function, whose differences over a texel are its second derivatives."""
-    needs_derivatives()
     height, width = 9, 16
     y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
     image = (0.5 * x**2 - 0.75 * x * y + 0.2 * y**2)[:, :, None].astype(np.float32)
@@ -100,55 +93,46 @@ def test_slopes_of_a_bitmap_turn_with_texture_coordinates(turn):
         np.testing.assert_allclose(found, np.repeat(expected[:, axis, None], 40, axis=1), rtol=0, atol=SECOND)
 
 
-def test_slopes_of_a_bitmap_that_is_not_interpolated_are_zero():
-    assert not np.any(slopes(heights_of(bitmap(filter_type="nearest")), *places()))
-
-
-def test_slopes_of_a_texture_without_a_gradient_are_derivatives():
-    s, t = places()
+@every_variant
+def test_slopes_of_other_textures_are_derivatives_and_those_of_texels_zero():
+    assert not np.any(slopes(heights_of(bitmap(filter_type="nearest")), *PLACES))
+    s, t = PLACES
     expected = [3 * np.cos(3 * s) * np.cos(2 * t), -2 * np.sin(3 * s) * np.sin(2 * t)]
     np.testing.assert_allclose(slopes(heights_of(waves()), s, t), expected, rtol=0, atol=1e-3)
 
 
-def test_the_range_of_a_bitmap_bounds_it():
-    found = heights_of(bitmap()).range()
-    assert (found.low, found.high) == (pytest.approx(IMAGE.min()), pytest.approx(IMAGE.max()))
+@every_variant
+def test_ranges_are_those_of_texels_of_luminances_of_samples_and_of_an_attributes_values():
+    def is_range(heights, low, high, **tolerance):
+        found = heights.range()
+        assert (found.low, found.high) == (pytest.approx(low, **tolerance), pytest.approx(high, **tolerance))
+
+    is_range(heights_of(bitmap()), IMAGE.min(), IMAGE.max())
     s, t = np.random.default_rng(1).random((2, 2000)) * 3
     values = np.array(heights_of(bitmap()).height(arrays(s, t)))
-    assert values.min() >= found.low
-    assert values.max() <= found.high
-
-
-def test_the_range_of_a_bitmap_in_colours_is_that_of_its_luminance():
-    heights = heights_of(bitmap(np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)))
+    found = heights_of(bitmap()).range()
+    assert found.low <= values.min() < values.max() <= found.high
+    colours = heights_of(bitmap(np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)))
     # At texels' centres the texture has their values.
     s, t = (each.ravel() for each in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))
-    values, found = np.array(heights.height(arrays(s, t))), heights.range()
-    assert (found.low, found.high) == (pytest.approx(values.min(), abs=1e-6), pytest.approx(values.max(), abs=1e-6))
-
-
-def test_the_range_of_other_textures_is_that_of_samples():
+    values = np.array(colours.height(arrays(s, t)))
+    is_range(colours, values.min(), values.max(), abs=1e-6)
     assert heights_of(waves()).range().high == pytest.approx(1, abs=1e-3)
-    flat = heights_of({"type": "uniform", "value": 0.25}).range()
-    assert (flat.low, flat.high) == (0.25, 0.25)
-    board = heights_of({"type": "checkerboard"}).range()
-    assert (board.low, board.high) == (pytest.approx(0.2), pytest.approx(0.4))
-
-
-def test_the_range_of_an_attribute_is_the_hull_of_its_values():
+    is_range(heights_of({"type": "uniform", "value": 0.25}), 0.25, 0.25, rel=0, abs=0)
+    is_range(heights_of({"type": "checkerboard"}), 0.2, 0.4)
     cage = cube(attributes={"height": np.linspace(-1, 2, 8)[:, None]})
-    found = AttributeHeights(LimitSurface(cage).channel("height")).range()
-    assert (found.low, found.high) == (-1, 2)
+    is_range(AttributeHeights(LimitSurface(cage).channel("height")), -1, 2, rel=0, abs=0)
 
 
+@every_variant
 def test_textures_that_are_no_heights_are_refused():
     with pytest.raises(ValueError, match=r'kind "MeshAttribute" was given; expected the name of the attribute itself'):
         heights_of({"type": "mesh_attribute", "name": "vertex_height"})
 
 
+@every_ad_variant
 def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap():
     """They did not, but for the products of both coordinates: slopes of bitmaps are constant along a texel."""
-    needs_derivatives()
     x, y, z = cube().positions.T
     cage = cube(texcoords=np.stack([0.3 * x + 0.11 * z + 0.5, 0.3 * y + 0.23 * z + 0.5], axis=1))
     t, s = np.meshgrid(*[(np.arange(256) + 0.5) / 256] * 2, indexing="ij")

@@ -1,4 +1,4 @@
-"""Scenes of many shapes: any number loads, and shapes share all that does not depend on positions."""
+"""Shapes that are made: any number loads, without the collector, and they share all but what follows positions."""
 
 import gc
 import os
@@ -13,11 +13,12 @@ import pytest
 from mitsuba_subdivision import Attribute, CageWarning, ControlCage
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.files.formats import FORMATS
-from mitsuba_subdivision.shapes import registration
+from mitsuba_subdivision.shapes import registration, subdivision_shape
+from mitsuba_subdivision.shapes.device_state import paused_collection
 from reference.refined_cages import tagged
-from shapes.cages import cube, described
+from shapes.cages import cube, described, with_attributes
 from shapes.updates import update
-from shapes.variants import every_array_variant, every_variant, exact, exact_llvm, llvm
+from shapes.variants import every_array_variant, every_variant, exact, exact_llvm, llvm, scalar, shadings
 
 pytestmark = pytest.mark.threads
 
@@ -56,9 +57,9 @@ def placed(shape, i):
     return {**shape, "to_world": mi.ScalarTransform4f().translate([i % 8, i // 8 % 8, i // 64])}
 
 
-def load(shape, count, **options):
-    scene = mi.load_dict({"type": "scene", **{f"s{i:04}": placed(shape, i) for i in range(count)}}, **options)
-    return scene.shapes()
+def load(shapes, **options):
+    named = {f"s{i:04}": placed(shape, i) for i, shape in enumerate(shapes)}
+    return mi.load_dict({"type": "scene", **named}, **options).shapes()
 
 
 def assert_as_if_alone(shape, found, i):
@@ -73,7 +74,7 @@ def assert_as_if_alone(shape, found, i):
 @pytest.mark.parametrize(("count", "parallel"), [(MANY, True), (SOME, False)], ids=["parallel", "one by one"])
 def test_many_shapes_load(count, parallel):
     shape = of(cube())
-    found = load(shape, count, parallel=parallel)
+    found = load([shape] * count, parallel=parallel)
     assert len(found) == count
     for i in (0, count // 2, count - 1):
         assert_as_if_alone(shape, found, i)
@@ -91,8 +92,7 @@ def test_what_waits_within_constructors_loads():
     ]
     cage = coloured(cube(), height=np.linspace(0, 1, 8)[:, None])
     shapes = [of(cage, **kinds[i % len(kinds)]) for i in range(SOME)]
-    scene = {"type": "scene", **{f"s{i:03}": placed(shape, i) for i, shape in enumerate(shapes)}}
-    found = mi.load_dict(scene).shapes()
+    found = load(shapes)
     assert len(found) == SOME
     for i in range(SOME - len(kinds), SOME):
         assert_as_if_alone(shapes[i], found, i)
@@ -102,11 +102,9 @@ def test_what_waits_within_constructors_loads():
 @pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "one by one"])
 def test_many_shapes_load_from_xml(parallel, tmp_path):
     cube().save(tmp_path / "cube.obj")
-    shape = (
-        '<shape type="subdivision"><string name="filename" value="cube.obj"/>'
-        '<integer name="tessellation_rate" value="2"/><transform name="to_world"><translate x="{}"/></transform>'
-        "</shape>"
-    )
+    shape = """<shape type="subdivision"><string name="filename" value="cube.obj"/>
+        <integer name="tessellation_rate" value="2"/>
+        <transform name="to_world"><translate x="{}"/></transform></shape>"""
     text = "".join(map(shape.format, range(SOME)))
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
     assert len(mi.load_file(str(tmp_path / "scene.xml"), parallel=parallel).shapes()) == SOME
@@ -114,10 +112,8 @@ def test_many_shapes_load_from_xml(parallel, tmp_path):
 
 @llvm
 def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
-    shape = of(cube())
-    scene = {f"s{i:03}": placed(shape, i) for i in range(SOME)} | {"wrong": {**shape, "tessellation_rate": 0}}
     with pytest.raises(RuntimeError, match='parameter "tessellation_rate" is 0; expected 1 to'):
-        mi.load_dict({"type": "scene", **scene})
+        load([*[of(cube())] * SOME, {**of(cube()), "tessellation_rate": 0}])
 
 
 def test_a_constructor_too_deep_runs_in_its_own_thread():
@@ -142,6 +138,51 @@ def test_a_constructor_too_deep_runs_in_its_own_thread():
     assert depths == [1]
 
 
+# Python's garbage collector
+
+
+@scalar
+def test_the_collector_rests_while_a_shape_is_made_and_is_as_it_was_afterwards(monkeypatch):
+    read_parameters, found = subdivision_shape.read_parameters, []
+
+    def noted(props):
+        found.append(gc.isenabled())
+        return read_parameters(props)
+
+    monkeypatch.setattr(subdivision_shape, "read_parameters", noted)
+    made(cube())
+    assert gc.isenabled()
+    # Also after a shape that is refused, and where it was off.
+    with pytest.raises(RuntimeError, match="filename"):
+        mi.load_dict({"type": "subdivision"})
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        made(cube())
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+    assert found == [False] * 3
+
+
+def test_the_collector_runs_again_after_pauses_that_overlap():
+    begun, ended = threading.Event(), threading.Event()
+
+    @paused_collection()
+    def longer():
+        begun.set()
+        ended.wait()
+
+    thread = threading.Thread(target=longer)
+    with paused_collection():
+        thread.start()
+        begun.wait()
+    # The first pause is over, and the other, which began within it, leaves the collector as it is.
+    ended.set()
+    thread.join()
+    assert gc.isenabled()
+
+
 # Sharing
 
 
@@ -153,14 +194,8 @@ def tables(shape):
     return [*found, surface.pieces()] if shape._exact is not None else found
 
 
-def device_arrays(shape):
-    parameters = mi.traverse(shape)
-    return [parameters[name].index for name in ("faces", "face_element")]
-
-
-@exact
 @every_variant
-@pytest.mark.parametrize("shading", ["vertex", "exact"])
+@shadings
 @pytest.mark.parametrize("rate", [1, 3])
 def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_path, np_rng):
     cage = coloured(cube())
@@ -176,8 +211,8 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
     for first, *others in (from_arrays, files):
         for shape in others:
             assert all(a is b for a, b in zip(tables(first), tables(shape), strict=True))
-            if dr.is_jit_v(mi.Float):
-                assert device_arrays(shape) == device_arrays(first)
+            for name in ("faces", "face_element") if dr.is_jit_v(mi.Float) else ():
+                assert mi.traverse(shape)[name].index == mi.traverse(first)[name].index
         assert not np.array_equal(buffers(first)["vertex_positions"], buffers(others[0])["vertex_positions"])
     assert files[0]._parameters.surface.patches is from_arrays[0]._parameters.surface.patches
     assert files[0]._triangles.table is from_arrays[0]._triangles.table
@@ -206,14 +241,11 @@ def test_shapes_of_other_tags_or_rules_share_no_patches(change):
 
 @every_variant
 def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
-    one, two, three = (
-        made(cube()),
-        mi.load_dict({**of(cube()), "tessellation_rate": 3}),
-        made(cube(), scheme="doo_sabin"),
-    )
-    assert one._parameters.surface.patches is two._parameters.surface.patches
-    assert len({id(each._triangles.table) for each in (one, two, three)}) == 3
-    assert one._parameters.surface.patches is not three._parameters.surface.patches
+    options = {}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"}
+    shapes = [mi.load_dict({**of(cube()), **each}) for each in options]
+    assert len({id(shape._triangles.table) for shape in shapes}) == 3
+    patches = [shape._parameters.surface.patches for shape in shapes]
+    assert patches[0] is patches[1] is not patches[2]
 
 
 @exact
@@ -234,12 +266,11 @@ def test_nothing_is_kept_when_the_last_shape_has_gone():
 
 
 def written(cage, path, age=LONG_AGO, more=""):
-    """Write a cage to a file as if that had been so many nanoseconds ago."""
-    cage.save(path)
-    path.write_text(path.read_text() + more)
+    """Write a cage to a file as if that had been so many nanoseconds ago; the file is the same as before."""
+    cage.save(path.with_name("saved.obj"))
+    path.write_text(path.with_name("saved.obj").read_text() + more)
     then = time.time_ns() - age
     os.utime(path, ns=(then, then))
-    return str(path)
 
 
 def from_file(path, **more):
@@ -251,42 +282,29 @@ def cage_of(shape):
 
 
 @every_variant
-def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
-    path = written(cube(), tmp_path / "cube.obj")
-    one = from_file(path)
+def test_a_file_is_read_once_until_it_changes_and_warned_of_by_each_shape(tmp_path, monkeypatch):
+    path, unused = tmp_path / "cube.obj", "v 9 9 9\n"
+
+    def warned(**options):
+        with pytest.warns(CageWarning, match="used by no face"):
+            return cage_of(from_file(str(path), **options))
+
+    written(cube(), path, more=unused)
+    cages = [warned()]
     with monkeypatch.context() as patched:
         patched.setattr(ControlCage, "from_file", None)
-        two = from_file(path)
-    assert cage_of(one) is cage_of(two)
-    # Of the same size.
-    shifted = cube().with_positions(cube().positions[::-1])
-    three = from_file(written(shifted, tmp_path / "cube.obj", LONG_AGO // 2))
-    np.testing.assert_array_equal(cage_of(three).positions, shifted.positions)
+        assert warned() is cages[0]
     # Other options, another cage.
-    assert cage_of(from_file(path, boundary="none", strict=True)).boundary == "none"
+    assert warned(boundary="none", strict=True).boundary == "none"
+    # Of the same size; and then at once again, as times of files are too coarse to tell whether it has changed since.
+    for turn, age in ((-1, LONG_AGO // 2), (1, 0), (-1, 0)):
+        positions = cube().positions[::turn]
+        written(cube().with_positions(positions), path, age, unused)
+        cages.append(warned())
+        np.testing.assert_array_equal(cages[-1].positions[:8], positions)
 
 
-@every_variant
-def test_a_file_that_has_just_changed_is_read_again(tmp_path):
-    """Times of files are too coarse to tell whether it has changed once more."""
-    shapes = []
-    for positions in (cube().positions, cube().positions[::-1]):
-        shapes.append(from_file(written(cube().with_positions(positions), tmp_path / "cube.obj", age=0)))
-        np.testing.assert_array_equal(cage_of(shapes[-1]).positions, positions)
-    assert cage_of(from_file(str(tmp_path / "cube.obj"))) is not cage_of(shapes[-1])
-
-
-@every_variant
-def test_each_shape_warns_of_its_file(tmp_path):
-    path, shapes = written(cube(), tmp_path / "cube.obj", more="v 9 9 9\n"), []
-    for _ in range(2):
-        with pytest.warns(CageWarning, match="used by no face"):
-            shapes.append(from_file(path))
-    assert cage_of(shapes[0]) is cage_of(shapes[1])
-
-
-def test_names_of_formats_that_refer_to_no_other_files():
-    """USD files do, and these may change alone."""
+def test_only_usd_files_refer_to_others_which_may_change_alone():
     assert {suffix for suffix, each in FORMATS.items() if not each.refers_to_files} == {".obj", ".ply"}
 
 
@@ -299,14 +317,21 @@ def test_triangles_that_are_chosen_anew_keep_derivatives():
     assert np.array(dr.grad(shape.control_points)).any()
 
 
-@llvm
-def test_shapes_of_equal_attributes_share_them_on_the_device():
-    cage = coloured(cube())
-    one, two, other = (made(each) for each in (cage, cage.with_positions(-cage.positions), coloured(cage, 1)))
+@every_variant
+def test_shapes_of_equal_attributes_share_them_until_those_of_one_change():
+    cage, is_jit = with_attributes(), dr.is_jit_v(mi.Float)
+    shapes = [made(each) for each in (cage, cage.with_positions(-cage.positions), coloured(cube(), 1))]
+    one, two, other = map(mi.traverse, shapes)
+    for name in ("colour", "texcoords", "weight", "label"):
+        assert not is_jit or one[f"cage_{name}"].index == two[f"cage_{name}"].index
     for name in ("vertex_colour", "vertex_texcoords"):
-        index = [mi.traverse(shape)[name].index for shape in (one, two, other)]
-        assert index[0] == index[1] != index[2]
-    # What one of them is given is its own.
-    update(one, cage_colour=mi.traverse(one)["cage_colour"] * 2)
-    before, after = (np.array(mi.traverse(shape)["vertex_colour"]) for shape in (two, one))
-    np.testing.assert_allclose(after, 2 * before, rtol=SINGLE)
+        assert not is_jit or one[name].index == two[name].index != other[name].index
+    before = {name: np.array(two[name]) for name in ("vertex_colour", "cage_texcoords")}
+    # What one of them is given is its own, also in place.
+    update(one, cage_colour=one["cage_colour"] * 2)
+    dr.scatter(one["cage_texcoords"], 7.0, dr.uint32_array_t(type(one["cage_texcoords"]))(0))
+    one.update()
+    np.testing.assert_allclose(np.array(one["vertex_colour"]), 2 * before["vertex_colour"], rtol=SINGLE)
+    assert np.array(one["cage_texcoords"])[0] == 7
+    for name, values in before.items():
+        np.testing.assert_array_equal(np.array(two[name]), values)

@@ -12,7 +12,7 @@ from mitsuba_subdivision.shapes.parameters import is_attribute_parameter
 from mitsuba_subdivision.shapes.tessellation_parameters import LIMITS
 from mitsuba_subdivision.tessellation import HIGHEST_RATE
 from shapes.cages import cube, load
-from shapes.variants import every_variant, llvm, scalar
+from shapes.variants import every_variant
 
 ROWS = (*PARAMETERS, *STATE_PARAMETERS)
 
@@ -38,17 +38,12 @@ def test_traverse_shows_what_the_table_says(limit):
         assert ("discontinuous" in stated[name]) == bool(flags & mi.ParamFlags.Discontinuous), name
 
 
-@llvm
-def test_arrays_of_exact_shading_are_on_the_page():
-    parameters = {"displacement": {"type": "checkerboard"}, "shading": "auto"}
-    names = shown_by(**parameters).keys() - {row.name for row in ROWS}
-    names = {re.sub("^shading_cage_.*", "shading_cage_NAME", name) for name in names}
-    assert [name for name in names if f"``{name}``" not in register_variant(mi.variant()).__doc__] == []
-
-
-@scalar
-def test_the_page_has_every_row():
+@every_variant
+def test_the_page_has_every_row_and_the_arrays_of_exact_shading():
     page = register_variant(mi.variant()).__doc__
+    names = shown_by(displacement={"type": "checkerboard"}, shading="auto").keys() - {row.name for row in ROWS}
+    names = {re.sub("^shading_cage_.*", "shading_cage_NAME", name) for name in names}
+    assert [name for name in names if f"``{name}``" not in page] == []
     rows = re.split(r"^ \* - ", page, flags=re.MULTILINE)[1:]
     assert [row.split("\n")[0] for row in rows] == [row.name for row in ROWS]
     assert f":extra-rows: {len(PARAMETERS)}\n" in page
@@ -56,9 +51,8 @@ def test_the_page_has_every_row():
         assert stated.text in re.sub(r"\n {5}(?=\S)", " ", row)
         assert set(stated.flags) <= set(re.findall(r"\|(\w+)\|", row))
     # As it stands in the text of Mitsuba's documentation.
-    assert (
-        "\n\n * - displacement_scale\n   - |float|\n   - Factor of the heights. (Default: 1)\n   - |exposed|, " in page
-    )
+    scale = "\n\n * - displacement_scale\n   - |float|\n   - Factor of the heights. (Default: 1)\n   - |exposed|, "
+    assert scale in page
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
@@ -107,7 +101,5 @@ def test_a_parameter_takes_the_numbers_that_its_message_states_and_no_others(row
 
 
 def test_names_with_placeholders_are_those_of_attributes():
-    placeholders = {name for name in PARAMETER_OF_NAME if "NAME" in name}
-    assert placeholders == {name for name in PARAMETER_OF_NAME if is_attribute_parameter(name)} - {
-        "texcoords", "texcoord_indices"
-    }  # fmt: skip
+    of_attributes = {name for name in PARAMETER_OF_NAME if is_attribute_parameter(name)}
+    assert {name for name in PARAMETER_OF_NAME if "NAME" in name} == of_attributes - {"texcoords", "texcoord_indices"}

@@ -1,4 +1,4 @@
-"""The plugin is there in every variant, whatever the order of import and `set_variant`."""
+"""The plugin is there in every variant, in any order of import and `set_variant`; exact shading, where it works."""
 
 import subprocess
 import sys
@@ -7,11 +7,15 @@ from pathlib import Path
 
 import mitsuba as mi
 import mitsuba_subdivision as msub
+import numpy as np
 import pytest
 from mitsuba_subdivision.llvm import llvm_problem, require_llvm
 from mitsuba_subdivision.shapes import register_variant
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook import interaction_hook
+from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import exact_shading_problem, hook_problem
 from shapes.cages import cube, load
-from shapes.variants import every_variant, scalar
+from shapes.scenes import vertices
+from shapes.variants import every_variant, exact_llvm, llvm, scalar
 
 STAR = Path(__file__).parents[2] / "scenes/cages/star.obj"
 BEGIN = """
@@ -78,15 +82,10 @@ def test_a_library_that_aborts_is_warned_of_where_an_llvm_variant_is_set_and_now
 
 
 @scalar
-def test_registers_once():
-    before = register_variant("scalar_rgb")
+def test_known_variants_are_registered_once_from_many_threads():
+    before, found = register_variant("scalar_rgb"), []
     msub.register()
     assert register_variant("scalar_rgb") is before
-
-
-@scalar
-def test_registers_once_from_many_threads():
-    found = []
     threads = [threading.Thread(target=lambda: found.append(register_variant("scalar_spectral"))) for _ in range(8)]
     for thread in threads:
         thread.start()
@@ -94,36 +93,25 @@ def test_registers_once_from_many_threads():
         thread.join()
     assert len(found) == 8
     assert len(set(found)) == 1
+    with pytest.raises(ValueError, match=r'unknown variant "scalar_grb"; expected one of .*scalar_rgb'):
+        register_variant("scalar_grb")
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", pytest.param("llvm_ad_rgb", marks=needs_llvm)])
-def test_equal_shapes_of_a_dict_stay_two(variant):
-    code = """
-scene = mi.load_dict({'type': 'scene', 'left': cube(), 'right': cube()})
+def test_equal_shapes_of_a_dict_stay_two_and_can_be_written_as_xml(variant):
+    run(f"""
+import mitsuba_subdivision, mitsuba as mi; mi.set_variant('{variant}')
+scene = mi.load_dict({{'type': 'scene', 'left': cube(), 'right': cube()}})
 assert sorted(shape.id() for shape in scene.shapes()) == ['left', 'right']
-assert {'left.control_points', 'right.control_points'} <= set(mi.traverse(scene).keys())
+assert {{'left.control_points', 'right.control_points'}} <= set(mi.traverse(scene).keys())
 # Whether or not objects of a scene are merged.
 one = cube()
-assert len(mi.load_dict({'type': 'scene', 'a': one, 'b': one}, optimize=False).shapes()) == 2
-"""
-    run(f"import mitsuba_subdivision, mitsuba as mi; mi.set_variant('{variant}')\n{code}")
-
-
-@needs_llvm
-def test_a_dict_can_be_written_as_xml():
-    run("""
-import mitsuba_subdivision, mitsuba as mi; mi.set_variant('llvm_ad_rgb')
-scene = {'type': 'scene', 'left': {'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}
-state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene)
-text = mi.parser.write_string(state)
+assert len(mi.load_dict({{'type': 'scene', 'a': one, 'b': one}}, optimize=False).shapes()) == 2
+scene = {{'type': 'scene', 'left': {{'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}}}
+text = mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene))
 assert '<shape type="subdivision" name="left">' in text, text
 assert '<integer name="tessellation_rate" value="3"' in text, text
 """)
-
-
-def test_unknown_variant_is_an_error():
-    with pytest.raises(ValueError, match=r'unknown variant "scalar_grb"; expected one of .*scalar_rgb'):
-        register_variant("scalar_grb")
 
 
 def test_a_first_picture_imports_little():
@@ -139,3 +127,57 @@ mi.render(mi.load_dict(scene | {{"sensor": {{"type": "perspective"}}, "integrato
 heavy = {{"scipy", "pathlib", "argparse"}}
 assert not heavy & (set(sys.modules) - there), heavy & (set(sys.modules) - there)
 """)
+
+
+# Exact shading, where it works
+
+
+def problem():
+    return exact_shading_problem(getattr(mi, mi.variant()))
+
+
+def shading_of(shape):
+    (line,) = [line for line in str(shape).splitlines() if "shading = " in line]
+    return line.strip(" ,").removeprefix("shading = ")
+
+
+@every_variant
+def test_a_shape_says_what_became_of_its_shading():
+    expected = "exact" if problem() is None else "vertex"
+    assert (expected == "exact") == (not mi.variant().startswith("scalar") and hook_problem() is None)
+    automatic, given = (load(cube(), shading=shading) for shading in ("auto", expected))
+    assert shading_of(automatic) == shading_of(given) == expected
+    assert mi.traverse(automatic).keys() == mi.traverse(given).keys()
+    assert shading_of(load(cube(), shading="auto", face_normals=True)) == shading_of(load(cube())) == "vertex"
+
+
+@exact_llvm
+def test_flat_faces_contradict_exact_shading():
+    message = 'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
+    with pytest.raises(RuntimeError, match=message):
+        load(cube(), shading="exact", face_normals=True)
+
+
+@scalar
+def test_scalar_variants_have_a_reason_of_their_own_not_to_have_exact_shading():
+    assert problem() == "exact shading needs a variant of llvm or cuda"
+    with pytest.raises(Exception, match='shading: "exact" in a scalar variant; expected "vertex", "auto"'):
+        load(cube(), shading="exact")
+
+
+@llvm
+def test_without_the_hook_automatic_shading_is_by_normals_of_vertices(monkeypatch):
+    def fail(*_):
+        raise RuntimeError("needs the virtual functions of Mitsuba 3.9")
+
+    monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
+    assert problem() == "exact shading needs another computer"
+    automatic = load(cube(), shading="auto")
+    assert shading_of(automatic) == "vertex"
+    np.testing.assert_array_equal(vertices(automatic), vertices(load(cube())))
+    # A trial that fails is a reason, too.
+    monkeypatch.setattr(interaction_hook, "hook_problem", lambda: None)
+    monkeypatch.setattr(interaction_hook, "interaction_hook", fail)
+    interaction_hook._trial_problem.cache_clear()
+    assert problem() == "exact shading needs the virtual functions of Mitsuba 3.9"
+    interaction_hook._trial_problem.cache_clear()

@@ -4,15 +4,20 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface, upload
+from mitsuba_subdivision import ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.tessellation import Criterion, Measure
+from peers.fidelity_cages import book, fan, joined, pole
+from peers.fidelity_cages import cube as box
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
 from reference.exact_samples import SCHEMES, angle, samples_at
-from shapes.cages import cube, described, load
-from shapes.scenes import SINGLE, buffer, hit, perspective, vertices
-from shapes.updates import MODES, derivative, update
+from shapes.cages import cube, described, load, with_attributes
+from shapes.scenes import SINGLE, WIDTHS, buffer, down, hit, perspective, scene_with, vertices
+from shapes.updates import MODES, derivative, differentiated, update
 from shapes.variants import every_ad_variant, every_variant, mirrors, scalar
 
+# Of sums of some hundred positions of about one in single precision.
+SUMMED = 2e-4
 SCENE = """<scene version="3.0.0">
 <shape type="subdivision"><string name="filename" value="{}"/></shape></scene>"""
 
@@ -25,6 +30,19 @@ def triangle_normals(shape):
     a, b, c = (buffer(shape, "vertex_positions")[corner] for corner in buffer(shape, "faces").T)
     return np.cross(b - a, c - a)
 
+
+def of(given):
+    return lambda: ControlCage(given.positions, given.faces)
+
+
+NON_MANIFOLD = {
+    "book": of(book(3)),
+    "cones": of(joined(fan(4), fan(5), {0: 0})),
+    "cubes": of(joined(box(), box(), {0: 7, 1: 6})),
+    "pole": of(pole(5)),
+}
+CAGES = {"valence 5": lambda: named_cages.extraordinary(5), "textured": with_attributes, **NON_MANIFOLD}
+with_warnings = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 
 # Construction
 
@@ -41,15 +59,33 @@ def test_normals_of_all_vertices_are_right(scheme, valence):
 
 
 @pytest.mark.core
+@mirrors
+@with_warnings
+@pytest.mark.parametrize("name", CAGES)
 @every_variant
-def test_vertices_lie_on_the_limit_surface_with_its_normals():
-    cage = named_cages.extraordinary(5)
-    shape, expected = make(cage), LimitSurface(cage).tessellate(4)
-    np.testing.assert_allclose(buffer(shape, "vertex_positions"), expected.positions, atol=SINGLE)
-    np.testing.assert_allclose(buffer(shape, "vertex_normals"), expected.normals, atol=50 * SINGLE)
-    np.testing.assert_array_equal(buffer(shape, "faces"), expected.triangles)
+def test_buffers_are_the_tessellation(name, mirror):
+    cage = CAGES[name]()
+    shape = make(cage, to_world=mi.ScalarTransform4f().scale([mirror, 1, 1]))
+    expected = LimitSurface(cage).tessellate(4)
+    positions, normals = vertices(shape)
+    np.testing.assert_allclose(positions, expected.positions * [mirror, 1, 1], atol=SINGLE / 2)
+    np.testing.assert_allclose(normals, expected.normals * [mirror, 1, 1], atol=50 * SINGLE)
+    flip = [0, 1, 2] if mirror == 1 else [0, 2, 1]
+    np.testing.assert_array_equal(buffer(shape, "faces"), expected.triangles[:, flip])
     np.testing.assert_array_equal(buffer(shape, "face_element"), expected.element)
-    assert shape.bbox().contains(mi.ScalarPoint3f(*map(float, expected.positions.mean(axis=0))))
+    attributes = {} if expected.texcoords is None else {"texcoords": expected.texcoords, **expected.attributes}
+    assert len(attributes) == 4 * (name == "textured")
+    for attribute, values in attributes.items():
+        assert values.shape[1] == WIDTHS.get(f"vertex_{attribute}", 3)
+        np.testing.assert_allclose(buffer(shape, f"vertex_{attribute}"), values, atol=SINGLE)
+    assert shape.bbox().contains(mi.ScalarPoint3f(positions.mean(axis=0).tolist()))
+
+
+@with_warnings
+@every_variant
+def test_strict_shapes_refuse_what_is_no_manifold():
+    with pytest.raises(Exception, match="expected a manifold surface"):
+        load(NON_MANIFOLD["book"](), strict=True)
 
 
 @scalar
@@ -63,15 +99,18 @@ def test_normals_of_the_published_forms_are_numbers_where_float32_overflows():
     np.testing.assert_array_equal(buffer(shape, "vertex_normals"), np.nan_to_num(normals))
 
 
-@pytest.mark.parametrize("name", ["cage.obj", "folder/cage.obj"])
 @scalar
-def test_filename_is_relative_to_the_scene(tmp_path, name):
-    (tmp_path / name).parent.mkdir(exist_ok=True)
-    cube().save(tmp_path / name)
-    (tmp_path / "scene.xml").write_text(SCENE.format(name))
-    (shape,) = mi.load_file(str(tmp_path / "scene.xml")).shapes()
-    assert shape.face_count() == 6 * 2 * 8 * 8
-    assert 'source = "cage.obj"' in str(shape)
+def test_filename_is_relative_to_the_scene_and_a_missing_file_an_error_that_names_the_place_there(tmp_path):
+    for name in ("cage.obj", "folder/cage.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cube().save(tmp_path / name)
+        (tmp_path / "scene.xml").write_text(SCENE.format(name))
+        (shape,) = mi.load_file(str(tmp_path / "scene.xml")).shapes()
+        assert shape.face_count() == 6 * 2 * 8 * 8
+        assert 'source = "cage.obj"' in str(shape)
+        (tmp_path / name).unlink()
+    with pytest.raises(RuntimeError, match=r'(?s)line 2.*there is no file "none.obj"; looked in'):
+        mi.load_string(SCENE.format("none.obj"))
 
 
 @scalar
@@ -119,32 +158,83 @@ def test_the_shape_has_its_bsdf_emitter_and_medium_and_says_what_it_is():
         assert f"\n  {line}" in text
     assert "exterior_medium" not in text
     assert text.count("[") == text.count("]")
+    parameters, before = mi.traverse(shape), vertices(shape)
+    assert parameters["patch_count"] == 6
+    with pytest.raises(Exception, match="Read-Only"):
+        parameters["patch_count"] = 7
+    # Of what concerns others.
+    shape.parameters_changed([])
+    shape.parameters_changed(["bsdf"])
+    np.testing.assert_array_equal(vertices(shape), before)
+
+
+# Single materials: together they are the surface of all
+
+MATERIALS = {"": [0], "red": [1, 4], "dark blue": [2, 3, 5]}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A cube with materials, of which one is used twice, and a crease between two."""
+    cube().save(tmp_path / "plain.obj")
+    lines = (tmp_path / "plain.obj").read_text().splitlines()
+    faces = [line for line in lines if line.startswith("f ")]
+    names = {face: name for name, of_name in MATERIALS.items() for face in of_name}
+    text = [line for line in lines if not line.startswith("f ")]
+    for face, line in enumerate(faces):
+        text += [*([f"  usemtl {names[face]} "] if names[face] else []), line]
+    (tmp_path / "cube.obj").write_text("\n".join([*text, "t crease 2/1/0 0 1 10", ""]))
+    return str(tmp_path / "cube.obj")
+
+
+def triangles(part):
+    """Positions of the corners of all triangles, as numbers with all their bits, in one order."""
+    corners = buffer(part, "vertex_positions")[buffer(part, "faces")].reshape(-1, 9)
+    return corners[np.lexsort(corners.T)]
 
 
 @scalar
-def test_missing_file_is_an_error_that_names_the_place_in_the_scene():
-    with pytest.raises(RuntimeError, match=r'(?s)line 2.*there is no file "none.obj"; looked in'):
-        mi.load_string(SCENE.format("none.obj"))
+@pytest.mark.parametrize(
+    "given", [{"tessellation_rate": 3}, {"tessellation": "adaptive", "max_edge": 0.4}], ids=["uniform", "adaptive"]
+)
+def test_materials_share_their_vertices_bit_by_bit(file, given):
+    given = {"type": "subdivision", "filename": file, **given}
+    whole, parts = mi.load_dict(given), [mi.load_dict({**given, "material": material}) for material in MATERIALS]
+    together = np.concatenate([triangles(part) for part in parts])
+    np.testing.assert_array_equal(together[np.lexsort(together.T)], triangles(whole))
+    areas = [float(part.surface_area()) for part in parts]
+    # Sums of some hundred areas in single precision.
+    assert sum(areas) == pytest.approx(float(whole.surface_area()), rel=1e-6)
+    assert min(areas) > 0
+
+
+@scalar
+def test_files_name_the_material_of_each_face_and_unknown_ones_are_errors(file):
+    cage = ControlCage.from_file(file)
+    assert {name: faces.tolist() for name, faces in cage.materials.items()} == MATERIALS
+    assert {name: len(faces) for name, faces in cage.refined().materials.items()} == {"": 4, "red": 8, "dark blue": 12}
+    for wrong, message in (
+        ({"material": "green"}, '"material" is "green"; expected one of "", "red", "dark blue"'),
+        ({"material": "red", "shown_faces": upload(mi.TensorXu, [1])}, '"material" and "shown_faces" contradict each'),
+    ):
+        with pytest.raises(RuntimeError, match=message):
+            mi.load_dict({"type": "subdivision", "filename": file, **wrong})
 
 
 # Normals and transforms
 
 
 @every_variant
-def test_normals_point_outward_on_both_sides_of_a_reflection():
+@pytest.mark.parametrize("flip", [False, True])
+def test_normals_point_outward_on_both_sides_of_a_reflection_and_hits_inward_where_flipped(flip):
+    sign = -1 if flip else 1
     for scale in ([1, 1, 1], [-1, 1, 1], [-2, -1, -0.5]):
-        shape = make(to_world=mi.ScalarTransform4f().scale(scale))
+        shape = make(to_world=mi.ScalarTransform4f().scale(scale), flip_normals=flip)
         positions, normals = vertices(shape)
         assert np.all((normals * positions).sum(axis=1) > 0)
         middles = positions[buffer(shape, "faces")].mean(axis=1)
         assert np.all((triangle_normals(shape) * middles).sum(axis=1) > 0)
-
-
-@mirrors
-@every_variant
-def test_flip_normals(mirror):
-    for flip, sign in ((False, 1), (True, -1)):
-        si = hit(make(to_world=mi.ScalarTransform4f().scale([mirror, 1, 1]), flip_normals=flip))
+        si = hit(shape)
         assert dr.all(sign * si.n.z > 0.5)
         assert dr.all(sign * si.sh_frame.n.z > 0.5)
 
@@ -163,14 +253,6 @@ def test_face_normals():
 # Parameters that `traverse` shows
 
 
-@every_variant
-def test_patch_count_is_read_only():
-    parameters = mi.traverse(make())
-    assert parameters["patch_count"] == 6
-    with pytest.raises(Exception, match="Read-Only"):
-        parameters["patch_count"] = 7
-
-
 @mirrors
 @every_variant
 def test_update_equals_a_new_shape(np_rng, mirror):
@@ -184,43 +266,47 @@ def test_update_equals_a_new_shape(np_rng, mirror):
     assert dr.allclose(shape.bbox().max, expected.bbox().max, atol=SINGLE)
 
 
-@every_variant
-def test_unrelated_update_keeps_the_surface():
-    shape = make()
-    before = vertices(shape)
-    shape.parameters_changed([])
-    shape.parameters_changed(["bsdf"])
-    np.testing.assert_array_equal(vertices(shape), before)
+CHORD = {"tessellation": "adaptive", "chord_error": 1e-2}
 
 
-# Gradients
-
-
-def sample_scene(integrator="direct"):
-    """Cube under a sky only: a point light's shadows have derivatives that projective integrators leave out."""
-    # Mitsuba never frees a scene with samples of indirect outlines; the cube has none to see.
-    integrator = {"type": integrator, **({"sppi": 0} if integrator.endswith("_projective") else {})}
-    seen = {"sensor": perspective(16, [1, 2, 5], up=[0, 1, 0]), "sky": {"type": "constant", "radiance": 1.0}}
-    shape = described(cube(), tessellation_rate=4)
-    return mi.load_dict({"type": "scene", "integrator": integrator, **seen, "shape": shape})
-
-
-@pytest.mark.parametrize("integrator", ["prb", "direct_projective"])
+@with_warnings
 @every_ad_variant
-def test_gradients_of_renders_reach_the_control_points(integrator):
-    scene, key = sample_scene(integrator), "shape.control_points"
-    parameters = mi.traverse(scene)
-    start = mi.Float(parameters[key])
+@pytest.mark.parametrize(("name", "options"), [*((name, {}) for name in NON_MANIFOLD), ("valence 5", CHORD)])
+def test_gradients_are_those_of_the_weights(name, options):
+    """Positions are linear in the control points, so that a difference over any step is the derivative."""
+    cage, rng = CAGES[name](), np.random.default_rng(1)
+    surface = LimitSurface(cage)
+    table = surface.adaptive_sampling(Criterion(Measure.CHORD, 1e-2), 64) if options else surface.sampling(4)
+    weights, direction = rng.uniform(-1, 1, (table.vertex_count, 3)), rng.uniform(-1, 1, cage.positions.shape)
+    parameters = mi.traverse(load(cage, **(options or {"tessellation_rate": 4})))
+    points = differentiated(parameters, "control_points")
+    dr.backward(dr.sum(parameters["vertex_positions"] * upload(mi.Float, weights)))
+    gradient = np.array(dr.grad(points)).reshape(-1, 3)
+    moved, before = (table.apply(positions)[0] for positions in (cage.positions + direction, cage.positions))
+    assert (gradient * direction).sum() == pytest.approx((weights * (moved - before)).sum(), abs=SUMMED)
+
+
+@pytest.mark.parametrize(("integrator", "by"), [("prb", "control_points"), ("direct_projective", "to_world")])
+@every_ad_variant
+def test_gradients_of_renders_reach_control_points_and_placement(integrator, by):
+    """A cube that grows under a sky: of a point light's shadows, projective integrators leave out derivatives."""
+    # Mitsuba never frees a scene with samples of indirect outlines; the cube has none to see.
+    integrator = {"type": integrator, **({"sppi": 0} if integrator == "direct_projective" else {})}
+    sensor, shape = perspective(16, [1, 2, 5], up=[0, 1, 0]), described(cube(), tessellation_rate=4)
+    scene = scene_with(integrator=integrator, sensor=sensor, sky={"type": "constant"}, shape=shape)
+    parameters, points = mi.traverse(scene), mi.Float(mi.traverse(scene)["shape.control_points"])
+
+    def grow(step):
+        larger = points * (1 + step) if by == "control_points" else mi.AffineTransform4f().scale(1 + step)
+        update(parameters, {f"shape.{by}": larger})
 
     def mean():
         return dr.mean(mi.render(scene, parameters, spp=256, seed=1), axis=None)
 
-    backward, forward, difference = (
-        derivative(mode, lambda step: update(parameters, {key: start * (1 + step)}), mean, 0.02) for mode in MODES
-    )
+    backward, forward, difference = (derivative(mode, grow, mean, 0.02) for mode in MODES)
     assert np.isfinite(backward)
     assert backward != 0
-    if integrator == "direct_projective":
+    if by == "to_world":
         # Growing covers more of the sky: silhouettes matter. Monte Carlo noise at 256 samples is a few per cent.
         assert backward == pytest.approx(difference, rel=0.1)
     assert forward == pytest.approx(backward, rel=0.1)
@@ -233,53 +319,50 @@ def test_gradients_of_renders_reach_the_control_points(integrator):
 def test_two_shapes_with_the_same_material_keep_their_parameters():
     shape = described(cube(), bsdf={"type": "ref", "id": "m"})
     other = {**shape, "to_world": mi.ScalarTransform4f().translate([4, 0, 0])}
-    scene = mi.load_dict({"type": "scene", "m": {"type": "diffuse", "id": "m"}, "a": shape, "b": other})
+    scene = scene_with(m={"type": "diffuse", "id": "m"}, a=shape, b=other)
     assert len(scene.shapes()) == 2
     parameters = mi.traverse(scene)
     assert {"a.control_points", "b.control_points"} <= set(parameters.keys())
     update(parameters, {"a.control_points": parameters["a.control_points"] * 2})
-    a, b = (scene.ray_intersect(mi.Ray3f([x, 0.1, 9], [0, 0, -1])) for x in (0.1, 4.1))
+    a, b = (scene.ray_intersect(down(x, 0.1, 9)) for x in (0.1, 4.1))
     assert dr.all(a.is_valid())
     assert dr.all(a.p.z > b.p.z + 0.5)
 
 
 @every_variant
 def test_instances():
-    scene = {"type": "scene", "group": {"type": "shapegroup", "shape": described(cube())}}
+    scene = {"group": {"type": "shapegroup", "shape": described(cube())}}
     for x in (-3, 3):
         to_world = mi.ScalarTransform4f().translate([x, 0, 0])
         scene[f"at_{x}"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-    scene = mi.load_dict(scene)
+    scene = scene_with(**scene)
     for x in (-3, 3):
-        si = scene.ray_intersect(mi.Ray3f([x + 0.1, 0.1, 9], [0, 0, -1]))
+        si = scene.ray_intersect(down(x + 0.1, 0.1, 9))
         assert dr.all(si.is_valid())
         assert dr.all(si.sh_frame.n.z > 0.9)
-    assert not dr.any(scene.ray_intersect(mi.Ray3f([0.1, 0.1, 9], [0, 0, -1])).is_valid())
+    assert not dr.any(scene.ray_intersect(down(0.1, 0.1, 9)).is_valid())
 
 
 @every_variant
-def test_area_emitter():
+def test_area_emitters_and_elements_of_faces_follow_the_triangles():
     shape = make(emitter={"type": "area", "radiance": 2.0})
-    assert len(mi.load_dict({"type": "scene", "shape": shape}).emitters()) == 1
+    assert len(scene_with(shape=shape).emitters()) == 1
     area = np.linalg.norm(triangle_normals(shape), axis=1).sum() / 2
     assert dr.allclose(shape.surface_area(), area, rtol=1e-5)
     assert dr.allclose(shape.sample_position(0, [0.3, 0.6]).pdf, 1 / area, rtol=1e-5)
-    update(shape, control_points=mi.traverse(shape)["control_points"] * 2)
-    assert dr.allclose(shape.surface_area(), 4 * area, rtol=1e-5)
-
-
-@every_variant
-def test_face_element_can_be_evaluated():
-    shape = make()
     si = hit(shape)
     expected = buffer(shape, "face_element")[np.array(si.prim_index).item()]
     assert dr.allclose(si.shape.eval_attribute_1("face_element", si), expected)
+    update(shape, control_points=mi.traverse(shape)["control_points"] * 2)
+    assert dr.allclose(shape.surface_area(), 4 * area, rtol=1e-5)
 
 
 @pytest.mark.core
 @every_variant
 def test_renders():
-    image = np.array(mi.render(sample_scene(), spp=4))
+    sensor, shape = perspective(16, [1, 2, 5], up=[0, 1, 0]), described(cube(), tessellation_rate=4)
+    scene = scene_with(integrator={"type": "direct"}, sensor=sensor, sky={"type": "constant"}, shape=shape)
+    image = np.array(mi.render(scene, spp=4))
     assert np.isfinite(image).all()
     # The shape reflects half of the sky, which is behind it.
     assert 0.3 < image[8, 8].min() < 0.7
