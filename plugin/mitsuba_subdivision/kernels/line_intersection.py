@@ -53,6 +53,11 @@ class Lines:
     d: Vector3
     hold: Mask  # Lanes whose point lies on its line; other points keep their location on the surface
 
+    @property
+    def variables(self) -> tuple[Vector3, ...]:
+        """Arrays that the points follow besides the control points."""
+        return self.o, self.d
+
     def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton step from given values of the surface, whose derivatives follow the line."""
         du, dv = step_along(self.o - here.value, self.d, dr.detach(here.du), dr.detach(here.dv))

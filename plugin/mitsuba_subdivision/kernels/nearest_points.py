@@ -37,6 +37,11 @@ class NearestPoints:
     along_v: Float
     is_free: Mask  # Lanes whose surface point may move in all directions
 
+    @property
+    def variables(self) -> tuple[Vector3, ...]:
+        """Arrays that the surface points follow besides the control points."""
+        return (self.p,)
+
     def step(self, here: PatchValues) -> tuple[Float, Float]:
         """Newton step from given values of the surface, whose derivatives follow the nearest point."""
         offset = here.value - self.p

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
-from .algebra import cross, over, rounding, unit
+from .algebra import AffineMap, cross, over, rounding, unit
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .line_intersection import MISSED, ON_LINE, LineHits, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
-from .locations import ElementWalk, Location
+from .locations import Location
 from .nearest_points import NearestPoints, nearest_locations
 from .piece_kernel import DIFFERENCE, PatchValues, Piece, PieceKernel
-from .surface_points import NearestSurfacePoints, RandomSurfacePoints, SurfaceHits, SurfacePoints
 from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
@@ -26,6 +25,56 @@ if TYPE_CHECKING:
 
 # Largest distance of a hit from its line, relative to the longest derivative of the surface; used by `intersect`.
 NEAR_LINE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of a surface.
+
+    Attributes
+    ----------
+    location : Location
+        Element and parameters.
+    p : 3-vector
+        In the space of the control points.
+    n : 3-vector
+        Unit normal along ``dp_du x dp_dv``. Where the surface has none, as on folds, zero or dominated by rounding.
+    dp_du, dp_dv : 3-vectors
+        Derivatives by the parameters of the location.
+    dn_du, dn_dv : 3-vectors, or None
+        Derivatives of the normal, if they were requested.
+    t : float array, or None
+        Of `SurfaceKernel.intersect`: ray parameter, in lengths of the direction; infinite where the ray does not
+        intersect the surface nearby.
+    distance : float array, or None
+        Of `SurfaceKernel.closest`: distance from the given points.
+    pdf : float array, or None
+        Of `SurfaceKernel.sample`: probability density by area.
+    """
+
+    location: Location
+    p: Vector3
+    n: Vector3
+    dp_du: Vector3
+    dp_dv: Vector3
+    dn_du: Vector3 = None
+    dn_dv: Vector3 = None
+    t: Float = None
+    distance: Float = None
+    pdf: Float = None
+
+    def placed(self, to_world: AffineMap) -> SurfacePoints:
+        """Transform the points to another space."""
+        normal = to_world.normal(self.n)
+        n = unit(normal)
+        dp_du, dp_dv = to_world.direction(self.dp_du), to_world.direction(self.dp_dv)
+        points = SurfacePoints(self.location, to_world.point(self.p), n, dp_du, dp_dv)
+        if self.dn_du is None:
+            return points
+        inverse = over(1, dr.norm(normal), 0)
+        changes = (to_world.normal(derivative) * inverse for derivative in (self.dn_du, self.dn_dv))
+        dn_du, dn_dv = (change - n * dr.dot(n, change) for change in changes)
+        return replace(points, dn_du=dn_du, dn_dv=dn_dv)
 
 
 class SurfaceKernel:
@@ -41,7 +90,7 @@ class SurfaceKernel:
         cells: Callable[[], SamplingCells] | None = None,  # Makes the cells for `sample` when it is first called
     ) -> None:
         self.types = ArrayTypes.of(float_type)
-        self._cells = cells
+        self._make_cells = cells
         self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
         self.walk = self._patches.walk  # Over the surface's elements
         # Displacement of the surface. All results are those of the displaced surface, and differentiable with respect
@@ -107,7 +156,7 @@ class SurfaceKernel:
 
     def intersect(
         self, ray: Ray, element: Index | Location, uv: Vector2 | None = None, corner: Index = 0, derivatives: int = 1
-    ) -> SurfaceHits:
+    ) -> SurfacePoints:
         """Intersect rays with the surface near given parameters.
 
         Differentiable with respect to the control points and the ray: hits stay on the ray.
@@ -129,7 +178,7 @@ class SurfaceKernel:
         projection = origin + direction * (dr.dot(projection, direction) / dr.squared_norm(direction))
         hits = self.line_hits(projection, direction, start)
         lines = Lines(o, d, hits.kind == ON_LINE)
-        points = self.at(hits.location, derivatives=derivatives, lines=lines, values=hits.values)
+        points = self.at(hits.location, derivatives=derivatives, constraint=lines, values=hits.values)
         along_ray = points.p - o
         t = dr.dot(along_ray, d) / dr.squared_norm(d)
         squared_distance = dr.squared_norm(dr.detach(along_ray - d * t))
@@ -138,7 +187,7 @@ class SurfaceKernel:
         squared_size = dr.squared_norm(dr.detach(points.p)) + dr.squared_norm(dr.detach(along_ray))
         is_on_line = squared_distance < dr.maximum(tolerance, dr.square(rounding(self.types)) * squared_size)
         t = dr.select((hits.kind != MISSED) & is_on_line, t, dr.inf)
-        return SurfaceHits(**vars(points), t=t)
+        return replace(points, t=t)
 
     def closest(
         self,
@@ -147,7 +196,7 @@ class SurfaceKernel:
         uv: Vector2 | None = None,
         corner: Index = 0,
         derivatives: int = 1,
-    ) -> NearestSurfacePoints:
+    ) -> SurfacePoints:
         """Find locally nearest points of the surface by descent from given parameters.
 
         The descent crosses elements, and follows a border or a crease that it cannot cross. The result is a local
@@ -167,10 +216,10 @@ class SurfaceKernel:
         start = dr.detach(self._location(element, uv, corner))
         piece_at = partial(self._patches.piece, dr.detach(self.coefficients))
         location, nearest = nearest_locations(self.walk, piece_at, dr.detach(points), start)
-        surface = self.at(location, derivatives=derivatives, nearest=replace(nearest, p=points))
-        return NearestSurfacePoints(**vars(surface), distance=dr.norm(points - surface.p))
+        surface = self.at(location, derivatives=derivatives, constraint=replace(nearest, p=points))
+        return replace(surface, distance=dr.norm(points - surface.p))
 
-    def sample(self, choice: Float, inside: Vector2, derivatives: int = 1) -> RandomSurfacePoints:
+    def sample(self, choice: Float, inside: Vector2, derivatives: int = 1) -> SurfacePoints:
         """Draw points of the surface from random numbers.
 
         No number is rejected, so points are not exactly uniform by area: their density is ``pdf``, and their weight is
@@ -193,15 +242,40 @@ class SurfaceKernel:
         ValueError
             If the kernel was made without cells.
         """
-        location, density = self._sampler.drawn(choice, inside)
-        points = self.at(location, derivatives=derivatives)
-        return RandomSurfacePoints(**vars(points), pdf=over(density, dr.norm(cross(points.dp_du, points.dp_dv))))
+        types = self.types
+        until, density, start, matrices, offsets = self._cells
+
+        def is_before(index: Index) -> Mask:
+            return types.fetch(types.float, until, index) <= choice
+
+        cell = types.index(dr.binary_search(0, len(until) - 1, is_before))
+        x, y = inside[0], inside[1]
+        if self.walk.domain.corner_count == 3:
+            is_beyond = x + y > 1
+            x, y = dr.select(is_beyond, 1 - x, x), dr.select(is_beyond, 1 - y, y)
+        a, b, c, d = types.fetch(types.vector4, matrices, cell)
+        offset = types.fetch(types.vector2, offsets, cell)
+        u, v = dr.fma(a, x, dr.fma(b, y, offset[0])), dr.fma(c, x, dr.fma(d, y, offset[1]))
+        points = self.at(Location(types.fetch(types.index, start, cell), u, v), derivatives=derivatives)
+        by_parameters = types.fetch(types.float, density, cell)
+        return replace(points, pdf=over(by_parameters, dr.norm(cross(points.dp_du, points.dp_dv))))
 
     @cached_property
-    def _sampler(self) -> AreaSampler:
-        if self._cells is None:
+    def _cells(self) -> tuple[FloatBuffer, ...]:
+        """Cumulative probabilities of cells, and densities by their parameters, half-edges, matrices and offsets."""
+        if self._make_cells is None:
             raise ValueError("the kernel was made without cells to draw from; expected one from LimitSurface.on_device")
-        return AreaSampler(self._cells(), self.types, self.walk)
+        types, cells = self.types, self._make_cells()
+        if not cells.areas.sum() > 0:
+            raise ValueError("the surface has no area; expected one to draw points from")
+        # Probabilities are differences of the rounded cumulative sums.
+        cumulative = (np.cumsum(cells.areas) / cells.areas.sum()).astype(types.numpy_float)
+        cumulative[-1] = 1
+        size = np.abs(np.linalg.det(cells.matrices)) * (0.5 if self.walk.domain.corner_count == 3 else 1)
+        density = np.diff(cumulative.astype(np.float64), prepend=0) / size
+        floats = (types.floats(values) for values in (cumulative, density, cells.matrices, cells.offsets))
+        until, density, matrices, offsets = floats
+        return until, density, types.indices(cells.half_edge), matrices, offsets
 
     def at(
         self,
@@ -209,71 +283,55 @@ class SurfaceKernel:
         active: Mask = True,
         derivatives: int = 1,  # 2 adds the derivatives of the normals
         *,
-        # Lines whose hits the points are: derivatives then follow the hits, else the location is fixed. Next to
-        # extraordinary points, derivatives of ``dp_du`` and ``dp_dv`` are those for a fixed location in any case.
-        lines: Lines | None = None,
-        nearest: NearestPoints | None = None,  # Points whose nearest points derivatives follow
+        # Lines whose hits the points are, or points that they are nearest to: derivatives then follow these, else the
+        # location is fixed.
+        constraint: Lines | NearestPoints | None = None,
         moves: bool = True,  # Whether results are attached to the control points and the displacement
         # Values at the location, as returned by `line_hits`: saves evaluation where nothing is differentiated
         values: PatchValues | None = None,
     ) -> SurfacePoints:
         """Evaluate the surface."""
         coefficients = self.coefficients if moves else dr.detach(self.coefficients)
-        if self.displacement is None or moves:
-            return self._at(location, active, derivatives, lines, nearest, coefficients, values)
-        with dr.suspend_grad(*self.displacement.variables()):
-            return self._at(location, active, derivatives, lines, nearest, coefficients, values)
-
-    def _at(
-        self,
-        location: Location,
-        active: Mask,
-        derivatives: int,
-        lines: Lines | None,
-        nearest: NearestPoints | None,
-        coefficients: FloatBuffer,
-        values: PatchValues | None,
-    ) -> SurfacePoints:
-        u, v = dr.detach(location.u), dr.detach(location.v)
         variables = [] if self.displacement is None else self.displacement.variables()
-        is_moving = dr.grad_enabled(coefficients, *variables)
-        constraint: Lines | NearestPoints | None = None
-        if lines is not None and (is_moving or dr.grad_enabled(lines.o, lines.d)):
-            constraint = lines
-        elif nearest is not None and (is_moving or dr.grad_enabled(nearest.p)):
-            constraint = nearest
-        is_location_moving = constraint is not None or dr.grad_enabled(location.u, location.v)
-        if values is None or is_moving or derivatives == 2 or is_location_moving:
-            piece = self._piece(coefficients, location.half_edge, u, v, active)
-            evaluated = piece.values(derivatives=2 if is_location_moving else derivatives)
-            # With the known primal values, Dr.Jit omits the evaluation from kernels that only need derivatives.
-            values = evaluated.at_values(values) if values is not None and is_moving else evaluated
-        n = unit(values.normal)
-        if derivatives == 1 and not is_location_moving:
-            return SurfacePoints(location, values.value, n, values.du, values.dv)
-        # If the derivatives of normals are not returned, they need not be differentiable.
-        with dr.suspend_grad(when=derivatives == 1):
-            dn_du, dn_dv = _normal_derivatives(values, n)
-        if not is_location_moving:
-            return SurfacePoints(location, values.value, n, values.du, values.dv, dn_du, dn_dv)
-        steps = (location.u, location.v) if constraint is None else constraint.step(values)
-        # Steps of value zero that carry the derivatives of the parameters.
-        du_step, dv_step = (dr.replace_grad(self.types.float(0), step) for step in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
-        location, shifted = Location(location.half_edge, u + du_step, v + dv_step), values.shifted(du_step, dv_step)
-        n = n + (dr.detach(dn_du) * du_step + dr.detach(dn_dv) * dv_step)
-        dp_du, dp_dv = shifted.du, shifted.dv
-        if lines is not None and constraint is lines and piece.is_deep is not None:
-            # Derivatives of tangents are unbounded near extraordinary points, and would add noise.
-            dp_du, dp_dv = dr.select(piece.is_deep, values.du, dp_du), dr.select(piece.is_deep, values.dv, dp_dv)
-        points = SurfacePoints(location, shifted.value, n, dp_du, dp_dv)
-        if derivatives == 1:
-            return points
-        normals_by_u, normals_by_v = _second_normal_derivatives(piece)
-        dn_du, dn_dv = (
-            derivative + (by_u * du_step + by_v * dv_step)
-            for derivative, by_u, by_v in zip((dn_du, dn_dv), normals_by_u, normals_by_v, strict=True)
-        )
-        return replace(points, dn_du=dn_du, dn_dv=dn_dv)
+        with dr.suspend_grad(*variables, when=bool(variables) and not moves):
+            is_moving = dr.grad_enabled(coefficients, *variables)
+            if constraint is not None and not (is_moving or dr.grad_enabled(*constraint.variables)):
+                constraint = None
+            follows = constraint is not None or dr.grad_enabled(location.u, location.v)
+            order = 2 if follows else derivatives
+            if values is None or is_moving or order == 2:
+                u, v = dr.detach(location.u), dr.detach(location.v)
+                piece = self._piece(coefficients, location.half_edge, u, v, active)
+                evaluated = piece.values(derivatives=order)
+                # With the known primal values, Dr.Jit omits the evaluation from kernels that only need derivatives.
+                values = evaluated.at_values(values) if values is not None and is_moving else evaluated
+            n = unit(values.normal)
+            points = SurfacePoints(location, values.value, n, values.du, values.dv)
+            if order == 1:
+                return points
+            # If the derivatives of normals are not returned, they need not be differentiable.
+            with dr.suspend_grad(when=derivatives == 1):
+                dn_du, dn_dv = _normal_derivatives(values, n)
+            if derivatives == 2:
+                points = replace(points, dn_du=dn_du, dn_dv=dn_dv)
+            if not follows:
+                return points
+            steps = (location.u, location.v) if constraint is None else constraint.step(values)
+            # Steps of value zero that carry the derivatives of the parameters.
+            du, dv = (dr.replace_grad(self.types.float(0), step) for step in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
+            shifted = values.shifted(du, dv)
+            dp_du, dp_dv = shifted.du, shifted.dv
+            if isinstance(constraint, Lines) and piece.is_deep is not None:
+                # Derivatives of tangents are unbounded near extraordinary points, and would add noise.
+                dp_du, dp_dv = dr.select(piece.is_deep, values.du, dp_du), dr.select(piece.is_deep, values.dv, dp_dv)
+            n = n + (dr.detach(dn_du) * du + dr.detach(dn_dv) * dv)
+            location = Location(location.half_edge, u + du, v + dv)
+            points = replace(points, location=location, p=shifted.value, n=n, dp_du=dp_du, dp_dv=dp_dv)
+            if derivatives == 1:
+                return points
+            by_u, by_v = _second_normal_derivatives(piece)
+            dn_du, dn_dv = (x + (x_u * du + x_v * dv) for x, x_u, x_v in zip((dn_du, dn_dv), by_u, by_v, strict=True))
+            return replace(points, dn_du=dn_du, dn_dv=dn_dv)
 
     def _piece(
         self,
@@ -320,49 +378,3 @@ def _second_normal_derivatives(piece: Piece) -> tuple[list, list]:
         )
         by_u, by_v = ([(b - a) * inverse for b, a in zip(*pair, strict=True)] for pair in pairs)
     return by_u, by_v
-
-
-class AreaSampler:
-    """Draws random locations on a surface."""
-
-    def __init__(
-        self,
-        cells: SamplingCells,
-        types: ArrayTypes,
-        walk: ElementWalk,  # Over the surface's elements
-    ) -> None:
-        self._types, self._walk = types, walk
-        self._count = len(cells.areas)
-        if not cells.areas.sum() > 0:
-            raise ValueError("the surface has no area; expected one to draw points from")
-        # Probabilities are differences of the rounded cumulative sums.
-        cumulative = (np.cumsum(cells.areas) / cells.areas.sum()).astype(types.numpy_float)
-        cumulative[-1] = 1
-        probabilities = np.diff(cumulative.astype(np.float64), prepend=0)
-        size = np.abs(np.linalg.det(cells.matrices)) * (0.5 if walk.domain.corner_count == 3 else 1)
-        self._until = types.floats(cumulative)
-        self._start = types.indices(cells.half_edge)
-        self._matrices, self._offsets = types.floats(cells.matrices), types.floats(cells.offsets)
-        self._density = types.floats(probabilities / size)
-
-    def drawn(
-        self,
-        choice: Float,  # In [0, 1)
-        inside: Vector2,  # In [0, 1) each
-    ) -> tuple[Location, Float]:
-        """Draw locations, and return them with their density by the parameters of their elements."""
-        types = self._types
-
-        def is_before(index: Index) -> Mask:
-            return types.fetch(types.float, self._until, index) <= choice
-
-        cell = types.index(dr.binary_search(0, self._count - 1, is_before))
-        x, y = inside[0], inside[1]
-        if self._walk.domain.corner_count == 3:
-            is_beyond = x + y > 1
-            x, y = dr.select(is_beyond, 1 - x, x), dr.select(is_beyond, 1 - y, y)
-        a, b, c, d = types.fetch(types.vector4, self._matrices, cell)
-        offset = types.fetch(types.vector2, self._offsets, cell)
-        u, v = dr.fma(a, x, dr.fma(b, y, offset[0])), dr.fma(c, x, dr.fma(d, y, offset[1]))
-        half_edge = types.fetch(types.index, self._start, cell)
-        return Location(half_edge, u, v), types.fetch(types.float, self._density, cell)

@@ -20,8 +20,7 @@ from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.linear_maps import ControlValues
 from ..kernels.locations import Location, TriangleLocations
-from ..kernels.surface_kernel import SurfaceKernel
-from ..kernels.surface_points import SurfacePoints
+from ..kernels.surface_kernel import SurfaceKernel, SurfacePoints
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
@@ -204,9 +203,8 @@ class ExactShading:
         if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
             o, ray_direction = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
             lines = Lines(o, ray_direction, hits.kind == ON_LINE)
-        points = kernel.at(
-            hits.location, active, 2 if flags & _NORMAL_DERIVATIVES else 1, lines=lines, moves=moves, values=hits.values
-        )
+        order = 2 if flags & _NORMAL_DERIVATIVES else 1
+        points = kernel.at(hits.location, active, order, constraint=lines, moves=moves, values=hits.values)
         is_before = active & (dot(dr.detach(points.p) - hit, d) < 0)
         points = points.placed(to_world)
         if flags & _PARAMETERS:
@@ -262,7 +260,7 @@ class ExactShading:
                 to_world = AffineMap.of(self.to_world)
             d = to_world.inverse_direction(dr.select(is_mirrored, mirrored, direction))
             lines = Lines(to_world.inverse_point(vector3(si.p)), d, is_held)
-            location = self.kernel.at(location, active, lines=lines).location
+            location = self.kernel.at(location, active, constraint=lines).location
         value = self._attributes[name](location, active)[0]
         return self._upsampling(value) if self._upsampling and name in self._colors else value
 
