@@ -11,7 +11,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
-from .cage.rules import RULES
+from .cage.contents import RULES
 from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.seams import seams
 from .surface import LimitSurface

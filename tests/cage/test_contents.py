@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, ControlCage
-from mitsuba_subdivision.cage.contents import CageContents
+from mitsuba_subdivision.cage.contents import RULES, CageContents
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.cage.rules import RULES
 from reference.refined_cages import tagged
 
 

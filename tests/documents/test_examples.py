@@ -29,7 +29,7 @@ import mitsuba_subdivision
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage.rules import RULES
+from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.figures import FIGURES
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.files.obj_reader import read_obj

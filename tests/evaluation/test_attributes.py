@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, torus
 from reference.exact_samples import faces_of
 from reference.face_varying import Channel, refined

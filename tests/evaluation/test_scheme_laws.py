@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from evaluation.common import ChangedCatmullClark
 from mitsuba_subdivision import LimitSurface, SchemeError, check_scheme, register_scheme
-from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, Scheme, StencilTable
 from mitsuba_subdivision.schemes.domain import SQUARE

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, CageWarning, ControlCage
-from mitsuba_subdivision.cage import rules
+from mitsuba_subdivision.cage import contents
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from reference.exact_samples import faces_of
@@ -53,7 +53,7 @@ RULES = {
 
 @pytest.mark.parametrize(("rule", "tag"), RULES)
 def test_rules_are_those_of_tags_unless_an_argument_overrides_them(read, rule, tag):
-    override = rules.RULES[rule][-1]
+    override = contents.RULES[rule][-1]
     for given, expected in RULES[rule, tag].items():
         assert getattr(read(f"t {tag.format(given)}\n"), rule) == expected
         assert getattr(read(f"t {tag.format(given)}\n", **{rule: override}), rule) == override
@@ -230,8 +230,8 @@ def test_time_of_tags_grows_with_their_number(tmp_path):
 
 def test_a_rule_that_no_tag_stands_for_is_lost_with_a_warning(tmp_path, monkeypatch):
     """As a new boundary rule would be, which OpenSubdiv's tags do not know."""
-    monkeypatch.setitem(rules.RULES, "boundary", (*rules.RULES["boundary"], "new"))
+    monkeypatch.setitem(contents.RULES, "boundary", (*contents.RULES["boundary"], "new"))
     cage = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="new")
     with pytest.warns(CageWarning, match="no place for boundary new"):
         cage.save(tmp_path / "cage.obj")
-    assert ControlCage.from_file(tmp_path / "cage.obj").boundary == rules.RULES["boundary"][0]
+    assert ControlCage.from_file(tmp_path / "cage.obj").boundary == contents.RULES["boundary"][0]

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, CageWarning, ControlCage
-from mitsuba_subdivision.cage.contents import same
+from mitsuba_subdivision.cage.contents import RULES, same
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.cage.rules import RULES
 from mitsuba_subdivision.files.usd_writer import write_usd
 from usd.stages import moved, prim
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.cage.attributes import Attribute
+from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.patches import LinearChannel, SubdividedChannel, channel
 from patches.closed_cages import mixed_torus
 from patches.locations import grid_locations

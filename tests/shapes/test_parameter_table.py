@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.rules import RULES
+from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.shapes import register_variant
 from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
 from mitsuba_subdivision.shapes.parameters import is_attribute_parameter

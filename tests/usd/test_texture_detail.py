@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mitsuba_subdivision.cage.attributes import Attribute
-from mitsuba_subdivision.cage.contents import CageContents
+from mitsuba_subdivision.cage.contents import Attribute, CageContents
 from mitsuba_usd.baking import Baked
 from mitsuba_usd.contents import InstanceContents, MaterialContents, NodeContents, ShapeContents, TextureContents
 from mitsuba_usd.stage_warnings import StageWarnings

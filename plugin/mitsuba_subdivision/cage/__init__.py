@@ -1,7 +1,6 @@
 """Control cages: validation, tags, attributes, contents of files, and named examples."""
 
-from .attributes import Attribute
-from .contents import CageContents, same, same_topology
+from .contents import Attribute, CageContents, same, same_topology
 from .control_cage import ControlCage
 from .errors import CageError, CageSource, CageWarning, in_digits, shortened, warn
 from .validation import require_range

@@ -1,17 +1,135 @@
-"""Contents of a file with a control cage, and their comparison."""
+"""Contents of a file with a control cage: its arrays, attributes and rules, and their comparison."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..mesh.connectivity import IntArray
-from .attributes import Attribute
-from .errors import CageSource
+from ..mesh.connectivity import IntArray, Topology
+from .errors import CageError, CageSource, number_of_such, shortened
+
+Interpolation = Literal["vertex", "varying", "face_varying"]
+INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
+
+# Rules of a cage and their values, named as in OpenSubdiv and USD. The first value is the default.
+RULES = {
+    "boundary": ("edge_and_corner", "edge_only", "none"),
+    "crease_method": ("uniform", "chaikin"),
+    "triangle_rule": ("catmull_clark", "smooth"),
+    "face_varying": ("corners_plus1", "none", "corners_only", "corners_plus2", "boundaries", "all"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Attribute:
+    """Values at the vertices or face corners of a control cage.
+
+    A cage stores a validated copy of an attribute, with read-only arrays: ``values`` float64, ``indices`` int64.
+
+    Parameters
+    ----------
+    values : (n, k) array
+        One row for each vertex of the cage. With "face_varying", one row for each distinct value.
+    interpolation : "vertex", "varying" or "face_varying"
+        "vertex": values are subdivided like points. "varying": values are interpolated bilinearly over each face.
+        "face_varying", usual for texture coordinates: values belong to face corners, and are subdivided like points,
+        but may be discontinuous along edges.
+    indices : (n_h,) int array, optional
+        With "face_varying" only: the 0-based row of ``values`` at each face corner, in the order of the cage's
+        ``face_vertices``. By default ``values`` has one row for each face corner, in that order.
+    """
+
+    values: NDArray
+    interpolation: Interpolation
+    indices: IntArray | None
+
+    def __init__(
+        self, values: ArrayLike, interpolation: Interpolation = "vertex", indices: ArrayLike | None = None
+    ) -> None:
+        indices = None if indices is None else _array(indices)
+        vars(self).update(values=_array(values), interpolation=interpolation, indices=indices)
+
+
+def validated_attribute(
+    given: Attribute | ArrayLike,  # An array has a row for each vertex
+    name: str,  # Name of the attribute in messages
+    topology: Topology,
+    source: CageSource,
+    # (n_h,) int64: if faces were turned over, the given face corner of each face corner of the mesh
+    order: IntArray | None = None,
+    width: int | None = None,  # Required number of columns
+) -> Attribute:
+    """Check an attribute of a cage, and return it with read-only arrays of float64 and int64.
+
+    Raises CageError if sizes do not match, an index is out of range, a value is not finite, or the interpolation is
+    unknown.
+    """
+    attribute = given if isinstance(given, Attribute) else Attribute(given)
+    interpolation, indices = attribute.interpolation, attribute.indices
+    label = f'{source.name}: attribute "{shortened(name)}"'
+    if interpolation not in INTERPOLATIONS:
+        raise CageError(f'{label} has the interpolation "{interpolation}"; expected one of {", ".join(INTERPOLATIONS)}')
+    values = _validated_values(attribute.values, label, width)
+    if interpolation != "face_varying":
+        if indices is not None:
+            raise CageError(f"{label} has indices; expected them with face-varying interpolation only")
+        if len(values) != topology.vertex_count:
+            raise CageError(f"{label} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
+        return Attribute(values, interpolation)
+    corner_count = topology.half_edge_count
+    if indices is None:
+        if len(values) != corner_count:
+            expected = f"expected {corner_count} values, one per face corner"
+            raise CageError(f"{label} has {len(values)} values and no indices; {expected}")
+        indices = np.arange(corner_count)
+    # Not copied before the length is checked, as a damaged file may have any number of indices.
+    if indices.shape != (corner_count,) or not np.issubdtype(indices.dtype, np.integer):
+        raise CageError(
+            f"{label} has indices of shape {indices.shape} and type {indices.dtype}; expected {corner_count} integers, "
+            "one per face corner"
+        )
+    wrong = np.flatnonzero((indices < 0) | (indices >= len(values)))
+    if len(wrong):
+        corner = int(wrong[0])
+        face = int(topology.face[corner])
+        raise CageError(
+            f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])} has index {indices[corner]} "
+            f'into attribute "{shortened(name)}"; expected 0 to {len(values) - 1} ({len(wrong)} such corners)'
+        )
+    indices = (indices if order is None else indices[order]).astype(np.int64)
+    indices.flags.writeable = False
+    return Attribute(values, interpolation, indices)
+
+
+def _validated_values(unchecked: NDArray, label: str, width: int | None) -> NDArray[np.float64]:
+    try:
+        # A zero-dimensional array contains values that could not be converted, see `_array`.
+        values = np.array(unchecked if unchecked.ndim else unchecked.item(), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise CageError(f"{label} has values that are no table of numbers: {error}") from error
+    if values.ndim != 2 or not values.shape[1] or width not in (None, values.shape[1]):
+        raise CageError(f"{label} has values of shape {values.shape}; expected (n, {width or 'k'})")
+    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(wrong):
+        value = shortened(str(values[wrong[0]].tolist()))
+        such = number_of_such(len(wrong), "value")
+        raise CageError(f"{label}: value {wrong[0]} is {value}; expected finite numbers ({such})")
+    values.flags.writeable = False
+    return values
+
+
+def _array(values: ArrayLike) -> NDArray:
+    """Return an array, or a zero-dimensional object array if ``values`` are none; the cage then raises an error."""
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError):  # Such as rows of different lengths.
+        wrapped = np.empty((), dtype=object)
+        wrapped[()] = values
+        return wrapped
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,13 +16,17 @@ from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
 from ..mesh.sharpness import CreaseMethod
 from ..variants import variant_module
-from .attributes import Attribute, validated_attributes, validated_texcoords
-from .contents import CageContents
+from .contents import RULES, Attribute, CageContents, validated_attribute
 from .errors import CageError, CageSource
-from .rules import RULES
 from .structure import CageStructure
-from .tags import validated_tags
-from .validation import flattened_faces, validated_face_indices, validated_faces, validated_holes, validated_positions
+from .validation import (
+    flattened_faces,
+    validated_face_indices,
+    validated_faces,
+    validated_holes,
+    validated_positions,
+    validated_tags,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -170,6 +174,14 @@ class ControlCage:
         for name, rule in rules.items():
             if rule not in RULES[name]:
                 raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
+        attributes = {} if attributes is None else attributes
+        if not isinstance(attributes, Mapping):
+            raise CageError(f"{source.name}: attributes are {attributes!r}; expected a dict of attributes by name")
+        if "texcoords" in attributes:
+            raise CageError(
+                f'{source.name}: an attribute is called "texcoords"; expected another name, as texture coordinates are '
+                "given apart from attributes"
+            )
         validated = validated_positions(positions, source)
         topology, non_manifold, order = validated_faces(len(validated), sizes, vertices, source, strict)
         structure = CageStructure(
@@ -183,8 +195,13 @@ class ControlCage:
         vars(self).update(
             positions=validated,
             structure=structure,
-            texcoords=validated_texcoords(texcoords, topology, source, order),
-            attributes=validated_attributes(attributes, topology, source, order),
+            texcoords=(
+                None if texcoords is None else validated_attribute(texcoords, "texcoords", topology, source, order, 2)
+            ),
+            attributes={
+                name: validated_attribute(attribute, name, topology, source, order)
+                for name, attribute in attributes.items()
+            },
             materials={
                 name: validated_face_indices(topology, faces, "material face", source)
                 for name, faces in (materials or {}).items()

@@ -15,7 +15,6 @@ from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
 from ..mesh.shared import Content, Shared
 from ..mesh.sharpness import CreaseMethod
-from .rules import boundary_corners, boundary_holes
 from .validation import read_only
 
 if TYPE_CHECKING:
@@ -51,7 +50,9 @@ class CageStructure:
         t, is_corner = self.topology, self.tags.is_corner
         if self.non_manifold is not None:
             is_corner = is_corner | self.non_manifold.is_corner
-        return is_corner | boundary_corners(self.boundary, t)
+        if self.boundary == "edge_and_corner":
+            is_corner = is_corner | t.is_border_vertex & (t.vertex_face_count == 1)
+        return is_corner
 
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:
@@ -76,9 +77,13 @@ class CageStructure:
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:
         t = self.topology
-        hole = boundary_holes(self.boundary, t, self.is_boundary & ~self.tags.is_infinite)
-        hole[self.holes] = True
-        return hole
+        is_hole = np.zeros(t.face_count, dtype=bool)
+        is_hole[self.holes] = True
+        if self.boundary == "none":
+            # Faces at infinitely sharp boundary edges are part of the surface.
+            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
+            is_hole[t.face[np.flatnonzero(at_boundary[t.face_vertices])]] = True
+        return is_hole
 
     @cached_property
     def edges(self) -> IndexArray:

@@ -5,7 +5,7 @@ Every error names the first invalid value, the number of invalid values, and the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from typing import cast
 
@@ -13,12 +13,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.manifold import NonManifold
-from .errors import CageError, CageSource, number_of_such, warn
-from .oriented_faces import oriented_faces
+from ..mesh.cuts import Sharpness
+from ..mesh.manifold import (
+    NonManifold,
+    fan_counts,
+    fan_labels,
+    is_manifold,
+    is_repeated,
+    runs_with_twin,
+    separated,
+    turning_order,
+)
+from ..mesh.sharpness import INFINITE
+from .errors import CageError, CageSource, in_digits, number_of, number_of_such, warn
 
 # Vertices and half-edges of the cage, and of the cage refined once, must fit into 31 bits.
 MOST_FACE_CORNERS = MOST_VERTICES = (1 << 29) - 1
+# float64 represents all integers up to this exactly.
+_LARGEST_INDEX = 2**53
+# Maximum number of items of a kind that a message about the manifold names.
+SHOWN = 3
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
@@ -72,11 +86,16 @@ def validated_faces(
     source: CageSource,
     strict: bool,  # Whether the faces must be an oriented 2-manifold, closed or with boundary
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
-    """Check the faces of a cage, and return them as an oriented manifold, as `oriented_faces`.
+    """Check the faces of a cage, turn over those against their neighbours, and cut the mesh at non-manifold edges.
 
     Raises CageError if there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is
-    not an integer or out of range; with ``strict``, also as `oriented_faces`. Warns if vertices belong to no face,
-    faces are turned over, or the faces are not a manifold.
+    not an integer or out of range; with ``strict``, also if a face has a vertex twice, an edge has more than two faces,
+    neighbouring faces have opposite windings, or the faces of a vertex are not one fan. Warns if vertices belong to no
+    face, faces are turned over, or the faces are not a manifold.
+
+    Returns the topology, in which half-edges of non-manifold edges have no twin, and vertices may have several fans;
+    non-manifold edges and vertices, None for a manifold; and, if faces were turned over, (n_h,) int64, the given face
+    corner of each face corner of the topology.
     """
     flat_sizes, flat_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
     sizes = _integers(flat_sizes, "face_sizes", source)
@@ -88,11 +107,91 @@ def validated_faces(
     if (sizes == sizes[0]).all():
         # A broadcast scalar saves memory.
         sizes = np.broadcast_to(sizes[0], sizes.shape)
-    topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
-    oriented, non_manifold, order = oriented_faces(topology, source, strict)
-    read_only(oriented.face_vertices)
-    _warn_of_unused_vertices(topology, source)
-    return oriented, non_manifold, order
+    given = topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
+    non_manifold = order = None
+    if not is_manifold(given):
+        if strict:
+            _require_manifold(given, source)
+        order = turning_order(given)
+        if order is not None:
+            topology = Topology(vertex_count, given.face_sizes, read_only(vertices[order]))
+            turned = np.unique(given.face[order != np.arange(len(order))])
+            warn(
+                f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, as they were "
+                f"wound against their neighbours: {source.faces(turned, SHOWN)} (numbers count from "
+                f"{source.index_base})"
+            )
+        topology, non_manifold = separated(topology)
+        if non_manifold is not None:
+            warn(_description(topology, non_manifold, source))
+    unused = np.flatnonzero(given.vertex_face_count == 0)
+    if len(unused):
+        shown = ", ".join(str(vertex + source.index_base) for vertex in unused[:5].tolist())
+        warn(
+            f"{source.name}: {len(unused)} of {vertex_count} vertices are used by no face and have no effect ({shown}"
+            f"{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})"
+        )
+    return topology, non_manifold, order
+
+
+def _require_manifold(t: Topology, source: CageSource) -> None:
+    """Raise CageError about the first face, edge or vertex where a mesh is no oriented manifold."""
+
+    def edge_at(half_edge: int) -> str:
+        return source.edge(t.face_vertices[half_edge], t.face_vertices[t.next[half_edge]])
+
+    repeated = np.flatnonzero(is_repeated(t))
+    if len(repeated):
+        faces = np.unique(t.face[repeated])
+        vertex = t.face_vertices[repeated[t.face[repeated] == faces[0]]].min()
+        problem = f"has {source.vertex(vertex)} more than once"
+        raise source.error(source.at_face(faces[0]), problem, "distinct vertices", len(faces), "face")
+    crowded = np.flatnonzero(np.bincount(t.edge) > 2)
+    if len(crowded):
+        half_edges = np.flatnonzero(t.edge == crowded[0])
+        faces = t.face[half_edges]
+        problem = f"is one of {len(faces)} at {edge_at(half_edges[0])}: {source.faces(faces)}"
+        expected = "a manifold surface, at most 2 faces at an edge"
+        raise source.error(source.at_face(faces[0]), problem, expected, len(crowded), "edge")
+    same_way = np.flatnonzero(runs_with_twin(t))
+    if len(same_way):
+        first = same_way[0]
+        problem = f"and {source.faces(t.face[t.twin[[first]]])} both run along {edge_at(first)} in this direction"
+        expected = "opposite directions, all faces counter-clockwise from outside"
+        raise source.error(source.at_face(t.face[first]), problem, expected, len(same_way) // 2, "edge")
+    fan, is_first = fan_labels(t)
+    pinched = np.flatnonzero(fan_counts(t, is_first) > 1)
+    corners = np.flatnonzero(t.face_vertices == pinched[0])
+    labels = np.unique(fan[corners])
+    fans = [source.faces(t.face[corners[fan[corners] == label]]) for label in labels[:SHOWN]]
+    problem = f"joins {len(labels)} separate fans: " + " | ".join(fans) + (" | ..." if len(labels) > SHOWN else "")
+    expected = "one fan of faces around a vertex"
+    raise source.error(source.at_vertex(pinched[0]), problem, expected, len(pinched), "vertex")
+
+
+def _description(t: Topology, non_manifold: NonManifold, source: CageSource) -> str:
+    """Return the warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
+    half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
+    # One half-edge of each edge.
+    crowded = half_edges[np.unique(non_manifold.edge[half_edges], return_index=True)[1]]
+    ends = np.stack([t.face_vertices[crowded], t.face_vertices[t.next[crowded]]], axis=1)
+    pinched = np.flatnonzero((fan_counts(t, fan_labels(t)[1]) > 1) & ~t.ends_of(non_manifold.is_edge))
+    repeats = np.unique(t.face[is_repeated(t)])
+    kinds = (
+        ("edge", "of more than two faces, or of two in one direction", ends, lambda ends: source.edge(*ends)),
+        ("vertex", "between separate fans", pinched, source.vertex),
+        ("face", "with a vertex more than once", repeats, lambda face: source.faces(np.array([face]))),
+    )
+    parts = []
+    for noun, problem, items, name in kinds:
+        if count := len(items):
+            names = ", ".join(map(name, items[:SHOWN].tolist()))
+            parts.append(f"{number_of(count, noun)} {problem} ({names}{', ...' if count > SHOWN else ''})")
+    return (
+        f"{source.name}: the faces are no manifold: {'; '.join(parts)}. Such edges are infinitely sharp, and such "
+        "vertices are corners or lie on creases along these edges, as in OpenSubdiv; strict makes this an error "
+        f"(numbers count from {source.index_base})"
+    )
 
 
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
@@ -176,8 +275,7 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         raise CageError(f"{source.name}: faces have {corner_count} corners; expected at most {MOST_FACE_CORNERS}")
     small = np.flatnonzero(sizes < 3)
     if len(small):
-        count = sizes[small[0]]
-        problem = f"has {count} {'vertex' if count == 1 else 'vertices'}"
+        problem = f"has {number_of(int(sizes[small[0]]), 'vertex')}"
         raise source.error(source.at_face(small[0]), problem, "at least 3", len(small), "face")
     if sizes.sum() != corner_count:
         raise CageError(
@@ -198,11 +296,120 @@ def _check_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.int
         raise source.error(where, problem, expected, len(outside), "index")
 
 
-def _warn_of_unused_vertices(topology: Topology, source: CageSource) -> None:
-    unused = np.flatnonzero(topology.vertex_face_count == 0)
-    if len(unused):
-        shown = ", ".join(str(vertex + source.index_base) for vertex in unused[:5].tolist())
-        warn(
-            f"{source.name}: {len(unused)} of {topology.vertex_count} vertices are used by no face and have no effect "
-            f"({shown}{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})"
+def validated_tags(
+    topology: Topology,
+    creases: Sequence[tuple[int, int, float]] | NDArray,
+    corners: Sequence[tuple[int, float]] | NDArray,
+    source: CageSource,
+) -> Sharpness:
+    """Check creases and corners. If an edge or vertex occurs more than once, its last sharpness is used.
+
+    As in OpenSubdiv, creases and corners at edges and vertices that do not exist are ignored.
+
+    Raises CageError if vertices are not integers, or a sharpness is negative or NaN. Warns if creases or corners are
+    ignored.
+    """
+    edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
+    vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
+    starts, ends = edges[:, :2].astype(np.int64).T
+    half_edge, vertex = _half_edges_between(topology, starts, ends), vertices[:, 0].astype(np.int64)
+
+    def at_edge(row: int) -> str:
+        return f"{source.at_tag('creases', row)}: crease along {source.edge(starts[row], ends[row])}"
+
+    def at_vertex(row: int) -> str:
+        return f"{source.at_tag('corners', row)}: corner at {source.vertex(vertex[row])}"
+
+    def warn_of_ignored(is_there: NDArray[np.bool_], where: Callable[[int], str], problem: str, noun: str) -> None:
+        missing = np.flatnonzero(~is_there)
+        if len(missing):
+            such = number_of_such(len(missing), noun)
+            warn(f"{where(missing[0])}, which {problem}, is ignored ({such}; numbers count from {source.index_base})")
+
+    require_sharpness(edges[:, 2], at_edge)
+    require_sharpness(vertices[:, 1], at_vertex)
+    is_edge, is_vertex = half_edge >= 0, (vertex >= 0) & (vertex < topology.vertex_count)
+    warn_of_ignored(is_edge, at_edge, "is no edge of a face", "crease")
+    warn_of_ignored(is_vertex, at_vertex, f"is none of {topology.vertex_count} vertices", "corner")
+    half_edge, sharpness = half_edge[is_edge], edges[is_edge, 2]
+    of_edges = _sharpness(topology.half_edge_count, half_edge, sharpness, topology.twin[half_edge])
+    return Sharpness(of_edges, _sharpness(topology.vertex_count, vertex[is_vertex], vertices[is_vertex, 1]))
+
+
+def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) -> IntArray:
+    """Check edges, given as pairs of vertices, and return a half-edge of each.
+
+    Raises CageError if a pair is not an edge of two faces, or occurs twice.
+    """
+    t, ends = topology, np.asarray(edges)
+    if ends.size and (ends.dtype.kind not in "iu" or ends.shape != (len(ends), 2)):
+        raise CageError(f"{source.name}: edges of shape {ends.shape} and type {ends.dtype}; expected integers, (n, 2)")
+    ends = ends.astype(np.int64).reshape(-1, 2)
+    half_edges = _half_edges_between(t, *ends.T).astype(np.int64)
+    is_first = np.zeros(len(half_edges), dtype=bool)
+    is_first[np.unique(t.edge[half_edges], return_index=True)[1]] = True
+    for holds, problem, expected in (
+        (half_edges >= 0, "is no edge of a face", "edges of two faces"),
+        (t.twin[half_edges] >= 0, "is infinitely sharp, as it has not two faces", "edges of two faces"),
+        (is_first, "is given twice", "each edge once"),
+    ):
+        for row in np.flatnonzero(~holds)[:1]:
+            raise CageError(
+                f"{source.name}: {source.edge(*ends[row])} {problem}; expected {expected} (numbers count from "
+                f"{source.index_base})"
+            )
+    return half_edges
+
+
+def _sharpness(
+    count: int, indices: IntArray, values: NDArray[np.float64], twins: IntArray | None = None
+) -> NDArray[np.float64]:
+    """Return a read-only array of values, clamped to `INFINITE`, at ``indices`` and at twins of these; else zero."""
+    if not len(indices):
+        # Takes no memory, as in most cages nothing is sharp.
+        return np.broadcast_to(0.0, count)
+    sharpness = np.zeros(count)
+    sharpness[indices] = np.minimum(values, INFINITE)
+    if twins is not None:
+        sharpness[twins[twins >= 0]] = sharpness[indices[twins >= 0]]
+    return read_only(sharpness)
+
+
+def _table(
+    rows: Sequence[tuple[float, ...]] | NDArray, columns: int, name: str, expected: str, source: CageSource
+) -> NDArray[np.float64]:
+    try:
+        table = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CageError(f"{source.name}: {name} are not a table ({error}); expected rows {expected}") from error
+    vertices = table[:, :-1]
+    is_index = (vertices == np.floor(vertices)) & (np.abs(vertices) <= _LARGEST_INDEX)
+    for row in np.flatnonzero(~is_index.all(axis=1))[:1]:
+        raise CageError(f"{source.at_tag(name, row)}: {name} have the row {table[row].tolist()}; expected {expected}")
+    return table
+
+
+def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) -> IntArray:
+    """Return a half-edge between each pair of vertices, in either direction; -1 if there is none."""
+    if not len(starts):
+        return np.zeros(0, dtype=np.int64)
+    n = topology.vertex_count
+    half_edges = topology.edge_half_edge
+    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
+    keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
+    # If several edges have the same vertices, the first is used.
+    order = np.argsort(keys, kind="stable")
+    pair_keys = np.minimum(starts, ends) * n + np.maximum(starts, ends)
+    index = np.minimum(np.searchsorted(keys[order], pair_keys), len(keys) - 1)
+    candidate = order[index]
+    inside = (np.minimum(starts, ends) >= 0) & (np.maximum(starts, ends) < n)
+    return np.where(inside & (keys[candidate] == pair_keys), half_edges[candidate], -1)
+
+
+def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
+    """Raise CageError if a sharpness is negative or NaN; ``where`` returns the beginning of the message for a row."""
+    for row in np.flatnonzero(~(values >= 0))[:1]:
+        raise CageError(
+            f"{where(row)} has sharpness {in_digits(values[row])}; expected 0 for smooth, up to {INFINITE:g} for "
+            "semi-sharp, or more for infinitely sharp"
         )

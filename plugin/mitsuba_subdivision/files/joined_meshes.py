@@ -8,10 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
+from ..cage.contents import RULES, Attribute, CageContents
 from ..cage.errors import CageError, CageSource, shortened, warn
-from ..cage.rules import RULES
 from ..cage.validation import require_range
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray

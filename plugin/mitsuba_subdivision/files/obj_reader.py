@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
+from ..cage.contents import Attribute, CageContents
 from ..cage.errors import CageError, CageSource, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray

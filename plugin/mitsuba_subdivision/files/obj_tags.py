@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import CageContents
+from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
-from ..cage.rules import RULES
 from ..mesh.connectivity import IntArray
 from .obj_text import SPACE, ObjText, parsed, run_starts
 

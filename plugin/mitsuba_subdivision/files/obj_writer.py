@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
+from ..cage.contents import Attribute, CageContents
 from ..whole_file import whole_file
 from .formats import warn_of_losses
 from .obj_tags import rules_without_tag, tag_statements

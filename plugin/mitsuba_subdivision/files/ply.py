@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
+from ..cage.contents import RULES, Attribute, CageContents
 from ..cage.errors import CageError, CageSource, shortened, warn
-from ..cage.rules import RULES
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file

@@ -13,12 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
+from ..cage.contents import RULES, Attribute, CageContents, validated_attribute
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
-from ..cage.rules import RULES
-from ..cage.tags import require_sharpness
-from ..cage.validation import require_range, validated_face_indices
+from ..cage.validation import require_range, require_sharpness, validated_face_indices
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from . import usd_stage
@@ -401,7 +398,9 @@ class MeshReader:
             attribute = Attribute(values, "face_varying", indices)
         if topology is None:
             return attribute
-        return attribute.validated(primvar.GetPrimvarName(), topology, CageSource(self.location), width)
+        return validated_attribute(
+            attribute, primvar.GetPrimvarName(), topology, CageSource(self.location), width=width
+        )
 
 
 def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:

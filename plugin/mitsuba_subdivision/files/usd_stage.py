@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..cage.attributes import Interpolation
+from ..cage.contents import Interpolation
 from ..cage.errors import CageError, shortened, warn
 
 if TYPE_CHECKING:

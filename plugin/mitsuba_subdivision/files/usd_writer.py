@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
-from ..cage.contents import CageContents
-from ..cage.rules import RULES
+from ..cage.contents import RULES, Attribute, CageContents
 from ..whole_file import whole_file
 from .formats import warn_of_losses
 from .usd_stage import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, require_usd, token

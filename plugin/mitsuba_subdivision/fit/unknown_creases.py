@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from ..cage import CageError, ControlCage
-from ..cage.tags import validated_edges
+from ..cage.validation import validated_edges
 from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..mesh.cuts import Sharpness

@@ -2,7 +2,7 @@
 
 The rules are those of OpenSubdiv (`Vtr::Level::completeTopologyFromFaceVertices`, `orderVertexFacesAndEdges`,
 `Far::TopologyRefinerFactoryBase::prepareComponentTagsAndSharpness`). Before they are applied, faces with a winding
-opposite to their neighbours' are reversed (`orientation`), which OpenSubdiv leaves to its users.
+opposite to their neighbours' are turned over (`turning_order`), which OpenSubdiv leaves to its users.
 """
 
 from __future__ import annotations
@@ -175,3 +175,55 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
     # Where some fans do not run along the crease, OpenSubdiv applies the crease mask; here the vertex is a corner.
     creases[start[begins[returns_to_edge]]] = creases[start[closed]] = False
     return separate, NonManifold(edges, is_own_edge, t.edge, vertices, creases, closed)
+
+
+def turning_order(topology: Topology) -> IntArray | None:
+    """Find an order of the face corners with consistent winding; None if the winding is already consistent.
+
+    Two faces are neighbours if they share an edge that no third face has. In each connected component the smaller part
+    is turned over; of two equal parts, the one without the component's lowest face. A turned face keeps its first
+    corner. Faces around a Möbius strip have no consistent winding; there as few pairs of neighbours as possible remain
+    inconsistent.
+
+    Returns (n_h,) int64: the present index of each corner of the new order.
+    """
+    t = topology
+    one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))
+    other = t.twin[one]
+    # Ignore edges that join a vertex to itself, and edges that a face has twice.
+    joins = (t.face[one] != t.face[other]) & (t.face_vertices[one] != t.face_vertices[t.next[one]])
+    one, other = one[joins], other[joins]
+    disagrees = t.face_vertices[one] == t.face_vertices[other]
+    if not disagrees.any():
+        return None
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+
+    # A spanning tree of each component with as few inconsistent edges as possible; along a tree all faces can be made
+    # consistent. SciPy before 1.16 requires 32-bit indices.
+    first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int32)
+    order = np.lexsort((disagrees, second, first))
+    first, second, disagrees = first[order], second[order], disagrees[order]
+    is_new = np.ones(len(order), dtype=bool)
+    is_new[1:] = (np.diff(first) != 0) | (np.diff(second) != 0)
+    count = t.face_count
+    costs = (1 + disagrees[is_new], (first[is_new], second[is_new]))
+    tree = minimum_spanning_tree(sparse.coo_array(costs, shape=(count, count))).tocoo()
+
+    # A graph with two nodes for each face, unturned and turned. Consistent neighbours are connected unturned to
+    # unturned and turned to turned, inconsistent ones unturned to turned.
+    is_opposite = tree.data > 1
+    starts = np.concatenate([tree.row, tree.row + count])
+    ends = np.concatenate([tree.col + count * is_opposite, tree.col + count * ~is_opposite])
+    graph = sparse.coo_array((np.ones(len(starts), dtype=bool), (starts, ends)), shape=(2 * count, 2 * count))
+    unturned, turned = connected_components(graph, directed=False)[1].reshape(2, count)
+    _, lowest, component = np.unique(np.minimum(unturned, turned), return_index=True, return_inverse=True)
+    is_turned = unturned != unturned[lowest][component]
+    is_turned ^= (2 * np.bincount(component, is_turned) > np.bincount(component))[component]
+    if not is_turned.any():
+        return None
+    corner_order = np.arange(t.half_edge_count)
+    corners = t.half_edges_of(is_turned)
+    begin, size = t.face_offsets[t.face[corners]], t.face_sizes[t.face[corners]]
+    corner_order[corners] = begin + (size - (corners - begin)) % size
+    return corner_order

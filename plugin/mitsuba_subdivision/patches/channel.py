@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..cage import ControlCage
-from ..cage.attributes import Attribute
+from ..cage.contents import Attribute
 from ..evaluation.element import ElementSamples, evaluate_samples
 from ..evaluation.equations import Evaluator
 from ..evaluation.located_samples import LocatedSamples

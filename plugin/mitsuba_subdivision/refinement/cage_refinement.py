@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..cage.contents import CageContents
+from ..cage.contents import RULES, CageContents
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, CageSource, CageWarning
-from ..cage.rules import RULES
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.cuts import Sharpness

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.attributes import Attribute
+from ..cage.contents import RULES, Attribute
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, shortened
-from ..cage.rules import RULES
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.seams import seams, value_mesh
 from ..schemes import Scheme, SchemeError

@@ -12,7 +12,7 @@ from math import inf
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from ..cage.rules import RULES
+from ..cage.contents import RULES
 from ..tessellation import HIGHEST_RATE
 
 if TYPE_CHECKING:

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..cage.attributes import Attribute, Interpolation
+from ..cage.contents import RULES, Attribute, Interpolation
 from ..cage.errors import CageSource, noting_warnings, warn, without_warnings
-from ..cage.rules import RULES
 
 # Needed at run time: Dr.Jit resolves the annotations of dataclasses that a shape refers to.
 from ..evaluation.equations import Evaluator

@@ -15,8 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..cage import CageError, CageWarning, ControlCage
-from ..cage.contents import CageContents
-from ..cage.rules import RULES
+from ..cage.contents import RULES, CageContents
 from ..files import ply, usd_stage
 from ..files.formats import write_file
 from ..shapes.parameters import is_attribute_parameter, read_attributes

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from .. import patches, tessellation
 from ..cage import ControlCage
-from ..cage.attributes import Attribute
+from ..cage.contents import Attribute
 from ..cage.errors import CageError
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..mesh.shared import Shared
