@@ -97,7 +97,9 @@ def _inner_sample(rates: IntArray, u: IntArray, v: IntArray, corner_count: int) 
 
 def stitched(
     rates: IntArray,  # (t, 2) int64
-    sides: SideSamples,
+    # (t, m): segments on each side. There are as many samples, as the last point belongs to the next side.
+    counts: IntArray,
+    along: FloatArray,  # (n,) float64: position of each sample along its side, in [0, 1)
     # (t, m) bool: corners of tiles with inner samples that no triangle may cut off
     keeps_corner: NDArray[np.bool_] | None = None,
 ) -> IndexArray:
@@ -106,6 +108,7 @@ def stitched(
     Returns the samples of each triangle, (n, 3) int32, tile by tile. Samples on the sides of all tiles are numbered
     first, then inner samples.
     """
+    sides = SideSamples(counts, along)
     m, counts = sides.counts.shape[1], inner_counts(rates, sides.counts.shape[1])
     first_inner = len(sides.along) + ragged.starts(counts)
     parts, tiles = _across(rates, sides, np.flatnonzero(counts == 0)), np.flatnonzero(counts)

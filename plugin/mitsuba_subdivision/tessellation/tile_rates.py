@@ -14,7 +14,7 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .criterion import TINY, Criterion, Measure, NormalCone, TangentCone, cross, dot, least_product, rounded_up
-from .tiles import UNIT, PatchFrames, Tiles, sizes
+from .tiles import PatchFrames, Tiles
 
 # Samples of a displacement along each side of a tile.
 HEIGHT_SAMPLES = 9
@@ -136,10 +136,8 @@ class TileRates:
         if self.domain.corner_count == 3:
             # Samples outside the triangle are mirrored at the diagonal, as they lie in another element.
             u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
-        flipped, size = tiles["is_flipped"], sizes(tiles) / UNIT
-        u, v = (
-            size * (origin + np.where(flipped, 1 - t, t)) for origin, t in zip(tiles["origin"].T, (u, v), strict=True)
-        )
+        parameters = np.where(tiles["is_flipped"], 1 - np.stack([u, v]), np.stack([u, v]))
+        u, v = (parameters + tiles["origin"].T[:, None]) * np.ldexp(1.0, -tiles["depth"])
         corner = np.broadcast_to(tiles["corner"], u.shape).ravel().astype(np.int64)
         scale = self.frames.scale[self.frames.topology.face[tiles["corner"]]]
         heights = displacement.heights(corner, np.stack([(u * scale).ravel(), (v * scale).ravel()], axis=1))

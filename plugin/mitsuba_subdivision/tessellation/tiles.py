@@ -1,28 +1,26 @@
-"""Tiles, the parts of patches that have one grid each in an adaptive tessellation, and the frames of their patches.
+"""Tiles, the parts of patches that have one grid each in an adaptive tessellation, and the lines along which they meet.
 
 A tile is a copy of its patch's domain, ``2^depth`` times smaller, with its own rates. Tiles are structured arrays of
-`tile_type`. Frames place patches in the elements of a cage, and identify the elements' edges and vertices.
+`tile_type`. Frames place patches in the elements of a cage.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 
-# Length of a patch's side in integer parameters. A side of the smallest tile that is divided, of depth 22, has 64 parts
-# and at most 32 segments, see `tile_choice.MOST_TRIANGLES`.
-UNIT = 1 << 28
-# Length of an edge of an element in the same parts: a patch of a polygon reaches half way along it.
-EDGE = 2 * UNIT
 # Greatest depth of tiles around extraordinary points: single precision does not resolve smaller ones.
 DEEPEST = 24
+
+Tiles = NDArray[np.void]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,98 +41,6 @@ class PatchFrames:
     is_backward: NDArray[np.bool_]
     has_copies: bool  # Whether several edges or vertices of the topology have the same number
 
-    @cached_property
-    def meets_twice(self) -> NDArray[np.bool_]:
-        """``(n_f,)`` whether two corners of each whole element are connected more than once.
-
-        Connections are edges, and diagonals of quadrilaterals, of any element.
-        """
-        t, m = self.topology, self.domain.corner_count
-        meets_twice = np.zeros(t.face_count, dtype=bool)
-        whole = np.flatnonzero(self.is_whole)
-        corners = t.face_offsets[whole] + np.arange(m, dtype=np.int32)[:, None]
-        # Each edge once, as one of its half-edges.
-        edges = corners[t.edge_half_edge[t.edge[corners]] == corners]
-        first, second, twin = edges, t.next[edges], t.twin[edges]
-        if m == 4:
-            first, second = np.concatenate([first, *corners[:2]]), np.concatenate([second, *corners[2:]])
-            twin = np.concatenate([twin, *corners[:2]])
-        start, end = t.face_vertices[first].astype(np.int64), t.face_vertices[second]
-        pairs = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
-        sorted_pairs = np.sort(pairs)
-        duplicates = sorted_pairs[1:][sorted_pairs[1:] == sorted_pairs[:-1]]
-        is_duplicate = np.flatnonzero(np.isin(pairs, duplicates) | (start == end))
-        meets_twice[t.face[first[is_duplicate]]] = True
-        meets_twice[t.face[twin[is_duplicate][twin[is_duplicate] >= 0]]] = True
-        return meets_twice & self.is_whole
-
-    def names(
-        self,
-        corner: IntArray,  # (n,) int: corners at which the patches begin
-        points: IndexArray,  # (2, n) int32: points in the patches, in parts of `UNIT`
-        # (n_h,) int32: numbers of edges and vertices: `edge` and `vertex` of these frames, to identify the two sides of
-        # a crease, or those of a topology, to distinguish them
-        edge: IndexArray,
-        vertex: IndexArray,
-    ) -> tuple[NDArray[np.int64], IndexArray]:
-        """Identify points: equal points, on edges and vertices of equal numbers, get equal names and positions.
-
-        A point lies inside a patch, on an edge of its element, at a vertex, or on a spoke of a polygon. A spoke joins
-        the midpoint of an edge to the polygon's centre, and separates two patches at its corners. In a topology that is
-        cut further than these frames', numbers of vertices may overlap with those of edges, but only vertices have the
-        position zero.
-
-        Returns
-        -------
-        name : (n,) int64
-            Name of the vertex, edge, spoke, centre or patch that contains the point; patches from `first_inside` on.
-        position : (2, n) int32
-            The position in the patch; or the position along the edge or spoke, and zero. In parts of `UNIT`.
-        """
-        t, (u, v), position = self.topology, points, points.copy()
-        on_edge = self.first_inside - t.face_count - 2 * t.half_edge_count
-        on_spoke, at_centre = on_edge + t.half_edge_count, on_edge + 2 * t.half_edge_count
-        name = self.first_inside + corner.astype(np.int64)
-        if self.domain.corner_count == 3:
-            sides = [(v, u), (UNIT - u - v, v), (u, UNIT - v)]
-        else:
-            sides = [(v, u), (UNIT - u, v), (UNIT - v, UNIT - u), (u, UNIT - v)]
-        is_whole = self.is_whole[t.face[corner]]
-        # Points on edges: their indices, the half-edge, and the position along it.
-        edge_points = []
-        for side, (distance, along) in enumerate(sides):
-            on = np.flatnonzero((distance == 0) & is_whole)
-            half_edge = corner[on]
-            for _ in range(side):
-                half_edge = t.next[half_edge]
-            edge_points.append((on, half_edge, 2 * along[on]))
-        partial = np.flatnonzero(~is_whole)
-        if len(partial):
-            u, v, after, before = u[partial], v[partial], corner[partial], t.prev[corner[partial]]
-            for across, along, spoke in ((u, v, after), (v, u, before)):
-                on = np.flatnonzero(across == UNIT)
-                name[partial[on]] = on_spoke + spoke[on].astype(np.int64)
-                position[0, partial[on]], position[1, partial[on]] = along[on], 0
-            on = np.flatnonzero((u == UNIT) & (v == UNIT))
-            name[partial[on]], position[:, partial[on]] = at_centre + t.face[after[on]].astype(np.int64), 0
-            for distance, along, half_edge in ((v, u, after), (u, EDGE - v, before)):
-                on = np.flatnonzero(distance == 0)
-                edge_points.append((partial[on], half_edge[on], along[on]))
-        for on, half_edge, along in edge_points:
-            name[on], position[1, on] = on_edge + edge[half_edge].astype(np.int64), 0
-            position[0, on] = np.where(self.is_backward[half_edge], EDGE - along, along)
-        # Vertices, after the edges, as the end of each edge is the beginning of the next one.
-        for on, half_edge, along in edge_points:
-            begins = np.flatnonzero(along == 0)
-            name[on[begins]], position[0, on[begins]] = vertex[half_edge[begins]], 0
-        return name, position
-
-    @cached_property
-    def first_inside(self) -> int:
-        """The first name of points inside patches, after the names of vertices, edges, spokes and centres."""
-        t = self.topology
-        return max(int(self.vertex.max(initial=-1)), t.vertex_count - 1) + 1 + 2 * t.half_edge_count + t.face_count
-
     @classmethod
     def of(
         cls,
@@ -146,26 +52,21 @@ class PatchFrames:
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
         half_edge = np.arange(t.half_edge_count, dtype=np.int32)
-        lower = np.where(t.twin < 0, half_edge, np.minimum(half_edge, t.twin))
-        if patches.scheme.element == "vertex":
-            return cls(t, patches.scheme.domain, is_whole, scale, t.edge, t.face_vertices, lower != half_edge, False)
-        edge, is_backward = lower, lower != half_edge
-        start, border = t.face_vertices, np.flatnonzero(t.twin < 0)
-        has_copies = not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex)))
-        if has_copies:
-            start = control_of_vertex.astype(np.int32)[start]
-        # Border edges with the same end points are the two sides of a crease.
-        border_start, border_end = start[border].astype(np.int64), start[t.next[border]]
-        low, high = np.minimum(border_start, border_end), np.maximum(border_start, border_end)
-        pairs = low * (int(control_of_vertex.max()) + 1) + high
-        _, first, pair_index = np.unique(pairs, return_index=True, return_inverse=True)
-        edge[border] = border[first[pair_index]]
-        is_backward[border] = start[border] != start[edge[border]]
-        has_copies |= len(first) < len(border)
+        edge = np.where(t.twin < 0, half_edge, np.minimum(half_edge, t.twin))
+        is_backward = edge != half_edge
+        start, border, has_copies = t.face_vertices, np.flatnonzero(t.twin < 0), False
+        if patches.scheme.element == "face":
+            has_copies = not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex)))
+            if has_copies:
+                start = control_of_vertex.astype(np.int32)[start]
+            # Border edges with the same end points are the two sides of a crease.
+            ends = np.stack([start[border], start[t.next[border]]]).astype(np.int64)
+            pairs = ends.min(axis=0) * (int(control_of_vertex.max()) + 1) + ends.max(axis=0)
+            _, first, pair_index = np.unique(pairs, return_index=True, return_inverse=True)
+            edge[border] = border[first[pair_index]]
+            is_backward[border] = start[border] != start[edge[border]]
+            has_copies |= len(first) < len(border)
         return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)
-
-
-Tiles = NDArray[np.void]
 
 
 def tile_type(corner_count: int) -> np.dtype[np.void]:
@@ -209,20 +110,96 @@ def child(tiles: Tiles, number: int, domain: ParameterDomain) -> Tiles:
     children["halvings"] += 1
     children["is_flipped"] ^= is_middle
     # A child at a corner shares the sides that meet there.
-    shared = [side for side in range(m) if not is_middle and side in (number, (number - 1) % m)]
+    shared = [] if is_middle else [number, (number - 1) % m]
     children["sides"] = 0
     children["sides"][:, shared] = -(-tiles["sides"][:, shared] // 2)
     return children
 
 
-def sizes(tiles: Tiles) -> IndexArray:
-    """``(t,)`` side length of each tile in its patch, in parts of `UNIT`."""
-    return np.int32(UNIT) >> tiles["depth"]
+def in_patch(tiles: Tiles, tile: IntArray, uv: FloatArray) -> FloatArray:
+    """``(2, n)`` parameters in patches, from the tile of each point and its parameters ``(2, n)`` there."""
+    parameters = np.where(tiles["is_flipped"][tile], 1 - uv, uv)
+    parameters += tiles["origin"].T[:, tile]
+    parameters *= np.ldexp(1.0, -tiles["depth"])[tile]
+    return parameters
 
 
-def corner_points(tiles: Tiles, domain: ParameterDomain) -> IndexArray:
-    """``(2, t, m)`` corners of tiles in their patches, in parts of `UNIT`, counter-clockwise from the tile's (0, 0)."""
-    steps = domain.corners.T.astype(np.int32)[:, None]
-    steps = np.where(tiles["is_flipped"][:, None], 1 - steps, steps)
-    corners: IndexArray = (tiles["origin"].T[..., None] + steps) * sizes(tiles)[:, None]
-    return corners
+def half_edges_around(frames: PatchFrames, corner: IntArray) -> list[IntArray]:
+    """The half-edges around elements, in order from ``corner`` on, as many as the domain has corners."""
+    around = [corner]
+    for _ in range(1, frames.domain.corner_count):
+        around.append(frames.topology.next[around[-1]])
+    return around
+
+
+def vertices_at_corners(tiles: Tiles, frames: PatchFrames) -> IndexArray:
+    """``(m, t)`` half-edge that begins at the vertex of the elements at each corner of tiles; -1 at other corners."""
+    corner, depth = tiles["corner"], tiles["depth"]
+    is_whole = frames.is_whole[frames.topology.face[corner]]
+    half_edges = np.full((frames.domain.corner_count, len(tiles)), -1, dtype=np.int32)
+    for number, half_edge in enumerate(half_edges_around(frames, corner)):
+        # Origin of the tile at this corner of the patch.
+        u, v = (int(end) * ((1 << depth) - 1) for end in frames.domain.corners[number])
+        is_there = (tiles["origin"][:, 0] == u) & (tiles["origin"][:, 1] == v) & ~tiles["is_flipped"]
+        # Patches of polygons begin at the only vertex that they have.
+        is_there &= is_whole | (number == 0)
+        half_edges[number, is_there] = half_edge[is_there]
+    return half_edges
+
+
+class Sides(NamedTuple):
+    """The lines on which sides of tiles lie: edges of elements, spokes of polygons, and lines inside patches.
+
+    A spoke joins the midpoint of an edge to the polygon's centre, and separates two patches at its corners. Arrays have
+    an entry for each side, tile by tile.
+    """
+
+    half_edge: IntArray  # (m t,) int32: half-edge of the element on whose edge the side lies, or -1
+    line: IntArray  # (m t,) int32: number of any other line, from ``n_h`` on
+    # (m t,) int32: positions on the line at which the side begins and ends, in parts of ``2^-bits`` of a patch's side
+    begin: IntArray
+    end: IntArray
+    bits: int
+
+    def points(self, edge: IndexArray, side: IntArray | slice, position: IntArray) -> NDArray[np.int64]:
+        """``(n,)`` sort keys of positions on lines, equal for equal points on edges with equal numbers ``edge``."""
+        line = np.where(self.half_edge >= 0, edge[self.half_edge], self.line)
+        # Edges are two sides of patches long.
+        return np.left_shift(line, self.bits + 2, dtype=np.int64)[side] | position
+
+
+def sides_of(tiles: Tiles, frames: PatchFrames, bits: int) -> Sides:
+    """Find the lines of the sides of tiles, whose positions ``bits`` are enough for."""
+    t, m, unit = frames.topology, frames.domain.corner_count, 1 << bits
+    corner, flipped, is_whole = tiles["corner"], tiles["is_flipped"], frames.is_whole[t.face[tiles["corner"]]]
+    steps = frames.domain.corners.T.astype(np.int32)[..., None]
+    points = tiles["origin"].T[:, None] + np.where(flipped, 1 - steps, steps)
+    points <<= bits - tiles["depth"]
+    # Lines inside a patch run along u, along v or, in triangles, along the diagonal.
+    side, along = np.arange(m), np.array([0, 1, 1] if m == 3 else [0, 1, 0, 1])
+    begin, end = points[along, side], np.roll(points, -1, axis=1)[along, side]
+    level = points[[1, 0, 0] if m == 3 else 1 - along, side]
+    if m == 3:
+        level[1] += begin[1]
+    on_border = level == np.array([0, unit, 0] if m == 3 else [0, unit, unit, 0])[:, None]
+    # The patch of a polygon's corner has parts of the edges that begin and end there, and of both spokes from these.
+    around = np.stack(half_edges_around(frames, corner))
+    around[2:] = np.where(is_whole, around[2:], t.prev[corner])
+    around[1] = np.where(is_whole, around[1], corner)
+    on_edge = on_border & (is_whole | (side % 3 == 0)[:, None])
+    is_backward = on_edge & (frames.is_backward[around] != (side >= 2)[:, None])
+    begin, end = (np.where(is_backward, 2 * unit - at, at) for at in np.stack([begin, end]) << (on_edge & is_whole))
+    line, inside = t.half_edge_count + around, ~on_border
+    names = 3 * np.broadcast_to(corner, inside.shape)[inside].astype(np.int64)
+    names += np.broadcast_to((side if m == 3 else side % 2)[:, None], inside.shape)[inside]
+    line[inside] = 2 * t.half_edge_count + ranked(names << bits + 1 | level[inside])[0]
+    half_edge, line, begin, end = (column.T.ravel() for column in (np.where(on_edge, around, -1), line, begin, end))
+    return Sides(half_edge, line, begin, end, bits)
+
+
+def ranked(keys: IntArray) -> tuple[IndexArray, IndexArray]:
+    """Rank integers from 0 on, equal ones alike. Returns the ranks, and the first index of each rank."""
+    order, begins = ragged.sorted_order(keys)
+    number = np.empty(len(keys), dtype=np.int32)
+    number[order] = np.cumsum(begins, dtype=np.int32) - 1
+    return number, order[begins]
