@@ -13,7 +13,7 @@ import time
 import pytest
 from mitsuba_subdivision.__main__ import Abandoned, interruptible, main
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 
 # Windows has no such terminals.
 pty = pytest.importorskip("pty")

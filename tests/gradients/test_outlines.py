@@ -9,7 +9,7 @@ from gradients.outlines import RATE, SURFACES, change, covered, properties
 from gradients.scenes import POINTS, outline
 from gradients.surfaces import motions
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 

@@ -6,7 +6,7 @@ import pytest
 from gradients.estimates import ERRORS, MEANS_SOMETHING, Pictures
 from gradients.scenes import POINTS, inside, textured_cube, tilt
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 exact = pytest.mark.skipif(bool(hook_problem()), reason=str(hook_problem()))

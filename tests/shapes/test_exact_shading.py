@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file, upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from reference.refined_cages import sheet
 from scipy import ndimage
 from shapes.cages import MIXED_FACES, RING, cube, described, textured

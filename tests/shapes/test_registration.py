@@ -10,9 +10,8 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_subdivision.llvm import llvm_problem, require_llvm
-from mitsuba_subdivision.shapes import register_variant
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook import interaction_hook
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import exact_shading_problem, hook_problem
+from mitsuba_subdivision.shapes import interaction_hook, register_variant
+from mitsuba_subdivision.shapes.interaction_hook import exact_shading_problem, hook_problem
 from shapes.cages import cube, load
 from shapes.scenes import vertices
 from shapes.variants import every_variant, exact_llvm, llvm, scalar
@@ -178,6 +177,6 @@ def test_without_the_hook_automatic_shading_is_by_normals_of_vertices(monkeypatc
     # A trial that fails is a reason, too.
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: None)
     monkeypatch.setattr(interaction_hook, "interaction_hook", fail)
-    interaction_hook._trial_problem.cache_clear()
+    interaction_hook._problem_of_variant.cache_clear()
     assert problem() == "exact shading needs the virtual functions of Mitsuba 3.9"
-    interaction_hook._trial_problem.cache_clear()
+    interaction_hook._problem_of_variant.cache_clear()

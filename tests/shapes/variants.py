@@ -1,7 +1,7 @@
 """In which variants a test runs, and with which shading."""
 
 import pytest
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 
 every_variant = pytest.mark.usefixtures("variants_all_rgb")
 every_array_variant = pytest.mark.usefixtures("variants_array_rgb")

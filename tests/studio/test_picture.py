@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook import interaction_hook
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes import interaction_hook
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import StillPicture, Turntable
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
 from mitsuba_subdivision.studio.model import Model

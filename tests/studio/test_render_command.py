@@ -15,7 +15,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
 from mitsuba_subdivision.studio.cage_scenes import CageScenes
 from mitsuba_subdivision.studio.model import Model

@@ -10,7 +10,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.commands.pictures import save_scene
 from mitsuba_subdivision.regression.scene import load_scene
-from mitsuba_subdivision.shapes.mitsuba_3_9_hook.interaction_hook import hook_problem
+from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.studio_entries import Look

@@ -1,4 +1,4 @@
-"""Support of shapes for frozen functions (``@dr.freeze``).
+"""Values of Mitsuba's objects, and support of shapes for frozen functions (``@dr.freeze``).
 
 A frozen function must know every array that it reads. Dr.Jit finds the arrays that are attributes of a Python shape,
 but does not search objects of other classes. The first call records kernels, which later calls run without Python. So
@@ -11,13 +11,14 @@ import gc
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from types import MethodType, SimpleNamespace
 from typing import Any
 
 import drjit as dr
 
 from ..mesh.shared import SharedArray
+from ..variants import Variant
 
 # Prefixes of modules whose objects contain Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
@@ -43,6 +44,35 @@ def paused_collection() -> Iterator[None]:
 def is_recording() -> bool:
     """Whether a frozen function is being recorded, when values of arrays cannot be read."""
     return bool(dr.flag(dr.JitFlag.FreezingScope))
+
+
+def traversed(
+    variant: Variant,
+    traverse: Callable[[Any], None],  # Bound method of an object, such as ``mesh.traverse``
+) -> list[tuple[str, Any, Any]]:
+    """What an object of Mitsuba shows to `traverse`: name, value, and type of a value that is a member in C++.
+
+    The functions ``get_property`` and ``set_property`` of the variant read and assign such values, while the object is
+    alive.
+    """
+    callback = _collector(variant)()
+    traverse(callback)
+    return callback.shown
+
+
+@cache
+def _collector(variant: Variant) -> type:
+    class Collector(variant.TraversalCallback):
+        """Collects what it is shown."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.shown: list[tuple[str, Any, Any]] = []
+
+        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
+            self.shown.append((name, value, cpp_type))
+
+    return Collector
 
 
 class DeviceState:

@@ -33,7 +33,7 @@ from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
     from ..tessellation import VertexTable
-    from .mitsuba_3_9_hook.hook_trial import TriangleHit
+    from .interaction_hook import TriangleHit
 
 # Cosine of the angle between a ray and the normals that `_facing` turns to a silhouette.
 GRAZING = 1e-2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,7 @@ from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
-from .device_state import DeviceState, is_recording, paused_collection
+from .device_state import DeviceState, is_recording, paused_collection, traversed
 from .moving_vertices import MovingVertices, on_backward_of
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
@@ -42,37 +42,6 @@ def make_subdivision(
     """Make the shape class of a variant of Mitsuba."""
     is_jit = dr.is_jit_v(variant.Float)
     runs_on_llvm = dr.backend_v(variant.Float) == dr.JitBackend.LLVM
-
-    class MeshBuffers(variant.TraversalCallback):
-        """Reads or assigns buffers of a mesh in its `traverse`: Mitsuba gives Python no other access."""
-
-        def __init__(
-            self,
-            mesh: mi.Mesh,
-            names: Collection[str],
-            # Values to assign; None to read buffers into `self.values`
-            values: dict[str, FloatBuffer | IndexBuffer] | None = None,
-        ) -> None:
-            super().__init__()
-            self.mesh, self.names, self.assigns = mesh, names, values is not None
-            self.values: dict[str, FloatBuffer | IndexBuffer] = {} if values is None else values
-
-        def put(self, name: str, value: Any, _flags: int, cpp_type: Any = None) -> None:
-            if name not in self.names:
-                return
-            if not self.assigns:
-                buffer = variant.get_property(value, cpp_type, self.mesh)
-                # A copy, as the mesh modifies the buffer in place.
-                self.values[name] = type(buffer)(buffer)
-            elif is_jit:
-                variant.set_property(value, cpp_type, self.values[name])
-            else:
-                # `set_property` would copy twice: to an array of Mitsuba's type, and from there to the mesh.
-                buffer = variant.get_property(value, cpp_type, self.mesh)
-                if len(buffer) != len(self.values[name]):
-                    variant.set_property(value, cpp_type, dr.empty(type(buffer), len(self.values[name])))
-                    buffer = variant.get_property(value, cpp_type, self.mesh)
-                np.array(buffer, copy=False)[:] = self.values[name]
 
     class Subdivision(variant.Mesh):
         """Limit surface of a control cage as a triangle mesh whose vertices follow the control points.
@@ -143,10 +112,10 @@ def make_subdivision(
                 has_vertex_texcoords=self._triangles.has_texcoords,
             )
             if self._exact is not None:
-                from .mitsuba_3_9_hook.interaction_hook import interaction_hook
+                from .interaction_hook import interaction_hook
 
                 self._exact.follow_side_of(self)
-                interaction_hook(variant, self).attach(self, self._exact)
+                interaction_hook(variant).attach(self, self._exact)
             self._device_state = DeviceState(self) if is_jit else None
             # Empty, because Mitsuba would convert values from a list one by one. `_assemble` sets the buffers.
             self.add_attribute("face_element", 1, [])
@@ -356,16 +325,29 @@ def make_subdivision(
             )
 
         def _set_buffers(self, values: dict[str, FloatBuffer | IndexBuffer]) -> None:
+            """Assign buffers of the mesh."""
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
-            super().traverse(MeshBuffers(self, values.keys(), values))
+            for name, member, cpp_type in traversed(variant, super().traverse):
+                if name not in values:
+                    continue
+                if is_jit:
+                    variant.set_property(member, cpp_type, values[name])
+                    continue
+                # `set_property` would copy twice: to an array of Mitsuba's type, and from there to the mesh.
+                buffer = variant.get_property(member, cpp_type, self)
+                if len(buffer) != len(values[name]):
+                    variant.set_property(member, cpp_type, dr.empty(type(buffer), len(values[name])))
+                    buffer = variant.get_property(member, cpp_type, self)
+                np.array(buffer, copy=False)[:] = values[name]
             self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
             self._lengths |= {name: len(value) for name, value in values.items()}
 
         def _get_buffers(self, *names: str) -> dict[str, FloatBuffer | IndexBuffer]:
-            reader = MeshBuffers(self, names)
-            super().traverse(reader)
-            return reader.values
+            """Copies of buffers of the mesh, which Mitsuba modifies in place."""
+            members = [shown for shown in traversed(variant, super().traverse) if shown[0] in names]
+            buffers = ((name, variant.get_property(value, cpp_type, self)) for name, value, cpp_type in members)
+            return {name: type(buffer)(buffer) for name, buffer in buffers}
 
         def _weld_outlines(self, has_new_faces: bool) -> None:
             """Build Mitsuba's edge data structure as if coincident vertices were one vertex.
@@ -488,7 +470,7 @@ def _has_textured_emitter(props: mi.Properties, variant: Variant) -> bool:
 
 def _is_exact(parameters: Parameters, variant: Variant) -> bool:
     if parameters.shading == "auto" and not parameters.face_normals:
-        from .mitsuba_3_9_hook.interaction_hook import exact_shading_problem
+        from .interaction_hook import exact_shading_problem
 
         return exact_shading_problem(variant) is None
     if parameters.shading == "exact" and not dr.is_jit_v(variant.Float):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..messages import print_remark
-from ..shapes.mitsuba_3_9_hook.interaction_hook import exact_shading_problem
+from ..shapes.interaction_hook import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
 from ..shapes.tessellation_parameters import pixel_error_for
 from ..variants import SceneNode

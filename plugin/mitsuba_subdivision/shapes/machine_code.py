@@ -1,4 +1,4 @@
-"""Machine code that calls Python before or after a virtual function of Mitsuba, and propagates errors through C++.
+"""Virtual functions that call Python before or after Mitsuba's: machine code, the C++ objects that it passes, errors.
 
 Compiled bindings use trampolines for this: C++ functions that call Python, and throw a Python error as a C++ exception,
 which the bindings convert back when the call from Python to C++ returns. A ctypes callback is no safe replacement. It
@@ -14,9 +14,11 @@ import mmap
 import signal
 import struct
 import sys
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator
+from functools import cache, lru_cache
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, NoReturn
 
 import mitsuba as mi
@@ -28,12 +30,14 @@ _ERROR, _NO_ERROR, _ERROR_TYPE = (
     "_ZN8nanobind12python_errorD1Ev",
     "_ZTIN8nanobind12python_errorE",
 )
-# Functions of nanobind: wrap a C++ object, set its ownership, destroy it.
+# Functions of nanobind: wrap a C++ object, set its ownership, destroy it; the C++ instance of a Python object, and the
+# size of a C++ type in bytes.
 _OBJECT_AT, _SET_STATE, _DESTRUCT = (
     "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object",
     "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
     "_ZN8nanobind6detail16nb_inst_destructEP7_object",
 )
+_POINTER_OF, _SIZE_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object", "_ZN8nanobind6detail12nb_type_sizeEP7_object"
 # Lowest bit of an address that differs between C++ objects, which are aligned to 16 bytes; used by `tag_of`.
 _LOWEST_BIT = 4
 # Upper bound of the size of this exception, in bytes.
@@ -44,6 +48,13 @@ _NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"OO")
 # Python: these signals are blocked while Python runs.
 _SIGNALS = (signal.SIGINT,)
 _SIGNAL_SET = ctypes.create_string_buffer(128)
+_WORD = ctypes.sizeof(ctypes.c_void_p)
+# Number of entries before the address of a virtual function table, which identify its class [Itanium C++ ABI, 2.5.2].
+BEFORE = 2
+# Upper bound of the number of entries of a table. The table of Mitsuba's meshes has 66.
+_MOST_ENTRIES = 96
+# Packages whose frames `_raise_itself` skips.
+_LIBRARIES = ("mitsuba", "drjit")
 
 # Machine code for functions that store their arguments in the frame: the first at `rbp` - 0x18, the sixth at `rbp` -
 # 0x40. The seventh is passed on the stack, at `rbp` + 0x10.
@@ -81,68 +92,134 @@ _COMMON = bytes.fromhex("00000000 01 00 01 78 10 0c0708 9001 0000")
 _FRAME = bytes.fromhex("45 0e10 8602 43 0d06 8303 8c04 00000000")
 
 
-def bindings_library() -> ctypes.PyDLL:
-    """Load the library that Mitsuba's bindings share."""
-    return ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so"))
+# C++ objects and functions
 
 
-class Trampoline:
-    """A virtual function that calls the original function, and then Python.
+@lru_cache(maxsize=1)
+def bindings() -> ctypes.PyDLL:
+    """Load the library that Mitsuba's bindings share. Raises AttributeError if it lacks a function."""
+    library, address = ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so")), ctypes.c_void_p
+    for name, result, arguments in (
+        (_POINTER_OF, address, [ctypes.py_object]),
+        (_OBJECT_AT, ctypes.py_object, [ctypes.py_object, address, address]),
+        (_SIZE_OF, ctypes.c_size_t, [ctypes.py_object]),
+        ("__cxa_demangle", address, [ctypes.c_char_p, *[address] * 3]),
+    ):
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+@cache
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def address_of(instance: object) -> int:
+    """Address of the C++ instance of a Python object."""
+    return int(getattr(bindings(), _POINTER_OF)(instance))
+
+
+def object_at(kind: type, address: int) -> Any:
+    """Python object of a type for the C++ instance at an address."""
+    return getattr(bindings(), _OBJECT_AT)(kind, address, None)
+
+
+def offsets(structure: Any, *names: str) -> tuple[int, ...]:
+    """Offsets of members in a C++ structure. Raises RuntimeError if a member is elsewhere."""
+    address, size = address_of(structure), getattr(bindings(), _SIZE_OF)(type(structure))
+    distances = tuple(address_of(getattr(structure, name)) - address for name in names)
+    if not all(0 <= distance < size for distance in distances):
+        raise RuntimeError(f"{names} of {type(structure).__name__} are not where it is")
+    return distances
+
+
+def name_at(address: int) -> str:
+    """Mangled name of the function or object that begins at an address; empty if there is none."""
+    # Result of ``dladdr``: a file, its load address, and name and address of the symbol at or before an address.
+    symbol = (ctypes.c_void_p * 4)()
+    exists = bool(address) and _c_library().dladdr(ctypes.c_void_p(address), ctypes.byref(symbol))
+    return ctypes.string_at(symbol[2] or 0).decode() if exists and symbol[3] == address else ""
+
+
+def declaration_at(address: int) -> str:
+    """Demangled declaration of the function that begins at an address; empty if there is none."""
+    demangled = getattr(bindings(), "__cxa_demangle")(name_at(address).encode(), None, None, None)
+    if not demangled:
+        return ""
+    text = ctypes.string_at(demangled).decode()
+    _c_library().free(ctypes.c_void_p(demangled))
+    return text
+
+
+def table_of(instance: object) -> ctypes.c_void_p:
+    """Pointer of a C++ object to its virtual function table, in place."""
+    return ctypes.c_void_p.from_address(address_of(instance))
+
+
+def virtual_functions(table: int) -> list[int]:
+    """Entries of a virtual function table, with those before its address, up to the table of the next class.
+
+    If the end is not recognised, there are additional entries, which are never used.
+    """
+    entries: list[int] = []
+    while len(entries) < _MOST_ENTRIES:
+        entry = ctypes.c_void_p.from_address(table + _WORD * (len(entries) - BEFORE)).value or 0
+        if len(entries) >= BEFORE and name_at(entry).startswith("_ZTI"):
+            break
+        entries.append(entry)
+    return entries
+
+
+def replace_function(
+    table: int,  # Address of a write-protected virtual function table
+    index: int,  # Index among its `virtual_functions`
+    address: int,  # Address of the new function
+) -> None:
+    """Replace an entry of a table. Raises OSError if the system does not allow the table to be written."""
+    entry = table + _WORD * (index - BEFORE)
+    page = entry - entry % mmap.PAGESIZE
+    _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
+    ctypes.c_void_p.from_address(entry).value = address
+    _protect(page, mmap.PROT_READ)
+
+
+# Trampolines
+
+
+def calling_after(
+    # Address of a function that returns an object through its address, the first argument, and has up to six more
+    # arguments, numbers or addresses
+    original: int,
+    kind: type,  # Python type of the object
+    # Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
+    function: Callable[..., None],
+    # (2,) tuple of int: offsets of two words of the object. If the words are equal, Python is not called.
+    equal: tuple[int, ...] | None = None,
+) -> int:
+    """Make a virtual function that calls the original function, and then Python. Returns its address.
 
     Raises OSError if the system allows no executable memory. Raises AttributeError if the libraries lack a required
     function.
     """
-
-    def __init__(
-        self,
-        # Address of a function that returns an object through its address, the first argument, and has up to six more
-        # arguments, numbers or addresses
-        original: int,
-        kind: type,  # Python type of the object
-        # Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
-        function: Callable[..., None],
-        # Called with an error of ``function``, even one before its first line, and its traceback, after the object has
-        # been destructed. It must raise an error, which is thrown as a C++ exception.
-        fail: Callable[[BaseException, TracebackType], NoReturn],
-        # (2,) tuple of int: offsets of two words of the object. If the words are equal, Python is not called.
-        equal: tuple[int, ...] | None = None,
-    ) -> None:
-        self.address = _installed(_code_after(original, kind, function, fail, equal), kind, function, fail)
+    return _installed(_code_after(original, kind, function, equal), kind, function)
 
 
-class TaggingTrampoline:
-    """A virtual function that calls Python, and then the original function.
+def calling_before(
+    original: int,  # As for `calling_after`, but no object exists yet when Python is called
+    function: Callable[..., None],
+) -> int:
+    """Make a virtual function that calls Python, and then the original function. Returns its address.
 
     It adds the tag of the second argument, a C++ object, to the fifth argument, a number below 2¹⁶.
     """
-
-    def __init__(
-        self,
-        # As for `Trampoline`, but no object exists yet when Python is called
-        original: int,
-        function: Callable[..., None],
-        fail: Callable[[BaseException, TracebackType], NoReturn],
-    ) -> None:
-        self.address = _installed(_code_before(original, function, fail), function, fail)
+    rest = _answered() + _TAG_FIFTH + _LOAD_SIX + _PUSH_SEVENTH + _call(original) + _DROP_2 + _LEAVE
+    return _installed(_ENTER + _KEEP + _ask(function) + _jump_if_equal(len(rest)) + rest + _raise(), function)
 
 
 def tag_of(address: int) -> int:
     """The tag of a C++ object: bits of its address, in the upper half of 32 bits. Objects rarely share a tag."""
     return address >> _LOWEST_BIT << 16 & 0xFFFF0000
-
-
-def replace_function(
-    entry: int,  # Address of the entry in the table
-    address: int,  # Address of the function
-) -> None:
-    """Replace an entry of a write-protected virtual function table.
-
-    Raises OSError if the system does not allow the table to be written.
-    """
-    page = entry - entry % mmap.PAGESIZE
-    _protect(page, mmap.PROT_READ | mmap.PROT_WRITE)
-    ctypes.c_void_p.from_address(entry).value = address
-    _protect(page, mmap.PROT_READ)
 
 
 def require_trampolines() -> None:
@@ -151,7 +228,7 @@ def require_trampolines() -> None:
     Raises OSError if the system does not allow memory that was written to be executed. Raises AttributeError if the
     libraries lack a required function.
     """
-    _code_after(0, object, print, sys.exit, None)
+    _code_after(0, object, print, None)
     _protect(_writable_page(), mmap.PROT_READ | mmap.PROT_EXEC)
 
 
@@ -166,17 +243,17 @@ def _installed(code: bytes, *used: Any) -> int:
     code_and_unwind_info = code + _frame_description(address, len(code))
     if len(code_and_unwind_info) > mmap.PAGESIZE:
         raise OSError(f"machine code of {len(code_and_unwind_info)} bytes; expected at most a page of {mmap.PAGESIZE}")
-    for reference in used:
+    for reference in (*used, _fail):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(reference))
     ctypes.memmove(address, code_and_unwind_info, len(code_and_unwind_info))
     _protect(address, mmap.PROT_READ | mmap.PROT_EXEC)
-    bindings_library()["__register_frame"](ctypes.c_void_p(address + len(code)))
+    bindings()["__register_frame"](ctypes.c_void_p(address + len(code)))
     return address
 
 
 def _writable_page() -> int:
     """Allocate a page of memory, never freed, and return its address."""
-    allocate = ctypes.CDLL(None, use_errno=True).mmap
+    allocate = _c_library().mmap
     allocate.restype = ctypes.c_void_p
     allocate.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
@@ -187,7 +264,7 @@ def _writable_page() -> int:
 
 
 def _protect(page: int, allowed: int) -> None:
-    protect = ctypes.CDLL(None, use_errno=True).mprotect
+    protect = _c_library().mprotect
     protect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
     if protect(page, mmap.PAGESIZE, allowed):
         raise OSError(ctypes.get_errno(), "memory cannot be made executable, or a table writable")
@@ -197,18 +274,17 @@ def _code_after(
     original: int,
     kind: type,
     function: Callable[..., None],
-    fail: Callable[..., NoReturn],
     equal: tuple[int, ...] | None,
 ) -> bytes:
-    """Machine code of a `Trampoline`."""
-    library = bindings_library()
+    """Machine code of `calling_after`."""
+    library = bindings()
     set_state, destruct = _call(_address(library[_SET_STATE])), _call(_address(library[_DESTRUCT]))
     on_error = [
         # After an exception, the object does not exist for C++: destruct it, without freeing its memory.
         _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(_address(library[_OBJECT_AT])) + _KEEP_OBJECT,
         _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
         _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _forget(),
-        _raise(fail),
+        _raise(),
     ]
     call_python = _ask(function) + _jump_if_equal(len(_answered() + _LEAVE)) + _answered()
     skip_python = b""
@@ -219,17 +295,11 @@ def _code_after(
     return call_original + skip_python + call_python + _LEAVE + b"".join(on_error)
 
 
-def _code_before(original: int, function: Callable[..., None], fail: Callable[..., NoReturn]) -> bytes:
-    """Machine code of a `TaggingTrampoline`."""
-    rest = _answered() + _TAG_FIFTH + _LOAD_SIX + _PUSH_SEVENTH + _call(original) + _DROP_2 + _LEAVE
-    return _ENTER + _KEEP + _ask(function) + _jump_if_equal(len(rest)) + rest + _raise(fail)
-
-
 def _ask(function: Callable[..., None]) -> bytes:
     """Call Python with all arguments, and compare its result with NULL."""
-    library, python = bindings_library(), ctypes.pythonapi
+    library, python = bindings(), ctypes.pythonapi
     for number in _SIGNALS:
-        ctypes.CDLL(None).sigaddset(_SIGNAL_SET, int(number))
+        _c_library().sigaddset(_SIGNAL_SET, int(number))
     block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(_address(library["pthread_sigmask"]))
     enter = _call(_address(python.PyGILState_Ensure)) + _STATE_OF_RESULT
     arguments = _move("rdi", id(function)) + _move("rsi", _address(_NUMBERS)) + _FIRST_FOUR
@@ -242,15 +312,15 @@ def _answered() -> bytes:
     return _RESULT + _forget() + _release()
 
 
-def _raise(fail: Callable[..., NoReturn]) -> bytes:
+def _raise() -> bytes:
     """Throw the error that Python has raised as a C++ exception."""
-    library, python = bindings_library(), ctypes.pythonapi
+    library, python = bindings(), ctypes.pythonapi
     return b"".join(
         [
             _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
-            _move("rdi", id(fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + _NO_VECTORS,
+            _move("rdi", id(_fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + _NO_VECTORS,
             _call(_address(python.PyObject_CallFunction)),
-            *[each + _forget() for each in _KEPT],
+            *[kept + _forget() for kept in _KEPT],
             _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
             _KEEP_ERROR + _call(_address(library[_ERROR])),
             _release(),
@@ -267,7 +337,7 @@ def _forget() -> bytes:
 def _release() -> bytes:
     """Release the interpreter and unblock signals."""
     release = _STATE + _call(_address(ctypes.pythonapi.PyGILState_Release))
-    return release + _UNBLOCK + _call(_address(bindings_library()["pthread_sigmask"]))
+    return release + _UNBLOCK + _call(_address(bindings()["pthread_sigmask"]))
 
 
 def _frame_description(address: int, size: int) -> bytes:
@@ -294,3 +364,80 @@ def _call(function: int) -> bytes:
 
 def _jump_if_equal(distance: int) -> bytes:
     return _JUMP_IF_EQUAL + struct.pack("<i", distance)
+
+
+# Errors
+
+
+def _fail(error: BaseException, trace: TracebackType) -> NoReturn:
+    """Raise an error of Python so that the caller of Mitsuba receives the original error; C++ throws it on.
+
+    ``error`` may have been raised before the first line of the function that was called.
+    """
+    original = error.with_traceback(trace)
+    # Dr.Jit raises a `RuntimeError` from every error in a loop or a derivative.
+    while type(original) is RuntimeError and original.__cause__ is not None:
+        original = original.__cause__
+    # Frames of the error refer to C++ memory that will be freed.
+    _clear_frames(error)
+    _raise_itself(original, sys._getframe().f_back)
+    try:
+        raise original from original.__cause__
+    finally:
+        # Break the reference cycle with the traceback, which contains this frame.
+        del original, error, trace
+
+
+def _clear_frames(error: BaseException) -> None:
+    """Clear the local variables in the tracebacks of an error and its causes."""
+    for cause in _causes(error):
+        traceback.clear_frames(cause.__traceback__)
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Iterate over an error and its chain of causes."""
+    seen: list[BaseException] = []
+    while error is not None and error not in seen:
+        seen.append(error)
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _raise_itself(
+    error: BaseException,  # Error that will be raised through C++
+    frame: FrameType | None,  # Frame that called C++; None in threads that Python did not start
+) -> None:
+    """Raise an error in the user's code that called Mitsuba, instead of the error that C++ raises from it.
+
+    Uses Python's trace function. Under a debugger, which needs this function, the error of C++ is raised.
+    """
+    caller = _caller(frame)
+    if caller is None or sys.gettrace() is not None:
+        return
+
+    errors = [error]
+
+    def look(_: FrameType, event: str, argument: Any) -> None:
+        # Called for the error of C++, or for the next line if the caller has handled it.
+        sys.settrace(None)
+        caller.f_trace = None
+        error = errors.pop()
+        try:
+            if event == "exception" and argument[1] is not error and error in _causes(argument[1]):
+                raise error
+        finally:
+            # Break the reference cycle with the traceback, which contains this frame.
+            del error, argument
+
+    caller.f_trace = look
+    sys.settrace(lambda *_: None)
+
+
+def _caller(frame: FrameType | None) -> FrameType | None:
+    """The innermost frame outside of all frames of Mitsuba and Dr.Jit."""
+    caller = frame
+    while frame is not None:
+        if frame.f_globals.get("__name__", "").partition(".")[0] in _LIBRARIES:
+            caller = frame.f_back
+        frame = frame.f_back
+    return caller
