@@ -6,7 +6,7 @@ from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.mesh.connectivity import paired
-from mitsuba_subdivision.refinement.refined_attributes import differences
+from mitsuba_subdivision.refinement.refined_corners import differences
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core

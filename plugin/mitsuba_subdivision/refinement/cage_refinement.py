@@ -8,7 +8,6 @@ equal, and so are the limit surfaces.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from ..cage.contents import RULES, CageContents
 from ..cage.control_cage import ControlCage
-from ..cage.errors import CageError, CageSource, CageWarning
+from ..cage.errors import CageError, CageSource, without_warnings
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.cuts import Sharpness
@@ -24,8 +23,7 @@ from ..mesh.sharpness import INFINITE
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import adapted_scheme
-from .refined_attributes import differences, dual_attributes, refined_attributes
-from .refined_corners import RefinedCorners
+from .refined_corners import RefinedCorners, differences, dual_attributes, refined_attributes
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -170,10 +168,8 @@ def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: Refined
 
 
 def built(contents: CageContents) -> ControlCage:
-    """Build a cage without warnings."""
-    with warnings.catch_warnings():
-        # Problems that cause warnings were already in the coarse cage.
-        warnings.simplefilter("ignore", CageWarning)
+    """Build a cage without warnings, as problems that cause warnings were already in the coarse cage."""
+    with without_warnings():
         return ControlCage.from_arrays(**contents.as_arguments())
 
 
