@@ -86,7 +86,7 @@ def print_outlines(spp: int, seeds: int) -> None:
 
 def print_triangles(_spp: int, _seeds: int) -> None:
     print("surface         rate      area    volume     first    second")
-    types = ArrayTypes.of(sys.modules["drjit.llvm.ad"].Float64)
+    types = ArrayTypes(sys.modules["drjit.llvm.ad"].Float64)
     for name, build in CLOSED.items():
         surface = build()
         directions = list(motions(surface).values())

@@ -38,7 +38,7 @@ def surface(request):
 def types():
     if problem := llvm_problem():
         pytest.skip(problem)
-    return ArrayTypes.of(sys.modules["drjit.llvm.ad"].Float64)
+    return ArrayTypes(sys.modules["drjit.llvm.ad"].Float64)
 
 
 def expected_of(linear, shift, volume, first, second):

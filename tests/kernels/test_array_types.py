@@ -14,7 +14,7 @@ ROW_COUNT = 6
 @pytest.mark.core
 @pytest.mark.parametrize("size", [3, 4, 12, 16, 28, 48])
 def test_a_row_is_where_it_was_written_and_derivatives_return_to_it(size, variants_all_ad_rgb, np_rng):  # noqa: ARG001
-    types = ArrayTypes.of(mi.Float)
+    types = ArrayTypes(mi.Float)
     rows = np.arange(ROW_COUNT * size, dtype=np.float64).reshape(ROW_COUNT, size) + 1
     buffer = types.floats(rows)
     index, active = np_rng.integers(0, ROW_COUNT, 20), np_rng.random(20) < 0.7

@@ -13,7 +13,7 @@ ROUNDED = 2.0**-24
 
 @pytest.fixture
 def types(float_type):
-    return ArrayTypes.of(float_type)
+    return ArrayTypes(float_type)
 
 
 def on_device(function, types, *numbers):

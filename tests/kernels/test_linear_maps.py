@@ -42,7 +42,7 @@ def test_weighted_values_and_derivatives_are_products(float_type, rounding, weig
 
 @pytest.mark.parametrize("is_weighted", [False, True])
 def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, rounding, weights, is_weighted, np_rng):
-    types = ArrayTypes.of(float_type)
+    types = ArrayTypes(float_type)
     first, second = np_rng.random((2, COLUMNS, 3))
     values = ControlValues(types, 3, SparseMatrix(weights, types.float) if is_weighted else None).load(first)
     flat = values.flat
@@ -62,7 +62,7 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, roundin
 
 
 def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, rounding, weights, np_rng):
-    types, matrix = ArrayTypes.of(float_type), SparseMatrix(weights, float_type)
+    types, matrix = ArrayTypes(float_type), SparseMatrix(weights, float_type)
     values = np_rng.random((COLUMNS, 3))
     first, second = (ControlValues(types, 3, matrix).load(values.copy()) for _ in range(2))
     other = ControlValues(types, 3, matrix).load(values + 1)

@@ -59,7 +59,7 @@ class LinearChannelKernel(ChannelKernel):
     """Evaluates linearly interpolated values."""
 
     def __init__(self, channel: LinearChannel, walk: ElementWalk, float_type: type) -> None:
-        self._types, self._walk = ArrayTypes.of(float_type), walk
+        self._types, self._walk = ArrayTypes(float_type), walk
         patches = channel.patches
         half_edges = patches.half_edge_of_corner
         self._has_polygons = not patches.is_whole.all()
@@ -98,4 +98,4 @@ class LinearChannelKernel(ChannelKernel):
     def _value(self, half_edge: Index, active: Mask, *, of_centre: bool = False) -> Value:
         types = self._types
         row = 2 * half_edge + int(of_centre) if self._has_polygons else half_edge
-        return self.values.fetch(types.fetch(types.index, self._rows, row, active), active)
+        return self.values.fetch(dr.gather(types.index, self._rows, row, active), active)

@@ -70,7 +70,7 @@ class SparseMatrix:
         # Whether rows sum to one. Sums are then relative to the first value of each row, which reduces rounding errors.
         is_relative: bool = True,
     ) -> None:
-        self._types, self._matrix, self._is_relative = ArrayTypes.of(float_type), matrix, is_relative
+        self._types, self._matrix, self._is_relative = ArrayTypes(float_type), matrix, is_relative
         self._rows = self._uploaded(matrix)
 
     @classmethod
@@ -203,12 +203,12 @@ class WeightBlocks:
         """A function that returns the k-th control point of each lane; their number; the first row of weights."""
         types = self._types
         lane: Index = dr.arange(types.index, self.count)
-        block, patch = (types.fetch(types.index, indices, lane) for indices in self._lane)
-        first_control, stride, control_count, row = types.fetch(types.index4, self._columns, block)
+        block, patch = (dr.gather(types.index, indices, lane) for indices in self._lane)
+        first_control, stride, control_count, row = dr.gather(types.index4, self._columns, block)
         patch_control = first_control + patch
 
         def control(k: Index) -> Index:
-            return types.fetch(types.index, self._controls, dr.fma(k, stride, patch_control))
+            return dr.gather(types.index, self._controls, dr.fma(k, stride, patch_control))
 
         return control, control_count, row
 
@@ -221,7 +221,7 @@ class CoefficientMap:
     """The map of a piece table from control values to coefficients; differentiable, forward and backward."""
 
     def __init__(self, table: PieceTable, float_type: type) -> None:
-        self._types = types = ArrayTypes.of(float_type)
+        self._types = types = ArrayTypes(float_type)
         self._packet_count, refinement, controls = table.packet_count, table.refinement, table.controls
         # To the control points of the patches, if these are those of the cage refined once
         self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
@@ -277,13 +277,13 @@ class CoefficientMap:
         if self._parts is not None:
             refined, padded = padded, dr.zeros(types.float, PACKET * self._point_count)
             index: Index = dr.arange(types.index, self._refined_count)
-            dr.scatter(padded, types.fetch(types.vector4, refined, index), index, mode=NO_CONFLICTS)
+            dr.scatter(padded, dr.gather(types.vector4, refined, index), index, mode=NO_CONFLICTS)
             self._write(self._parts, refined, padded)
         coefficients: FloatBuffer = dr.zeros(types.float, PACKET * self._packet_count)
         if self._rings is not None:
             control, first, packet = self._rings
-            origin = types.fetch(types.vector4, padded, first, first != NOTHING)
-            dr.scatter(coefficients, types.fetch(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
+            origin = dr.gather(types.vector4, padded, first, first != NOTHING)
+            dr.scatter(coefficients, dr.gather(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
         if self._pieces is not None:
             self._write(self._pieces, padded, coefficients)
         return coefficients
@@ -294,7 +294,7 @@ class CoefficientMap:
         sums: FloatBuffer = dr.zeros(types.float, PACKET * self._point_count)
         if self._rings is not None:
             control, first, packet = self._rings
-            ring_gradient: Vector4 = types.fetch(types.vector4, gradient, packet)
+            ring_gradient: Vector4 = dr.gather(types.vector4, gradient, packet)
             dr.scatter_add(sums, ring_gradient, control)
             dr.scatter_add(sums, -ring_gradient, first, first != NOTHING)
         if self._pieces is not None:
@@ -403,4 +403,4 @@ class ControlValues:
 
     def fetch(self, index: Index, active: Mask = True) -> Value:
         """Gather the value at an index; zero in inactive lanes."""
-        return self._types.fetch(self._types.vector(self.size), self.flat, index, active)
+        return dr.gather(self._types.vector(self.size), self.flat, index, active)

@@ -50,11 +50,11 @@ class ElementWalk:
         # Convert numbers of Python and NumPy, which loops of Dr.Jit reject.
         element, corner = (types.converted(types.index, value) for value in (element, corner))
         u, v = (types.converted(types.float, value) for value in (u, v))
-        return Location(types.fetch(types.index, self._first, element, active) + corner, u, v)
+        return Location(dr.gather(types.index, self._first, element, active) + corner, u, v)
 
     def row(self, half_edge: Index, active: Mask = True) -> Index4:
         """Fetch the row of `PieceTable.half_edges`: twin, following and preceding half-edge, and code."""
-        return self.types.fetch(self.types.index4, self._half_edges, half_edge, active)
+        return dr.gather(self.types.index4, self._half_edges, half_edge, active)
 
     def from_first(self, location: Location, active: Mask = True) -> tuple[Location, Index]:
         """The same locations, seen from the first corner in whole elements; and the corner they were seen from."""
@@ -173,7 +173,7 @@ class TriangleLocations:
         """
         types = self._types
         half_edge, row = self._row(triangle, active)
-        corners = (types.fetch(types.vector2, self._parameters, 3 * row + i, active) for i in range(3))
+        corners = (dr.gather(types.vector2, self._parameters, 3 * row + i, active) for i in range(3))
         u, v = (dr.fma(b1, b - a, dr.fma(b2, c - a, a)) for a, b, c in zip(*corners, strict=True))
         location = Location(half_edge, u, v)
         return self._walk.carried(location, active) if self._leave_elements else location
@@ -182,12 +182,12 @@ class TriangleLocations:
         """The half-edge that the parameters of a triangle are seen from, and their row."""
         types, walk = self._types, self._walk
         if self._half_edge is not None:
-            return types.fetch(types.index, self._half_edge, triangle, active), triangle
+            return dr.gather(types.index, self._half_edge, triangle, active), triangle
         if self._element is None:
             count = self._whole_count
             return walk.at(triangle // count, 0, 0, active=active).half_edge, triangle % count
-        element = types.fetch(types.index, self._element, triangle, active)
-        number = triangle - types.fetch(types.index, self._first, element, active)
+        element = dr.gather(types.index, self._element, triangle, active)
+        number = triangle - dr.gather(types.index, self._first, element, active)
         first = walk.at(element, 0, 0, active=active).half_edge
         is_whole, per_corner = walk.is_whole(first, active), max(self._corner_count, 1)
         corner = dr.select(is_whole, 0, number // per_corner)

@@ -140,7 +140,8 @@ def _border(walk: ElementWalk, location: Location, du: Float, dv: Float) -> tupl
 
 
 def _limited(du: Float, dv: Float) -> tuple[Float, Float]:
-    factor = LONGEST_STEP / dr.maximum(dr.maximum(dr.abs(du), dr.abs(dv)), LONGEST_STEP)
+    longest: Float = dr.maximum(dr.maximum(dr.abs(du), dr.abs(dv)), LONGEST_STEP)
+    factor = LONGEST_STEP / longest
     return du * factor, dv * factor
 
 

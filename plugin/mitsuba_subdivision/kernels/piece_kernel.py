@@ -184,7 +184,7 @@ class Piece:
         evaluate, has_frame = kernel.monomials.values, tip.frame_row is not None
 
         def control(index: Index, active: Mask = True) -> list[Float]:
-            return [*types.fetch(types.vector4, self.buffer, tip.ring + index, active)][:size]
+            return [*dr.gather(types.vector4, self.buffer, tip.ring + index, active)][:size]
 
         def add_control(k, *totals):
             weights = evaluate(kernel.weights(tip.row + k), s, t, derivatives)
@@ -241,7 +241,7 @@ class PieceKernel:
     ) -> None:
         if use_stam and table.piece_levels:
             raise ValueError("a table with levels of tips that are pieces; expected one made for Stam's form")
-        self.types = types = ArrayTypes.of(float_type)
+        self.types = types = ArrayTypes(float_type)
         scheme = table.patches.scheme
         self.domain, basis = scheme.domain, polynomial_basis(scheme)
         self.monomials = Monomials(basis.powers.tolist())
@@ -290,10 +290,10 @@ class PieceKernel:
             code, u, v, scale, quarter = self._split(half_edge, row, u, v, active)
         turn = code // PATCH_CORNER & CORNERS
         patch = code // PATCH
-        first_piece, node = types.fetch(types.index2, self._patch_starts, patch, active)
+        first_piece, node = dr.gather(types.index2, self._patch_starts, patch, active)
         if self._is_divided:
             node, turn, u, v, scale = self._leaf(node, turn, u, v, scale, active)
-        kind, number, block_row, tip_code = types.fetch(types.index4, self._nodes, node, active)
+        kind, number, block_row, tip_code = dr.gather(types.index4, self._nodes, node, active)
         turn = (turn + kind // TURN) % domain.corner_count
         u, v = turned(domain, u, v, turn)
         number, is_piece, tip = first_piece + number, active, None
@@ -306,7 +306,7 @@ class PieceKernel:
             is_piece = active & ~is_deep
             block, is_rest = child - LEVEL_PIECES * self._piece_levels, level == level_count
             control_count = tip_code // CONTROL
-            ring = types.fetch(types.index, self._rings, patch, is_deep)
+            ring = dr.gather(types.index, self._rings, patch, is_deep)
             row_of_block = dr.fma(block, control_count, block_row)
             tip = Tip(dr.select(is_deep, control_count, types.index(0)), ring, row_of_block)
             if self._has_frames:
@@ -385,7 +385,7 @@ class PieceKernel:
         types, count = self.types, self.domain.corner_count
 
         def node_at(node):
-            return types.fetch(types.index4, self._nodes, node, active)
+            return dr.gather(types.index4, self._nodes, node, active)
 
         def descend(node, turn, u, v, scale):
             kind, first, _, _ = node_at(node)

@@ -89,7 +89,7 @@ class SurfaceKernel:
         use_stam: bool = False,
         cells: Callable[[], SamplingCells] | None = None,  # Makes the cells for `sample` when it is first called
     ) -> None:
-        self.types = ArrayTypes.of(float_type)
+        self.types = ArrayTypes(float_type)
         self._make_cells = cells
         self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
         self.walk = self._patches.walk  # Over the surface's elements
@@ -246,18 +246,18 @@ class SurfaceKernel:
         until, density, start, matrices, offsets = self._cells
 
         def is_before(index: Index) -> Mask:
-            return types.fetch(types.float, until, index) <= choice
+            return dr.gather(types.float, until, index) <= choice
 
         cell = types.index(dr.binary_search(0, len(until) - 1, is_before))
         x, y = inside[0], inside[1]
         if self.walk.domain.corner_count == 3:
             is_beyond = x + y > 1
             x, y = dr.select(is_beyond, 1 - x, x), dr.select(is_beyond, 1 - y, y)
-        a, b, c, d = types.fetch(types.vector4, matrices, cell)
-        offset = types.fetch(types.vector2, offsets, cell)
+        a, b, c, d = dr.gather(types.vector4, matrices, cell)
+        offset = dr.gather(types.vector2, offsets, cell)
         u, v = dr.fma(a, x, dr.fma(b, y, offset[0])), dr.fma(c, x, dr.fma(d, y, offset[1]))
-        points = self.at(Location(types.fetch(types.index, start, cell), u, v), derivatives=derivatives)
-        by_parameters = types.fetch(types.float, density, cell)
+        points = self.at(Location(dr.gather(types.index, start, cell), u, v), derivatives=derivatives)
+        by_parameters: Float = dr.gather(types.float, density, cell)
         return replace(points, pdf=over(by_parameters, dr.norm(cross(points.dp_du, points.dp_dv))))
 
     @cached_property

@@ -37,7 +37,7 @@ class VertexKernel:
 
     def __init__(self, table: VertexTable, float_type: type) -> None:
         self.vertex_count, self.control_count = table.vertex_count, table.control_count
-        self._types = types = ArrayTypes.of(float_type)
+        self._types = types = ArrayTypes(float_type)
         refinement = table.refinement
         self._refined_count = table.control_count if refinement is None else refinement.shape[0]
         self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
@@ -161,7 +161,7 @@ class _Part:
         """The coefficients of each lane's polynomial; rounding error and extent for `UnitNormal`."""
         types = self._types
         coefficients, origin, extent = self._blocks.vectors(padded)
-        rounding: Float = types.fetch(types.float, self._rounding, dr.arange(types.index, self._blocks.count))
+        rounding: Float = dr.gather(types.float, self._rounding, dr.arange(types.index, self._blocks.count))
         return coefficients, rounding, dr.maximum(extent, dr.abs(origin) * self._least_extent)
 
     def _loop(self, start: tuple, add: Callable[..., tuple], label: str) -> tuple:
@@ -170,15 +170,15 @@ class _Part:
         lane: Index = dr.arange(types.index, self._blocks.count)
 
         def range_of(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
-            return types.fetch(types.index, table, index), types.fetch(types.index, table, index + 1)
+            return dr.gather(types.index, table, index), dr.gather(types.index, table, index + 1)
 
         def add_entry(first_vertex: Index, entry: Index, *state) -> tuple:
-            vertex = first_vertex + types.fetch(types.index, self._offset, entry)
-            s, t = types.fetch(types.vector2, self._st, entry)
+            vertex = first_vertex + dr.gather(types.index, self._offset, entry)
+            s, t = dr.gather(types.vector2, self._st, entry)
             return add(vertex, s, t, *state)
 
         def vertices_of_run(run: Index) -> tuple[Index, Index, Index]:
-            kind, first_vertex = (types.fetch(types.index, column, run) for column in (self._kind, self._first_vertex))
+            kind, first_vertex = (dr.gather(types.index, column, run) for column in (self._kind, self._first_vertex))
             return first_vertex, *range_of(self._first_entry, kind)
 
         def add_run(run: Index, *state) -> tuple:

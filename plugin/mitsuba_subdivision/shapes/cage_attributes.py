@@ -138,7 +138,7 @@ class CageAttributes:
             return SharedArray(values.ravel())
         from ..kernels.array_types import ArrayTypes
 
-        return ArrayTypes.of(self._float).shared_floats(values)
+        return ArrayTypes(self._float).shared_floats(values)
 
     def _stored(self, name: str) -> FloatBuffer:
         values = self._at_vertices(name)

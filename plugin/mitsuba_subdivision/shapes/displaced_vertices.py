@@ -98,7 +98,7 @@ class DeviceDisplacement:
     ) -> None:
         self._surface, self._has_normals = surface, has_normals
         self.is_differentiable = bool(dr.is_diff_v(float_type))
-        self._types = types = ArrayTypes.of(float_type)
+        self._types = types = ArrayTypes(float_type)
         u, v = (types.floats(column) for column in locations.uv.T)
         self._location = Location(types.indices(locations.corner), u, v)
         self._read: FloatBuffer = None

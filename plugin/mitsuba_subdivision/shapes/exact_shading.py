@@ -118,7 +118,7 @@ class ExactShading:
     def _located(self, triangle: Index, b1: Float, b2: Float, active: Mask) -> Location:
         """The location of a point of a triangle of the shape, see `TriangleLocations`."""
         if self._kept is not None:
-            triangle = self.kernel.types.fetch(self.kernel.types.index, self._kept, triangle, active)
+            triangle = dr.gather(self.kernel.types.index, self._kept, triangle, active)
         return self._triangles(triangle, b1, b2, active)
 
     def welded_table(self, table: VertexTable) -> AttributeTable:

@@ -232,7 +232,7 @@ def _placed(positions: FloatBuffer, normals: FloatBuffer, matrix: Matrix4) -> tu
         from ..kernels.array_types import ArrayTypes
         from ..kernels.vertex_kernel import placed
 
-        types = ArrayTypes.of(type(positions))
+        types = ArrayTypes(type(positions))
         to_world = matrix if dr.is_jit_v(matrix) else types.matrix4(matrix.tolist())
         return placed(positions, normals, to_world, types.vector3)
     linear, offset = matrix[:3, :3], matrix[:3, 3]

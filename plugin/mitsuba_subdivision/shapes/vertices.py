@@ -96,7 +96,7 @@ class _Selection:
         if index is not None and float_type is not None:
             from ..kernels.array_types import ArrayTypes
 
-            self._types = ArrayTypes.of(float_type)
+            self._types = ArrayTypes(float_type)
             self._index = self._types.indices(index)
 
     def __call__(self, flat: FloatBuffer) -> FloatBuffer:
