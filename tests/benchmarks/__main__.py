@@ -6,8 +6,8 @@ Peers compute points and normals of the same surface at as many samples as the t
 They are built on the first run, if a C++ compiler, OpenSubdiv and Embree are there, and left out otherwise. Times are
 the best of some repeats; only the ratios within one run mean anything.
 
-Cold is the first call in a process; stages, mesh, load and picture then find no compiled kernels, totals those in
-Dr.Jit's cache. Peaks are resident memory, of warm calls.
+Cold is the first call in a process; stages, load and picture then find no compiled kernels, totals those in Dr.Jit's
+cache. Peaks are resident memory, of warm calls.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from processes import measured
 
 # Above so many triangles a dense file is not written.
 DENSE_TRIANGLES = 20_000_000
-OWN = "this package"
+PACKAGE = "this package"
 
 
 def main(arguments=None):
@@ -37,8 +37,8 @@ def main(arguments=None):
             results.append({"cage": cage, "rate": rate, **_measured(files, rate, options, commands)})
             _show(results[-1], floors)
     if options.json:
-        found = {"absent": absent, "memory of a cube": floors, "results": results}
-        Path(options.json).write_text(json.dumps(found, indent=1))
+        everything = {"absent": absent, "memory of a cube": floors, "results": results}
+        Path(options.json).write_text(json.dumps(everything, indent=1))
 
 
 def _parsed(arguments):
@@ -47,8 +47,6 @@ def _parsed(arguments):
     parser.add_argument("--rates", nargs="+", type=int, default=[8])
     parser.add_argument("--variants", nargs="*", default=["scalar_rgb", "llvm_ad_rgb"])
     parser.add_argument("--repeats", type=int, default=3)
-    once = "of the peers: each once, or all"
-    parser.add_argument("--samples", choices=["shared", "grid"], default="shared", help=once)
     parser.add_argument("--quick", action="store_true", help="totals and peers only")
     parser.add_argument("--no-peers", action="store_true")
     parser.add_argument("--cache", type=Path, default=CACHE, help=f"folder of cages and peers; {CACHE}")
@@ -60,36 +58,33 @@ def _measured(files, rate, options, commands):
     def with_empty_cache(task, variant=""):
         # Dr.Jit keeps compiled kernels at home.
         with tempfile.TemporaryDirectory() as home:
-            return _own(task, files, rate, options.repeats, variant, HOME=home)
+            return _timed(task, files, rate, options.repeats, variant, HOME=home)
 
-    triangles = 2 * rate**2 * (files["bin"].stat().st_size // 28)
-    result = {"empty kernel cache": with_empty_cache("total"), "total": _own("total", files, rate, options.repeats)}
+    result = {"empty kernel cache": with_empty_cache("total"), "total": _timed("total", files, rate, options.repeats)}
     result["peers"] = {
-        name: time_peer(command, files["bin"], rate, options.repeats, options.samples)
-        for name, command in commands.items()
+        name: time_peer(command, files["bin"], rate, options.repeats) for name, command in commands.items()
     }
-    if not options.quick:
-        tasks = [("stages", "")]
-        for variant in options.variants:
-            tasks.append(("mesh", variant))
-            if triangles <= DENSE_TRIANGLES:
-                tasks.append(("load", variant))
-            if not variant.startswith("scalar"):
-                tasks.append(("picture", variant))
-        for task, variant in tasks:
-            result[f"{task}, {variant}" if variant else task] = with_empty_cache(task, variant)
+    if options.quick:
+        return result
+    result["stages"] = with_empty_cache("stages")
+    is_small = 2 * rate**2 * (files["bin"].stat().st_size // 28) <= DENSE_TRIANGLES
+    for variant in options.variants:
+        if is_small:
+            result[f"load, {variant}"] = with_empty_cache("load", variant)
+        if not variant.startswith("scalar"):
+            result[f"picture, {variant}"] = with_empty_cache("picture", variant)
     return result
 
 
 def _memory_of_cube(options, commands):
     """Peak memory in MB of the package and of each peer for a cube: that of the program itself."""
     files = cage_files("cube", options.cache)
-    found = {name: time_peer(command, files["bin"], 1, 1, options.samples) for name, command in commands.items()}
-    memory = {name: peer["memory"] for name, peer in found.items() if "failed" not in peer}
-    return memory | {OWN: _own("total", files, 1, 2)["peak"]}
+    peers = {name: time_peer(command, files["bin"], 1, 1) for name, command in commands.items()}
+    memory = {name: peer["memory"] for name, peer in peers.items() if "failed" not in peer}
+    return memory | {PACKAGE: _timed("total", files, 1, 2)["peak"]}
 
 
-def _own(task, files, rate, repeats, variant="", **variables):
+def _timed(task, files, rate, repeats, variant="", **variables):
     program = Path(__file__).with_name("measure.py")
     words = [sys.executable, program, task, files["obj"], files["bin"], rate, repeats, variant]
     return measured(task, words, **variables)
@@ -98,41 +93,24 @@ def _own(task, files, rate, repeats, variant="", **variables):
 def _show(result, floors):
     total = result["total"]
     print(f"\n{result['cage']}, rate {result['rate']:<33}cold      warm   (ms)  peak (MB)")
-    for name in ("total", "update"):
-        _row(name, total, name)
-    _row("total, empty kernel cache", result["empty kernel cache"], "total")
-    print(f"  peak memory {total['peak']:.0f} MB" + _above_cube(total["peak"], floors[OWN]))
-    for task, found in result.items():
-        if task.startswith(("stages", "mesh", "load", "picture")):
-            for name in found["cold"]:
-                _row(f"{task}: {name}", found, name)
-        if task == "stages":
-            written, filled = (found["bandwidth"][name] / 1e9 for name in ("evaluation", "fill"))
-            print(f"  evaluation writes {written:.1f} GB/s; filling an array of that size, {filled:.1f} GB/s")
-        if task.startswith("load"):
-            for cage in ("OBJ cage", "PLY cage"):
-                ratio = found["warm"]["dense PLY"] / found["warm"][cage]
-                print(f"  {f'{task}: dense PLY / {cage}':50}{ratio:8.2f}")
+    labels = {"total": "", "empty kernel cache": "empty kernel cache: "}
+    for task, times in result.items():
+        for name in times["cold"] if isinstance(times, dict) and "cold" in times else ():
+            cold, warm = times["cold"][name] * 1e3, times["warm"][name] * 1e3
+            label = labels.get(task, f"{task}: ") + name
+            print(f"  {label:50}{cold:10.1f}{warm:10.1f}{times['memory'][name]:15.0f}")
+    print(f"  peak memory {total['peak']:.0f} MB, {total['peak'] - floors[PACKAGE]:.0f} above a cube's")
     for name, peer in result["peers"].items():
         if "failed" in peer:
             print(f"  {name:18} {peer['failed']}")
             continue
         update = (peer["update"] + peer["evaluation"]) / total["warm"]["update"]
-        memory = f"memory {peer['memory']:.0f} MB" + _above_cube(peer["memory"], floors.get(name))
         print(
             f"  {name:18} set-up {peer['setup'] * 1e3:8.1f}  evaluation {peer['evaluation'] * 1e3:8.1f}  "
             f"total {peer['total'] * 1e3:8.1f}: {peer['total'] / total['warm']['total']:5.2f} x, "
-            f"update {update:5.2f} x, {memory}"
+            f"update {update:5.2f} x, memory {peer['memory']:.0f} MB, "
+            f"{peer['memory'] - floors.get(name, 0):.0f} above a cube's"
         )
-
-
-def _above_cube(memory, floor):
-    return "" if floor is None else f", {memory - floor:.0f} above a cube's"
-
-
-def _row(label, found, name):
-    cold, warm = found["cold"][name] * 1e3, found["warm"][name] * 1e3
-    print(f"  {label:38}{cold:10.1f}{warm:10.1f}{found['memory'][name]:15.0f}")
 
 
 if __name__ == "__main__":

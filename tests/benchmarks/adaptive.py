@@ -13,7 +13,6 @@ USD is tessellated mesh by mesh, and its rows are sums.
 
 import argparse
 import json
-import resource
 import sys
 import time
 import warnings
@@ -22,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
-from processes import ran
+from processes import measured, peak_memory
 
 OUTLINES = "outlines"
 HEADER = "model, scheme, error         faces   uniform             s    MB   adaptive            s    MB   us/triangle"
@@ -56,16 +55,14 @@ def _error(word):
 
 def _row(model, scheme, error, rate):
     """One line of the table; each side is measured in a process of its own."""
-    name, found = f"{model.name}, {scheme}, {error if error == OUTLINES else format(error, 'g')}", []
-    for kind in ("uniform", "adaptive"):
-        done = ran([sys.executable, __file__, "--process", json.dumps([str(model), scheme, error, rate, kind])])
-        if done.returncode:
-            return f"{name}: {(done.stderr.strip().splitlines() or ['killed'])[-1]}"
-        found.append(json.loads(done.stdout))
-    uniform, adaptive = found
-    sides = "".join("{triangles:10,} {seconds:12.2f} {memory:5.0f}   ".format(**each) for each in found)
+    name = f"{model.name}, {scheme}, {error if error == OUTLINES else format(error, 'g')}"
+    uniform, adaptive = (
+        measured(name, [sys.executable, __file__, "--process", json.dumps([str(model), scheme, error, rate, kind])])
+        for kind in ("uniform", "adaptive")
+    )
+    columns = "".join("{triangles:10,} {seconds:12.2f} {memory:5.0f}   ".format(**side) for side in (uniform, adaptive))
     beyond = adaptive["seconds"] - 2 * uniform["seconds"] if rate == 1 else adaptive["seconds"]
-    return f"{name:27} {adaptive['faces']:6,} {sides}{1e6 * max(0, beyond) / adaptive['triangles']:8.2f}"
+    return f"{name:27} {adaptive['faces']:6,} {columns}{1e6 * max(0, beyond) / adaptive['triangles']:8.2f}"
 
 
 def _criterion(cage, error):
@@ -84,7 +81,7 @@ def _measured(model, scheme, error, rate, kind):
         surface = LimitSurface(cage, scheme)
         # Classes are found once for all tessellations.
         assert surface.patches.classes
-        taken, before = [], _peak()
+        taken, before = [], peak_memory()
         for _ in range(3):
             start = time.process_time()
             table = surface.sampling(rate) if kind == "uniform" else surface.adaptive_sampling(_criterion(cage, error))
@@ -95,13 +92,8 @@ def _measured(model, scheme, error, rate, kind):
         seconds += min(taken)
         triangles += count
         faces += cage.face_count
-        memory += _peak() - before
-    return {"faces": faces, "triangles": triangles, "seconds": seconds, "memory": memory / 1024}
-
-
-def _peak():
-    """Most memory that the process has taken so far, in kB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        memory += peak_memory() - before
+    return {"faces": faces, "triangles": triangles, "seconds": seconds, "memory": memory}
 
 
 def _cages(path):

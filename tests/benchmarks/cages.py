@@ -4,6 +4,8 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from mitsuba_subdivision import ControlCage
+from mitsuba_subdivision.cage import named_cages
 
 CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 # Four corners of each of three golden rectangles.
@@ -20,8 +22,8 @@ ICOSAHEDRON_FACES = np.transpose(
 
 def cube():
     """Six quadrilaterals, every corner of valence 3."""
-    points = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], dtype=float)
-    return points, np.array([(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)])
+    cage = named_cages.cube()
+    return cage.positions, cage.face_vertices.reshape(-1, 4)
 
 
 def torus(n=256):
@@ -48,32 +50,16 @@ def split_sphere(frequency, low, high, rounds, bump):
     return points * (1 + bump * np.sin(5 * x + 1) * np.sin(4 * y) + bump * np.cos(6 * z))[:, None], quads
 
 
-def refined(points, quads):
-    """One Catmull-Clark step."""
-    vertex_count = len(points)
-    ends, edge = _edges(quads, vertex_count)
-    centres = points[quads].mean(axis=1)
-    beside = _scattered(edge.ravel(), np.repeat(centres, 4, axis=0), len(ends))
-    middles = (points[ends].sum(axis=1) + beside) / 4
-    valence = np.bincount(quads.ravel(), minlength=vertex_count)[:, None]
-    faces_around = _scattered(quads.ravel(), np.repeat(centres, 4, axis=0), vertex_count)
-    neighbours = _scattered(ends.ravel(), points[ends[:, ::-1]].reshape(-1, 3), vertex_count)
-    moved = ((faces_around + neighbours) / valence + (valence - 2) * points) / valence
-    edge = edge + vertex_count
-    centre = vertex_count + len(ends) + np.arange(len(quads))
-    children = [np.stack([quads[:, k], edge[:, k], centre, edge[:, k - 1]], axis=1) for k in range(4)]
-    return np.concatenate([moved, middles, centres]), np.concatenate(children)
+def refined_twice(points, quads):
+    cage = ControlCage(points, quads).refined().refined()
+    return cage.positions, cage.face_vertices.reshape(-1, 4)
 
 
-PLY_HEADER = (
-    "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
-    "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
-)
 MAKERS = {
     "cube": cube,
     "star": lambda: split_sphere(2, 3, 8, 10, 0.25),
     "ev50k": lambda: split_sphere(29, 5, 7, 8, 0.06),
-    "mix50k": lambda: refined(*refined(*split_sphere(7, 3, 8, 8, 0.12))),
+    "mix50k": lambda: refined_twice(*split_sphere(7, 3, 8, 8, 0.12)),
     "torus": torus,
     "ev500k": lambda: split_sphere(91, 5, 7, 8, 0.06),
     "ev2m": lambda: split_sphere(183, 5, 7, 8, 0.06),
@@ -87,13 +73,9 @@ def cage_files(name, folder):
     if not all(path.exists() for path in files.values()):
         stem.parent.mkdir(parents=True, exist_ok=True)
         points, quads = MAKERS[name]()
-        with files["obj"].open("w") as out:
-            np.savetxt(out, points, "v %.9g %.9g %.9g")
-            np.savetxt(out, quads + 1, "f %d %d %d %d")
-        rows = np.empty(len(quads), [("count", "u1"), ("vertices", "<i4", 4)])
-        rows["count"], rows["vertices"] = 4, quads
-        header = PLY_HEADER.format(len(points), len(quads)).encode()
-        files["ply"].write_bytes(header + points.astype("<f4").tobytes() + rows.tobytes())
+        cage = ControlCage(points, quads)
+        for kind in ("obj", "ply"):
+            cage.save(files[kind])
         arrays = np.array([len(points), len(quads)], np.int32), points.astype(np.float32), quads.astype(np.int32)
         files["bin"].write_bytes(b"".join(array.tobytes() for array in arrays))
     return files

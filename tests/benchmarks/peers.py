@@ -36,9 +36,9 @@ def built_peers(folder):
     return commands, absent
 
 
-def time_peer(command, cage_file, rate, repeats, samples):
+def time_peer(command, cage_file, rate, repeats):
     """Seconds of set-up, update, evaluation and all of them, and peak memory in MB; or why it failed."""
-    arguments = [*command, str(cage_file), str(rate), str(repeats), samples]
+    arguments = [*command, str(cage_file), str(rate), str(repeats), "shared"]
     done = subprocess.run(arguments, capture_output=True, text=True, check=False)
     if done.returncode < 0:
         # What asks for more memory than there is, the system kills.

@@ -18,7 +18,6 @@ import argparse
 import json
 import sys
 import tempfile
-import time
 from functools import partial
 from pathlib import Path
 
@@ -29,9 +28,8 @@ import mitsuba_subdivision as msub
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from measure import peak_memory
 from mitsuba_subdivision.device_arrays import upload
-from processes import ROOT, ran
+from processes import ROOT, Clock, measured
 
 VARIANT = "llvm_ad_rgb"
 SHADINGS = ("vertex", "exact")
@@ -52,13 +50,13 @@ def main(arguments=None):
         mi.set_variant(VARIANT)
         print(json.dumps(TASKS[task][0](shading, repeats, *words)))
         return
-    for task in options.tasks:
-        found = []
+    for task in options.tasks or TASKS:
+        runs = []
         for words in TASKS[task][1](options):
-            found.append(_measured(task, words, options.repeats))
-            _show(f"{task} {' '.join(map(str, words))}", found[-1])
+            runs.append({shading: _measured(task, shading, words, options.repeats) for shading in SHADINGS})
+            _show(f"{task} {' '.join(map(str, words))}", runs[-1])
         if task == "shapes":
-            _show_further(*found)
+            _show_further(*runs)
 
 
 def _parsed(arguments):
@@ -72,52 +70,35 @@ def _parsed(arguments):
     options = parser.parse_args(arguments)
     if wrong := set(options.tasks) - TASKS.keys():
         parser.error(f"there is no task {', '.join(sorted(wrong))}; expected some of {', '.join(TASKS)}")
-    options.tasks = options.tasks or list(TASKS)
     return options
 
 
 def _counts(text):
-    shapes, instances, groups = text.split(",")
-    return int(shapes), int(instances), int(groups)
+    return tuple(map(int, text.split(",")))
 
 
-def _measured(task, words, repeats):
-    """By shading, what a process with an empty cache of kernels has measured, and one after it; or why not."""
-    found, failed = {}, {}
-    for shading in SHADINGS:
-        with tempfile.TemporaryDirectory() as home:
-            # Dr.Jit keeps compiled kernels at home.
-            command = [sys.executable, __file__, "--process", json.dumps([task, shading, words, repeats])]
-            runs = [ran(command, HOME=home) for _ in ("cold", "warm")]
-        for run in (run for run in runs if run.returncode):
-            failed[shading] = (run.stderr.strip().splitlines() or [f"status {run.returncode}"])[-1]
-        if not failed:
-            found[shading] = [json.loads(run.stdout.splitlines()[-1]) for run in runs]
-    return dict.fromkeys(SHADINGS, "not shown, as the other failed") | failed if failed else found
+def _measured(task, shading, words, repeats):
+    """What a process with an empty cache of kernels has measured, and one after it."""
+    with tempfile.TemporaryDirectory() as home:
+        # Dr.Jit keeps compiled kernels at home.
+        command = [sys.executable, __file__, "--process", json.dumps([task, shading, words, repeats])]
+        return [measured(f"{task}, {shading}", command, HOME=home) for _ in ("cold", "warm")]
 
 
-def _show(title, found):
-    print(f"\n{title:<32}{'wall s: vertex':>16}{'exact':>9}{'ratio':>8}{'CPU s: vertex':>18}{'exact':>9}{'ratio':>8}")
-    if isinstance(found["vertex"], str):
-        for shading, message in found.items():
-            print(f"  {shading}: {message}")
-        return
+def _show(title, runs):
+    print(f"\n{title:<32}" + "".join(f"{name:>20}" for name in (*SHADINGS, "ratio")) + "    wall s (CPU s)")
     for number, cache in enumerate(("empty cache", "compiled")):
-        runs = [found[shading][number] for shading in SHADINGS]
-        for step, seconds in runs[0]["seconds"].items():
-            columns = ""
-            for kind, width in ((0, 16), (1, 18)):
-                vertex, exact = seconds[kind], runs[1]["seconds"][step][kind]
-                columns += f"{vertex:{width}.4f}{exact:9.4f}{exact / max(vertex, 1e-9):8.2f}"
-            print(f"  {f'{cache}: {step}':<30}{columns}")
-        print(f"  {f'{cache}: memory, MB':<30}" + "".join(f"{run['memory']:16.0f}" for run in runs))
+        vertex, exact = (runs[shading][number] for shading in SHADINGS)
+        for step in vertex["seconds"]:
+            columns = np.array([vertex["seconds"][step], exact["seconds"][step]])
+            columns = [*columns, columns[1] / np.maximum(columns[0], 1e-9)]
+            print(f"  {f'{cache}: {step}':<30}" + "".join(f"{wall:10.4f} ({cpu:7.4f})" for wall, cpu in columns))
+        print(f"  {f'{cache}: memory, MB':<30}" + "".join(f"{run['memory']:20.0f}" for run in (vertex, exact)))
     sys.stdout.flush()
 
 
 def _show_further(few, many):
     """What each of the further shapes costs, with compiled kernels."""
-    if any(isinstance(each, str) for found in (few, many) for each in found.values()):
-        return
     for shading in SHADINGS:
         (_, less), (_, more) = few[shading], many[shading]
         times = ((more["seconds"][step][0] - less["seconds"][step][0]) / (MANY - FEW) * 1e3 for step in STEPS)
@@ -153,10 +134,10 @@ def copies(shading, repeats, count):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "copies.usdc"
         _write_copies(path, msub.ControlCage.from_file(ROOT / "scenes/cages/rook.obj"), count)
-        laps = _Laps()
+        clock = Clock()
         scene = msub.usd_scene(path, mi, spp=4, shading=shading)
-        laps.end("read")
-        return _pictures(scene, repeats, laps)
+        clock.lap("read")
+        return _pictures(scene, repeats, clock)
 
 
 def _write_copies(path, cage, count):
@@ -183,12 +164,12 @@ def _write_copies(path, cage, count):
 
 def gradients(shading, repeats, cage):
     """A step of a fit: render, differentiate by control points, update."""
-    laps, shape = _Laps(), _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
+    clock, shape = Clock(), _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
     scene = mi.load_dict(_scene({"shape": shape}, 128, 16, {"type": "prb", "max_depth": 3}))
     parameters = mi.traverse(scene)
     (key,) = (key for key in parameters.keys() if key.endswith("control_points"))  # noqa: SIM118
     dr.sync_thread()
-    laps.end("load")
+    clock.lap("load")
     start = upload(type(parameters[key]), parameters[key])
     for step in range(repeats + 1):
         moved = start + 1e-4 * step
@@ -198,8 +179,8 @@ def gradients(shading, repeats, cage):
         dr.backward(dr.mean(mi.render(scene, parameters, seed=step, spp=16) ** 2, axis=None))
         dr.eval(dr.grad(moved))
         dr.sync_thread()
-        laps.end("first" if step == 0 else "next")
-    return laps.found()
+        clock.lap("first" if step == 0 else "next")
+    return _taken(clock)
 
 
 TASKS = {
@@ -212,31 +193,20 @@ TASKS = {
 }
 
 
-def _pictures(scene, repeats, laps=None):
+def _pictures(scene, repeats, clock=None):
     """A scene, loaded, and pictures of it."""
-    laps = laps or _Laps()
+    clock = clock or Clock()
     loaded = mi.load_dict(scene)
     dr.sync_thread()
-    laps.end("load")
+    clock.lap("load")
     for number in range(repeats + 1):
         np.array(mi.render(loaded, seed=number))
-        laps.end("first" if number == 0 else "next")
-    return laps.found()
+        clock.lap("first" if number == 0 else "next")
+    return _taken(clock)
 
 
-class _Laps:
-    """The best of the laps of each name."""
-
-    def __init__(self):
-        self._seconds, self._last = {}, (time.perf_counter(), time.process_time())
-
-    def end(self, name):
-        lap = time.perf_counter() - self._last[0], time.process_time() - self._last[1]
-        self._seconds[name] = tuple(map(min, self._seconds.get(name, lap), lap))
-        self._last = time.perf_counter(), time.process_time()
-
-    def found(self):
-        return {"seconds": self._seconds, "memory": peak_memory()}
+def _taken(clock):
+    return {"seconds": clock.seconds, "memory": clock.peak}
 
 
 def _scene(shapes, size, spp, integrator=None):

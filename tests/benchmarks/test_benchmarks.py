@@ -65,13 +65,13 @@ def test_a_stage_without_materials_has_all_else(tmp_path):
     text = STAGE.replace("#usda 1.0", '#usda 1.0\n(\n    upAxis = "Z"\n)\ndef Material "red" {\n}')
     path.write_text(text.replace('"quads" {', f'"quads" {binding}'))
     given = usd.Stage.Open(str(path))
-    found = usd.Stage.Open(str(without_materials(path, tmp_path / "grey.usda")))
-    assert [each.GetName() for each in given.Traverse()] == ["red", "quads"]
-    assert [each.GetName() for each in found.Traverse()] == ["quads"]
-    quads = [each.GetPrimAtPath("/quads") for each in (given, found)]
-    assert [len(each.GetRelationship("material:binding").GetTargets()) for each in quads] == [1, 0]
-    assert found.GetMetadata("upAxis") == given.GetMetadata("upAxis") == "Z"
-    points, expected = (each.GetAttribute("points").Get() for each in quads)
+    grey = usd.Stage.Open(str(without_materials(path, tmp_path / "grey.usda")))
+    assert [prim.GetName() for prim in given.Traverse()] == ["red", "quads"]
+    assert [prim.GetName() for prim in grey.Traverse()] == ["quads"]
+    quads = [stage.GetPrimAtPath("/quads") for stage in (given, grey)]
+    assert [len(mesh.GetRelationship("material:binding").GetTargets()) for mesh in quads] == [1, 0]
+    assert grey.GetMetadata("upAxis") == given.GetMetadata("upAxis") == "Z"
+    points, expected = (mesh.GetAttribute("points").Get() for mesh in quads)
     assert points == expected
 
 
@@ -96,4 +96,4 @@ def test_a_whole_stage_is_measured_without_cycles(tmp_path):
     [("kill -9 $$", "ended by SIGKILL"), ("echo no cage >&2; exit 3", "no cage"), ("exit 3", "exit status 3")],
 )
 def test_a_peer_that_fails_says_why(program, reason):
-    assert time_peer(["sh", "-c", program], "cage.bin", 8, 1, "shared") == {"failed": reason}
+    assert time_peer(["sh", "-c", program], "cage.bin", 8, 1) == {"failed": reason}

@@ -70,7 +70,7 @@ def without_materials(path, copy):
     stage = Usd.Stage.Open(layer)
     for prim in stage.Traverse():
         UsdShade.MaterialBindingAPI(prim).UnbindAllBindings()
-    for prim in [each for each in stage.Traverse() if each.IsA(UsdShade.Material)]:
+    for prim in [prim for prim in stage.Traverse() if prim.IsA(UsdShade.Material)]:
         prim.SetActive(False)
     layer.Save()
     del delegate
@@ -81,66 +81,61 @@ def _no_cycles(python):
     """Why Cycles cannot be measured; None if it can."""
     if python is None:
         return "no --cycles PYTHON was given; expected one with `pip install bpy==5.0.1`"
-    found = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True, check=False)
-    return f"{python} has no module bpy; expected `pip install bpy==5.0.1`" if found.returncode else None
+    done = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True, check=False)
+    return f"{python} has no module bpy; expected `pip install bpy==5.0.1`" if done.returncode else None
 
 
 def _measured(sides, options):
     """By side, the best wall and processor seconds of each stage, and the peak of memory in MB."""
-    found = {name: [] for name in sides}
+    from processes import measured
+
+    runs = {name: [] for name in sides}
     with tempfile.TemporaryDirectory() as folder:
-        stage = options.stage
+        stage, camera = options.stage, Path(folder) / "camera.json"
         if options.grey:
             stage = without_materials(stage.resolve(), Path(folder) / "grey.usda")
-        common = [stage, "--size", *options.size, "--spp", options.spp]
         # Modules that are imported later are compiled once, as in an installation.
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         os.environ["PYTHONPYCACHEPREFIX"] = folder
-        camera = Path(folder) / "camera.json"
         # The first round compiles kernels and modules, and reads files into memory.
         for number in range(options.repeats + 1):
             for name, command in sides.items():
-                run = _run(name, [*command, *common] if name != "cycles" else [*command, stage, camera])
+                is_cycles, begun = name == "cycles", repr(time.monotonic())
+                rest = [camera] if is_cycles else ["--size", *options.size, "--spp", options.spp]
+                variables = {"PYTHONPATH": None} if is_cycles else {}
+                run = measured(name, [*command, stage, *rest], BEGUN=begun, **variables)
                 if number:
-                    found[name].append(run)
-                if name in SHADINGS:
+                    runs[name].append(run)
+                if not is_cycles:
                     camera.write_text(json.dumps(run["camera"] | {"spp": options.spp}))
-    best = {}
-    for name, runs in found.items():
-        seconds = {stage: np.min([run["seconds"][stage] for run in runs], axis=0).tolist() for stage in STAGES}
-        best[name] = {"seconds": seconds, "memory": max(run["memory"] for run in runs)}
-    return best
+    return {
+        name: {
+            "seconds": {stage: np.min([run["seconds"][stage] for run in its_runs], axis=0) for stage in STAGES},
+            "memory": max(run["memory"] for run in its_runs),
+        }
+        for name, its_runs in runs.items()
+    }
 
 
-def _run(name, words):
-    from processes import ran
-
-    done = ran(words, BEGUN=repr(time.monotonic()), **({} if name in SHADINGS else {"PYTHONPATH": None}))
-    lines = [line for line in done.stdout.splitlines() if line.startswith('{"seconds"')]
-    if done.returncode or not lines:
-        raise SystemExit(f"{name} failed:\n{done.stderr or done.stdout}")
-    return json.loads(lines[-1])
-
-
-def _show(found):
-    print(" " * 20 + "".join(f"{name:>22}" for name in found))
-    print(" " * 20 + f"{'wall s':>14}{'CPU s':>8}" * len(found))
+def _show(best):
+    print(" " * 20 + "".join(f"{name:>22}" for name in best) + "    wall s (CPU s)")
     for stage in STAGES:
-        columns = (each["seconds"][stage] for each in found.values())
-        print(f"{stage:<20}" + "".join(f"{wall:14.2f}{processor:8.2f}" for wall, processor in columns))
-    print(f"{'peak memory, MB':<20}" + "".join(f"{each['memory']:22.0f}" for each in found.values()))
-    for name in (name for name in found if name != "exact"):
-        exact, other = (np.array([found[each]["seconds"][stage] for stage in STAGES[-3:]]) for each in ("exact", name))
-        ratios = zip(STAGES[-3:], *(exact / other).T, strict=True)
+        columns = (side["seconds"][stage] for side in best.values())
+        print(f"{stage:<20}" + "".join(f"{wall:13.2f} ({processor:6.2f})" for wall, processor in columns))
+    print(f"{'peak memory, MB':<20}" + "".join(f"{side['memory']:22.0f}" for side in best.values()))
+    for name in (name for name in best if name != "exact"):
+        exact, other = (best[side]["seconds"] for side in ("exact", name))
+        ratios = ((stage, *(exact[stage] / other[stage])) for stage in STAGES[-3:])
         print(f"exact / {name}: " + ", ".join(f"{stage} {wall:.2f} (CPU {cpu:.2f})" for stage, wall, cpu in ratios))
 
 
 def _own(options):
     """Seconds of this package in this process, and its camera."""
-    # `measure` imports the package before Dr.Jit, so that it finds an LLVM library that works.
-    from measure import msub, peak_memory  # noqa: I001
+    # Before Dr.Jit, so that it finds an LLVM library that works.
+    import mitsuba_subdivision as msub  # isort: skip
     import drjit as dr
     import mitsuba as mi
+    from processes import peak_memory
 
     mi.set_variant("llvm_ad_rgb")
     clock = [(float(os.environ["BEGUN"]), 0.0), (time.monotonic(), time.process_time())]
