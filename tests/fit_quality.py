@@ -31,7 +31,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.figures.ball_fits import LIGHTS, integrator
+from mitsuba_subdivision.figures.fit import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
 from mitsuba_subdivision.fit.point_fit import triangle_samples
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh

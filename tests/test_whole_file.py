@@ -206,7 +206,7 @@ from pathlib import Path
 import mitsuba_subdivision as msub
 import mitsuba as mi
 from mitsuba_subdivision.cage.named_cages import torus
-from mitsuba_subdivision.figures.figure_scenes import draw_picture
+from mitsuba_subdivision.figures.staging import draw_picture
 from mitsuba_subdivision.figures.output import FigureOptions
 from mitsuba_subdivision.regression.image import write_exr
 from mitsuba_subdivision.whole_file import whole_file

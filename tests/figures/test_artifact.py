@@ -5,7 +5,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.figures.artifact import ROWS, RULES, project, vertex_normal
+from mitsuba_subdivision.figures.artifact import ROWS, RULES, vertex_normal
+from mitsuba_subdivision.figures.staging import project
 
 SCENES = Path(__file__).parents[2] / "scenes"
 # Sampled at u = v = offset, float32 loses the normal of Stam's form at |c1| = 10.

@@ -1,30 +1,27 @@
 """Every figure draws, and the numbers in them are those of the surfaces."""
 
 import hashlib
+import re
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface, example_file
 from mitsuba_subdivision.__main__ import parser
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.figures import FIGURES, FigureError, FigureOptions, peers
-from mitsuba_subdivision.figures.ball_fits import DIAGONAL, Course, Measurement, ball_cage
-from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence
+from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence, refinement_step, sub_domain
 from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, labels
 from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
-from mitsuba_subdivision.figures.displacement import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
-from mitsuba_subdivision.figures.domains import sub_domain
-from mitsuba_subdivision.figures.figure_scenes import load_stage
-from mitsuba_subdivision.figures.fit import in_front
+from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
 from mitsuba_subdivision.figures.normal_error import offset_cage
-from mitsuba_subdivision.figures.output import scene_path, write_plot
+from mitsuba_subdivision.figures.output import write_plot
 from mitsuba_subdivision.figures.own_cage import around_vertices, frame
-from mitsuba_subdivision.figures.projection import project, visible
-from mitsuba_subdivision.figures.refinement import RefinementStep
+from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
+from mitsuba_subdivision.figures.staging import project, visible
 from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, regular_elements
-from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, _magnified, _sample
+from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, normals_by, sample
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
 from scipy.spatial import cKDTree
@@ -56,23 +53,24 @@ def coarse(monkeypatch):
     constants = {
         "creases": {"RATE": 3},
         "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
-        "displacement": {"COLUMNS": 96, "ROWS": 96},
+        "scenes": {"COLUMNS": 96, "ROWS": 96},
         "zebra": {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
-        "fit": {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4},
-        "ball_fits": {"PIXELS": 12, "VIEWS": 2, "SPP": 1, "TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
-        "crease_fit": {"PIXELS": 12, "SPP": 1},
+        "fit": {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4, "PIXELS": 12, "BOX_PIXELS": 12, "VIEWS": 2, "SPP": 1}
+        | {"TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
     }
     for module, values in constants.items():
         for name, value in values.items():
             monkeypatch.setattr(f"mitsuba_subdivision.figures.{module}.{name}", value)
 
 
-def test_the_command_line_knows_every_figure_and_the_table_every_module_that_draws():
+def test_the_command_line_knows_every_figure_and_the_table_every_function_that_draws():
     assert tuple(FIGURES) == FIGURE_NAMES
     for name in (*FIGURES, "all"):
         assert parser().parse_args(["figure", name]).name == name
-    modules = {path.stem for path in Path(peers.__file__).parent.glob("*.py") if "\ndef draw(" in path.read_text()}
-    assert {figure.module for figure in FIGURES.values()} == modules
+    paths = Path(peers.__file__).parent.glob("*.py")
+    pattern = re.compile(r"^def (draw\w*)\(options: FigureOptions\)", re.MULTILINE)
+    functions = {f"{path.stem}.{name}" for path in paths for name in pattern.findall(path.read_text())}
+    assert {figure.function for figure in FIGURES.values()} == functions
 
 
 def test_figures_of_users_leave_a_checkout_as_it_is():
@@ -91,21 +89,21 @@ RENDERED_TWICE, WRITTEN_TWICE = "shading", "refinement"
 @pytest.mark.parametrize("name", FIGURE_NAMES)
 def test_a_figure_draws_without_warnings_fit_for_print(name, options):
     """In a column, where its PDF has text of 6 points, embedded fonts and the pixels that were rendered."""
-    figure = FIGURES[name]
+    figure, stem = FIGURES[name], "normal_error" if name == "error" else name
 
     def drawn(formats):
         files = figure(options(formats=formats, width=COLUMN))
         return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
     first = drawn(figure.formats)
-    files = {f"{figure.module}.{suffix}" for suffix in figure.formats}
+    files = {f"{stem}.{suffix}" for suffix in figure.formats}
     assert set(first) == {path.name for path in options().output.iterdir()} == files
     again = {RENDERED_TWICE: ("exr",), WRITTEN_TWICE: figure.formats}.get(name, ())
     if again:
         assert drawn(again).items() <= first.items()
 
     pypdf = pytest.importorskip("pypdf")
-    page = pypdf.PdfReader(options().output / f"{figure.module}.pdf").pages[0]
+    page = pypdf.PdfReader(options().output / f"{stem}.pdf").pages[0]
     assert float(page.mediabox.width) == pytest.approx(COLUMN / 25.4 * 72)
     sizes = []
     page.extract_text(visitor_text=lambda text, _cm, _tm, _font, size: sizes.append(size) if text.strip() else None)
@@ -174,19 +172,16 @@ def test_scalar_variants_draw_too_all_but_fits(options):
 def test_the_distance_of_surfaces_is_that_of_spheres():
     """Of two spheres around one point, the difference of their radii, but for gaps between samples."""
     inner, outer = (ball_cage(4, radius) for radius in (0.5, 0.6))
-    course = Course()
-    Measurement(outer, 8)(course, lambda: inner)
-    assert course.distances[0] * DIAGONAL == pytest.approx(0.1, rel=0.03)
-    assert course.cages == {0: inner}
+    assert distances(outer, [inner])[0] * DIAGONAL == pytest.approx(0.1, rel=0.03)
 
 
 def test_numbers_stand_on_edges_that_the_camera_sees():
-    seen = in_front(cube(), cube().edges, np.array([5.0, -6, 4]))
+    seen = in_front(cube(), np.array([5.0, -6, 4]))
     hidden = cube().positions[cube().edges[~seen]]
     # Those that meet in the corner across.
     assert len(hidden) == 3
     assert (hidden == [-1, 1, -1]).all(axis=2).any(axis=1).all()
-    assert in_front(cube(), cube().edges, np.array([5.0, 0, 0])).sum() == 4
+    assert in_front(cube(), np.array([5.0, 0, 0])).sum() == 4
 
 
 @pytest.fixture
@@ -224,7 +219,7 @@ def test_other_programs_are_drawn_only_where_they_are(options):
 
 
 def test_each_panel_of_creases_has_tags_of_its_own():
-    cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
+    cage = ControlCage.from_file(example_file("cages/rook.obj"))
     smooth, own, infinite = (_tagged(cage, name).tags.edges for name in TITLES)
     assert not smooth.any()
     assert own is cage.tags.edges
@@ -244,18 +239,18 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
     along = (np.arange(ROWS) + 0.5) / ROWS
     assert not heights[(along < LOWEST) | (along > HIGHEST)].any()
     assert 0.9 < heights.max() <= 1
-    cage = ControlCage.from_file(scene_path("displacement").parent / "cages/jar.obj")
+    cage = ControlCage.from_file(example_file("cages/jar.obj"))
     assert set(cage.tags.edges) == {0, 10}
 
 
 @pytest.mark.core
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_a_refinement_step_has_the_points_of_the_report(valence):
-    step = RefinementStep.at_valence(valence)
-    assert len(step.old) == 2 * valence + 8
-    assert len(step.new) == 2 * valence + 17
+    _, old, new, old_edges, new_edges = refinement_step(valence)
+    assert len(old) == 2 * valence + 8
+    assert len(new) == 2 * valence + 17
     # Neither set has two points in one place, and every new point has an edge.
-    for points, edges in ((step.old, step.old_edges), (step.new, step.new_edges)):
+    for points, edges in ((old, old_edges), (new, new_edges)):
         assert len(np.unique(points.round(6), axis=0)) == len(points)
         assert len(np.unique(edges.reshape(-1, 2).round(6), axis=0)) == len(points)
 
@@ -274,7 +269,7 @@ def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
 
 
 def test_subdivision_keeps_the_number_of_extraordinary_points():
-    cage = ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")
+    cage = ControlCage.from_file(example_file("cages/propeller.obj"))
     assert set(cage.face_sizes) == {3, 4, 5, 6}
     shares = []
     for _ in range(3):
@@ -315,13 +310,12 @@ def test_curvature_grows_as_the_eigenvalues_say(valence):
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
     view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
-    stage = load_stage("zoom", resolution=RESOLUTION)
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
-        samples = _sample(view, magnification, 8)
+        samples = sample(view, magnification, 8)
         # The elements at the point cover the picture, at every magnification.
         extent = np.abs(samples.positions[:, -1, :2]).max(axis=1)
         assert extent.min() > 0.9
-        stam, stabilised = (_magnified(stage, view, samples, name).median for name in ("stam", "stabilized"))
+        stam, stabilised = (normals_by(view, samples, name)[2] for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
@@ -21,7 +21,7 @@ from mitsuba_subdivision.studio.cage_scenes import CageScenes
 from mitsuba_subdivision.studio.model import Model
 from mitsuba_subdivision.studio.studio_entries import Look
 
-SCENES = scene_path("human").parent
+SCENES = Path(msub.example_file("human.xml")).parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
 SCENE = '<scene version="3.0.0"><integrator type="path"/>{}</scene>'
 CONSTANT = """<default name="radiance" value="0.25"/>

@@ -2,6 +2,7 @@
 
 import re
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import mitsuba as mi
 import mitsuba_subdivision as msub
@@ -13,7 +14,6 @@ from mitsuba_subdivision.cage import CageError, named_cages
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.commands.pictures import save_scene
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.figures.output import scene_path
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, VIEWS, framed, outermost
@@ -21,7 +21,7 @@ from mitsuba_subdivision.studio.model import CageWire, up_axis_of
 from mitsuba_subdivision.studio.studio_entries import sampler
 
 llvm, scalar = (pytest.mark.usefixtures(f"variant_{name}") for name in ("llvm_ad_rgb", "scalar_rgb"))
-CAGES = scene_path("human").parent / "cages"
+CAGES = Path(msub.example_file("human.xml")).parent / "cages"
 # How far outside the margin rounding may put a point, in parts of the picture.
 ROUNDING = 1e-9
 SMALL = {"size": (24, 18), "spp": 16, "rate": 2}

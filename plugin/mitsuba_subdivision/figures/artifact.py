@@ -18,10 +18,9 @@ from ..regression.probe import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
-from .figure_scenes import in_8_bits, load_stage, render, staged
 from .output import FigureError, FigureOptions, panels, scientific, show, write_pixels, write_plot
 from .own_cage import around_vertices, frame
-from .projection import project
+from .staging import in_8_bits, load_stage, project, render, staged
 from .subdivision import edge_curves
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
@@ -126,7 +125,7 @@ def draw(options: FigureOptions) -> list[Path]:
         row_axes[0].set_ylabel(f"valence {row.valence}, |c₁| = {vertex.offset:.1f}")
     for axis, rule in zip(axes[0], RULES, strict=True):
         axis.set_title(rule.title)
-    name = "artifact" if options.scheme == "catmull_clark" else f"artifact_{options.scheme}"
+    name = options.name_for_scheme("artifact")
     written = write_plot(options, name, figure)
     strips = [np.concatenate(rendered[i : i + len(RULES)], axis=1) for i in range(0, len(rendered), len(RULES))]
     metadata = {"pictures": records, "spp": options.spp, "variant": mi.variant()}
@@ -171,7 +170,7 @@ def _draw_panel(axis: Axes, row: Row, rule: NormalRule, options: FigureOptions, 
         "sample_offset": offset,
         "bsdf": next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter()),
     }
-    scene = staged(stage, [each for each in stage.shapes() if each.is_emitter()], surface=mi.load_dict(shape))
+    scene = staged(stage, [shape for shape in stage.shapes() if shape.is_emitter()], surface=mi.load_dict(shape))
     pixels = render(scene, options, f"valence {row.valence}, {rule.title}")[..., :3]
     tessellation = surface.tessellate(row.rate, rule.evaluator, np.float32, offset)
     distance = np.linalg.norm(tessellation.positions - tessellation.positions[0], axis=1)
@@ -184,9 +183,9 @@ def _draw_panel(axis: Axes, row: Row, rule: NormalRule, options: FigureOptions, 
     axis.set(xlim=(0, pixels.shape[1]), ylim=(pixels.shape[0], 0))
     sensor = scene.sensors()[0]
     # The needle of the extraordinary vertex comes first.
-    own, *others = project(sensor, needles, resolution)
+    first, *others = project(sensor, needles, resolution)
     curves = list(project(sensor, edges, resolution))
     axis.add_collection(LineCollection(curves, colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
-    axis.add_collection(LineCollection([own], colors="#d8452a", linewidths=1.5, capstyle="round"))
+    axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
     return pixels

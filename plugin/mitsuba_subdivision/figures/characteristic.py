@@ -1,17 +1,46 @@
-"""The characteristic map: the shape that the patches around an extraordinary point tend to, whatever the cage."""
+"""Figures of one patch around an extraordinary point: its refinement, its domains, and its tree of polynomials."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import matplotlib
 import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, PowerNorm
 from numpy.typing import NDArray
 
+from ..cage.structure import edges_of
 from ..evaluation.element import element_stencils
-from ..evaluation.irregular_patch import IrregularPatch, irregular_patch
-from ..evaluation.patch_tree import irregular_structure, isolated_signature
-from ..schemes import Scheme
+from ..evaluation.irregular_patch import IrregularPatch, irregular_patch, level_domains, level_rows
+from ..evaluation.patch_tree import irregular_structure, isolated_signature, patch_tree
+from ..evaluation.polynomials import regular_bernstein
+from ..evaluation.tree_arrays import PIECE_LEVELS
+from ..mesh.connectivity import Topology
+from ..mesh.one_ring import one_ring
+from ..mesh.signature import Fan, Signature
+from ..schemes import Scheme, scheme_named
+from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
+from .output import FigureOptions, hide_frame, panels, write_plot
 
 # Points along each side of a polygon, which the map bends.
 SIDE_POINTS = 24
+VALENCE, LEVELS = 5, 6
+# Size of labels at level 0 in points, per millimetre of the figure's width; those of other levels are smaller, as
+# their domains are. Indices are 0.7 times as large as labels, and 6 points at least.
+LABEL_SIZE, LEAST_LABEL = 0.175, 8.6
+# The irregular child is grey, as in the figure `subdivision`; in grey prints, all four differ.
+CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
+CONTROL_EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
+# Stencils that agree to this many decimals are the same: their entries are fractions of small integers.
+DECIMALS = 9
+# Of the tree: faces around the corners of the face, two of which are extraordinary.
+VALENCES = (3, 4, 5, 4)
+# Regular leaves, and those of each level around an extraordinary vertex; what is below is grey.
+LEAF_COLOURS, REST = ("#fcfcd0", "#b9dfa8", "#63b7b3", "#2a7fb0"), "#8d97a1"
+# Of the springs along the face's edges that hold its corners, against those of other edges.
+SLACK = 0.15
+LINE = "#2d3a45"
 
 
 def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
@@ -50,3 +79,184 @@ def outline(corners: NDArray[np.floating]) -> NDArray[np.float64]:
     """Points along the sides of a polygon ``(m, 2)``, `SIDE_POINTS` on each."""
     t = np.linspace(0, 1, SIDE_POINTS, endpoint=False)[None, :, None]
     return ((1 - t) * corners[:, None] + t * np.roll(corners, -1, axis=0)[:, None]).reshape(-1, 2)
+
+
+def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.float64]:
+    """Corners ``(m, 2)`` of the parameters of child ``child`` of the ``level``-th refinement at (0, 0)."""
+    corners = domain.children[child].inverse()(domain.corners)
+    for _ in range(level):
+        corners = domain.children[0].inverse()(corners)
+    return np.asarray(corners, dtype=np.float64)
+
+
+def draw_domains(options: FigureOptions) -> list[Path]:
+    """Draw the domains of the regular children at each level, and their images under the characteristic map."""
+    scheme = scheme_named(options.scheme)
+    patch = patch_of_valence(scheme, VALENCE)
+    characteristic = CharacteristicMap(patch, VALENCE)
+    figure, axes = panels(options, 1, 2)
+    flat, round_ = axes.flat
+    # Light enough at every level for black labels.
+    colours = matplotlib.colormaps["YlGnBu"](np.linspace(0.03, 0.75, LEVELS))
+    options.report(f"{scheme.name}: {LEVELS} levels, contraction {patch.basis.subdominant:.4f} at valence {VALENCE}")
+
+    for level in range(LEVELS):
+        style = {"facecolor": colours[level], "edgecolor": LINE, "linewidth": max(0.6 * 0.8**level, 0.2)}
+        size = options.width * LABEL_SIZE * 0.6**level
+        for child in range(1, len(scheme.domain.children)):
+            corners = sub_domain(scheme.domain, level, child)
+            flat.fill(*corners.T, **style)
+            if size > LEAST_LABEL:
+                label = rf"$\Omega_{child}^{{{level}}}$"
+                flat.text(*corners.mean(axis=0), label, fontsize=size, ha="center", va="center")
+            bent = characteristic(outline(corners))
+            for sector in range(VALENCE):
+                round_.fill(*characteristic.sector(bent, sector).T, **style)
+    flat.fill(*sub_domain(scheme.domain, LEVELS - 1, 0).T, facecolor="#d9d9d9", edgecolor=LINE, linewidth=0.2)
+    for axis in (flat, round_):
+        axis.set_aspect("equal")
+        hide_frame(axis)
+        axis.plot(0, 0, "o", color="#c8432b", clip_on=False, zorder=5)
+        axis.margins(0.01)
+    for axis, name in ((flat.xaxis, "u"), (flat.yaxis, "v")):
+        axis.set_ticks([0, 0.5, 1], labels=["0", f"${name}$", "1"])
+        axis.set_tick_params(length=0)
+    flat.set_title("parameters:\neach level × 0.5")
+    round_.set_title(f"characteristic map, valence {VALENCE}:\neach level × {patch.basis.subdominant:.3f}")
+    scale = matplotlib.cm.ScalarMappable(cmap=ListedColormap(colours))
+    scale.set_clim(-0.5, LEVELS - 0.5)
+    bar = figure.colorbar(scale, ax=axes, orientation="horizontal", fraction=0.035, pad=0.02, aspect=45)
+    bar.set_ticks(range(LEVELS))
+    bar.ax.tick_params(length=0)
+    bar.set_label("level $n$")
+    return write_plot(options, options.name_for_scheme("domains"), figure)
+
+
+def refinement_step(valence: int) -> tuple[CharacteristicMap, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """A Catmull-Clark patch with one extraordinary vertex and its four children, in the plane of its map.
+
+    Returns the map; control points of the patch ``(K, 2)`` and of its children ``(M, 2)``: the different rows of A and
+    of the matrices of the regular ones; and both ends of the edges between either, ``(.., 2, 2)`` each.
+    """
+    patch = patch_of_valence(scheme_named("catmull_clark"), valence)
+    characteristic = CharacteristicMap(patch, valence)
+    stencils = np.unique(np.concatenate([patch.structure.matrix, *patch.structure.children]).round(DECIMALS), axis=0)
+    ring = one_ring(patch.structure.signature).topology
+    refinement = patch.scheme.refine(ring)
+    # Refined points without such a stencil belong to neighbouring patches.
+    distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
+    needed = (distance < 10.0**-DECIMALS).any(axis=1)
+    edges, old = edges_of(refinement.topology), characteristic.control_points
+    new_edges = refinement.apply(old)[edges[needed[edges].all(axis=1)]]
+    return characteristic, old, stencils @ old, old[edges_of(ring)], new_edges
+
+
+def draw_refinement(options: FigureOptions) -> list[Path]:
+    """Draw the control points of a patch of valence 5 before and after one refinement.
+
+    The points lie where the characteristic map puts them. The refined points come from the evaluator's subdivision
+    matrices.
+    """
+    characteristic, old, new, old_edges, new_edges = refinement_step(VALENCE)
+    domain = characteristic.patch.scheme.domain
+    options.report(f"valence {VALENCE}: {len(old)} control points, {len(new)} after one refinement")
+    figure, ((before, after),) = panels(options, 1, 2)
+    for axis in (before, after):
+        axis.add_collection(LineCollection(list(old_edges), colors=CONTROL_EDGE, linewidths=0.6, zorder=1))
+        axis.plot(*old.T, "o", color="black", markersize=4, zorder=4)
+        axis.set_aspect("equal")
+        hide_frame(axis)
+    style = {"edgecolor": "#30363c", "linewidth": 0.7, "zorder": 2}
+    label = {"fontsize": 9, "ha": "center", "va": "center", "zorder": 6}
+    whole = characteristic(outline(domain.corners))
+    before.fill(*whole.T, facecolor=CHILD_COLOURS[0], **style)
+    before.text(*whole.mean(axis=0), r"$\Omega$", **label)
+    for k, colour in enumerate(CHILD_COLOURS):
+        child = characteristic(outline(sub_domain(domain, 0, k)))
+        after.fill(*child.T, facecolor=colour, **style)
+        after.text(*child.mean(axis=0), rf"$\Omega_{k}$", **label)
+    after.add_collection(LineCollection(list(new_edges), colors=NEW_EDGE, linewidths=0.5, zorder=3))
+    after.plot(*new.T, "o", mfc="white", mec="black", mew=0.6, markersize=3, zorder=5)
+    before.set(title=f"a patch of valence {VALENCE}", xlabel=f"$K$ = {len(old)} control points")
+    after.set(title="one refinement", xlabel=f"$M$ = {len(new)} new control points")
+    return write_plot(options, "refinement", figure)
+
+
+def draw_tree(options: FigureOptions) -> list[Path]:
+    """Draw a face with two extraordinary vertices, its leaves, and the Bernstein coefficients of these as weights."""
+    scheme = scheme_named("catmull_clark")
+    signature = Signature("face", tuple(Fan((4,) * valence) for valence in VALENCES))
+    tree, form, ring = patch_tree(scheme, signature), regular_bernstein(scheme), one_ring(signature)
+    # From the parameters of each leaf to those of the face; the level, 0 for regular leaves; rows of weights.
+    leaves: list[tuple[AffineMap, int, FloatArray]] = [
+        (AffineMap(*domain), 0, rows)
+        for *domain, rows in zip(*tree.regular_domains, tree.coefficients(form.of_controls), strict=True)
+    ]
+    rests = []
+    for tip in tree.tips:
+        outward = tip.domain.inverse()
+        for level in range(PIECE_LEVELS):
+            rows = level_rows(tip.irregular_patch, level) @ tip.coordinates
+            domains = level_domains(tip.irregular_patch, level)
+            leaves += [(outward @ domain, level + 1, leaf) for domain, leaf in zip(domains, rows, strict=True)]
+        rests.append(outward @ AffineMap(np.eye(2) * 2.0**-PIECE_LEVELS, np.zeros(2)))
+    count, size = ring.vertex_count, len(form.basis.indices)
+    options.report(f"{count} control points, {len(leaves)} leaves of {size} coefficients")
+    flat = _in_the_plane(ring.topology)
+
+    def at(uv: FloatArray) -> FloatArray:
+        return np.asarray(element_stencils(scheme, signature, uv)[0] @ flat)
+
+    figure, ((face, matrix),) = panels(options, 1, 2)
+    face.add_collection(LineCollection(list(flat[edges_of(ring.topology)]), colors="#b6bec6", linewidths=0.6))
+    face.plot(*flat.T, "o", color="black", markersize=3, zorder=4)
+    around = outline(scheme.domain.corners)
+    coloured = [(domain, LEAF_COLOURS[level]) for domain, level, _ in leaves] + [(rest, REST) for rest in rests]
+    for domain, colour in coloured:
+        corners = at(np.clip(domain(around), 0, 1))
+        face.fill(*corners.T, facecolor=colour, edgecolor=LINE, linewidth=0.4, zorder=2)
+    face.plot(*at(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
+    face.set_aspect("equal")
+    hide_frame(face)
+    face.set(
+        title="a face and its one-ring,\nleaves of its patch tree",
+        xlabel=f"$K$ = {count} control points\ngrey: (10) and (12); red: (13)",
+    )
+
+    weights = np.concatenate([rows for *_, rows in leaves])
+    # Small weights are seen, too.
+    matrix.imshow(weights, aspect="auto", cmap="Greys", norm=PowerNorm(0.5, 0, 1), interpolation="nearest")
+    for number, (_, level, _) in enumerate(leaves):
+        strip = {"xmin": -0.06, "xmax": -0.01, "clip_on": False, "linewidth": 0.2, "edgecolor": LINE}
+        matrix.axhspan(size * number - 0.5, size * (number + 1) - 0.5, facecolor=LEAF_COLOURS[level], **strip)
+        matrix.axhline(size * number - 0.5, color=LINE, linewidth=0.2)
+    matrix.set(
+        xticks=[],
+        yticks=[],
+        title="coefficients of all leaves =\nmatrix × control points",
+        xlabel=f"$K$ = {count} control points\n{len(leaves)} leaves, {size} coefficients each",
+    )
+    return write_plot(options, "tree", figure)
+
+
+def _in_the_plane(topology: Topology) -> FloatArray:
+    """Control points of a one-ring in the plane: the border on a circle, each other one amid its neighbours."""
+    t = topology
+    laplacian = np.zeros((t.vertex_count, t.vertex_count))
+    start, end = t.face_vertices, t.face_vertices[t.next]
+    laplacian[start, end] = laplacian[end, start] = -1
+    # The face is drawn large.
+    corners = t.face_vertices[: t.face_sizes[0]]
+    laplacian[np.ix_(corners, corners)] *= SLACK
+    np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
+    # Around the border, which begins at any of its half-edges.
+    following = dict(zip(start[t.twin < 0].tolist(), end[t.twin < 0].tolist(), strict=True))
+    border = [next(iter(following))]
+    while (vertex := following[border[-1]]) != border[0]:
+        border.append(vertex)
+    angle = 2 * np.pi * np.arange(len(border)) / len(border)
+    points = np.zeros((t.vertex_count, 2))
+    points[border] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    inner = np.setdiff1d(np.arange(t.vertex_count), border)
+    points[inner] = np.linalg.solve(laplacian[np.ix_(inner, inner)], -laplacian[np.ix_(inner, border)] @ points[border])
+    return points

@@ -12,10 +12,11 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
+from ..examples import example_file
 from ..variants import SceneNode
-from .figure_scenes import edge_rods, load_stage, make_mesh, paint, render_panels, staged
-from .output import FigureError, FigureOptions, panels, rows_of, scene_path, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, write_pixels, write_plot
 from .own_cage import fitted, read
+from .staging import edge_rods, load_stage, make_mesh, paint, render_panels, staged
 
 TITLES = {
     "smooth": "smooth\ntags ignored",
@@ -42,7 +43,7 @@ EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), IN
 
 def draw(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
-    cage = ControlCage.from_file(scene_path("creases").parent / "cages/rook.obj")
+    cage = ControlCage.from_file(example_file("cages/rook.obj"))
     if options.cage:
         cage = fitted(read(options.cage), cage.positions.min(axis=0), cage.positions.max(axis=0))
         if not cage.tags.edges.any():

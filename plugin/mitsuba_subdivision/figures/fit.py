@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -15,23 +15,62 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
-from ..mesh.connectivity import IntArray
+from ..cage.named_cages import cube
+from ..device_arrays import upload
+from ..fit import CageFit, LargeSteps, Schedule, View
+from ..fit.point_fit import mesh_samples
+from ..fit.views import with_sample_count
 from ..schemes.domain import FloatArray
+from ..shapes.moving_vertices import loss_of_views
+from ..surface import LimitSurface
 from ..variants import SceneNode
-from .ball_fits import GREY, VIEWS, Course, Measurement, fit_cage, fit_mesh, target, views_of
-from .crease_fit import FIRST, HIGHEST, CreaseFit, fit_creases
-from .figure_scenes import edge_rods, in_8_bits, load_stage, make_mesh, render, staged
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_pixels, write_plot
-from .projection import camera_matrix, project
+from .staging import camera_matrix, edge_rods, in_8_bits, load_stage, make_mesh, project, render, staged
 
+# Of all fits: steps, pictures, their pixels, samples, and samples of the pictures that are fitted to.
 STEPS, CREASE_STEPS = 100, 100
+VIEWS, PIXELS, BOX_PIXELS, SPP, EDGE_SPP, TARGET_SPP = 8, 80, 64, 16, 2, 256
+# Of the target: radius of its core, and how fast arms end to their sides.
+CORE, SHARPNESS_OF_ARMS = 0.45, 9
+# Radius of the ball that fits begin with; the diagonal of the target's box.
+RADIUS, DIAGONAL = 0.6, 2.2
+# How often a cube is halved to be the cage, the mesh, and the target.
+COARSE, DENSE, FINE = 2, 5, 6
+# λ of large steps, and Adam's first and last learning rates, in diagonals: the best of several.
+SMOOTHING, MESH_SMOOTHING = 1.0, 19.0
+RATES, MESH_RATES = (0.1, 0.006), (0.25, 0.01)
+# How often distances are measured; samples of each surface, and segments of a cage's edges there.
+MEASUREMENTS, SAMPLES, SEGMENTS = 16, 30_000, 6
 # When the cage is refined, and when it is shown on its way, as parts of the steps.
 REFINED, SHOWN = 0.3, (0.09, 0.29)
-# Segments of a cage's edges in renders, and fields of view of the first and the last row.
-RATE = 16
+
+# Of the cube that the box is fitted from, and of the box in parts of these.
+SIDE, SIDES = 1.24, (1.25, 1.0, 0.85)
+# Sharpness of the box's edges: around its top, between top and bottom, and around its bottom; of all edges at first.
+TOP, UPRIGHT, BOTTOM, FIRST, HIGHEST = 2.4, 1.5, 0.5, 0.5, 3
+BOX_RATES, SHARPNESS_RATES = (0.02, 0.001), (0.3, 0.02)
+# Segments of the cages' edges in pictures of the fit of the box, and in renders.
+BOX_RATE, RATE = 8, 16
+
+# Fields of view of the first and the last row.
 BALL_VIEW, BOX_VIEW = 11.5, 15.5
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}
+LIGHTS = {
+    "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
+    "key": {
+        "type": "directional",
+        "direction": [-1, -0.5, -1],
+        "irradiance": {"type": "rgb", "value": [1.5, 1.2, 1.0]},
+    },
+    "fill": {
+        "type": "directional",
+        "direction": [1, 0.2, 0.5],
+        "irradiance": {"type": "rgb", "value": [0.5, 0.8, 1.2]},
+    },
+}
 CLAY = {
     "type": "principled",
     "base_color": {"type": "rgb", "value": [0.74, 0.24, 0.07]},
@@ -45,54 +84,63 @@ ROD_RADIUS = 0.009
 # Radius of a crease in the pictures of the box: at sharpness 0, and more for each 1.
 CREASE_RADIUS, CREASE_GROWTH = 0.010, 0.010
 SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#e0602a", "#a3123f")
-# Of the courses.
 LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
 # Behind numbers, as dark as the backdrop.
 LABEL = "#343d46"
 
-# A title of two lines, and shapes to be rendered.
+# A title of two lines, and shapes to be rendered; and a title with pixels.
 Panel = tuple[str, SceneNode]
-# A title, and pixels.
 Picture = tuple[str, NDArray[np.float32]]
+# A box and the sharpness of its edges, those of `cube` in their order.
+Box = tuple[ControlCage, NDArray[np.float64]]
+
+
+class Course(NamedTuple):
+    """The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps."""
+
+    losses: list[float]
+    cages: dict[int, ControlCage]
 
 
 def draw(options: FigureOptions) -> list[Path]:
     """Fit the cages and the mesh, and draw the results."""
     if "_ad_" not in str(mi.variant()):
         raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
-    with in_order():
-        shape = target()
-        views = views_of(make_mesh(shape.positions, shape.triangles, GREY))
-        measure = Measurement(shape, STEPS)
+    with _in_order():
+        shape = _target()
+        views = _views_of(make_mesh(shape.positions, shape.triangles, GREY), PIXELS)
         options.report(f"{STEPS} steps with a cage of one size")
-        courses = {"cage": fit_cage([], views, STEPS, measure)}
+        courses = {"cage": _fit_cage([], views)}
         options.report(f"{STEPS} steps with a cage that is refined")
-        courses["refined"] = fit_cage([round(REFINED * STEPS)], views, STEPS, measure)
+        courses["refined"] = _fit_cage([round(REFINED * STEPS)], views)
         options.report(f"{STEPS} steps with a dense mesh")
-        courses["mesh"] = fit_mesh(views, STEPS, measure)
+        courses["mesh"] = _fit_mesh(views)
         options.report(f"{CREASE_STEPS} steps with creases")
-        creases = fit_creases(CREASE_STEPS)
-    _, balls = rendered(ball_panels(shape, courses), BALL_VIEW, options)
-    sensor, boxes = rendered(box_panels(creases), BOX_VIEW, options)
-    figure = composed(options, balls, boxes, courses, creases, sensor)
-    pixels = np.concatenate([pixels for _, pixels in (*balls, *boxes)], axis=1)
-    titles = [title.replace("\n", ", ") for title, _ in (*balls, *boxes)]
+        boxes, sharpness = _fit_creases()
+    _, of_balls = _rendered(_ball_panels(shape, courses), BALL_VIEW, options)
+    sensor, of_boxes = _rendered(_box_panels(boxes), BOX_VIEW, options)
+
+    # Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete.
+    is_page = options.width >= BETWEEN
+    figure, axes = panels(options, *((3, 4) if is_page else (4, 3)))
+    left = list(axes.flat)
+    box_axes = [left.pop(len(of_balls) + 2 * is_page) for _ in of_boxes]
+    *ball_axes, losses, distances, course_of_sharpness = left
+    for axis, (title, pixels) in zip((*ball_axes, *box_axes), (*of_balls, *of_boxes), strict=True):
+        show(axis, in_8_bits(pixels), *title.split("\n", 1))
+    for axis, box in zip(box_axes, boxes, strict=True):
+        _label(axis, sensor, *box)
+    _plot_courses(losses, distances, shape, courses)
+    _plot_sharpness(course_of_sharpness, boxes[0][1], sharpness)
+    figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
     written = write_plot(options, "fit", figure)
+    titles = [title.replace("\n", ", ") for title, _ in (*of_balls, *of_boxes)]
+    pixels = np.concatenate([pixels for _, pixels in (*of_balls, *of_boxes)], axis=1)
     return written + write_pixels(options, "fit", pixels, {"pictures": titles, "spp": options.spp})
 
 
-def rendered(shown: Sequence[Panel], field_of_view: float, options: FigureOptions) -> tuple[Any, list[Picture]]:
-    """The camera, and renders of panels by their titles."""
-    stage = load_stage("fit", resolution=options.resolution, field_of_view=field_of_view)
-    pictures = []
-    for title, shapes in shown:
-        options.report(title.replace("\n", ", "))
-        pictures.append((title, render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]))
-    return stage.sensors()[0], pictures
-
-
 @contextmanager
-def in_order() -> Iterator[None]:
+def _in_order() -> Iterator[None]:
     """Compute on one thread: with several, the order of gradient sums, and so every later step, is not reproducible."""
     threads = dr.thread_count()
     dr.set_thread_count(1)
@@ -102,53 +150,208 @@ def in_order() -> Iterator[None]:
         dr.set_thread_count(threads)
 
 
-def ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
+def _target() -> ControlCage:
+    """A ball with six arms of different lengths, as triangles."""
+    ball = ball_cage(FINE, 1.0)
+    ends = np.array([(1, 0.1, 0), (-1, 0.2, 0.3), (0, 1, 0.2), (0.2, -1, 0), (0, 0.3, 1), (0.1, 0, -1)])
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+    lengths = np.array([1.0, 0.8, 0.9, 0.7, 1.0, 0.8])
+    arms = (lengths * np.exp(SHARPNESS_OF_ARMS * (ball.positions @ ends.T - 1))).sum(axis=1, keepdims=True)
+    positions = ball.positions * (CORE + arms)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    return ControlCage((positions - (low + high) / 2) * DIAGONAL / np.linalg.norm(high - low), ball.triangles)
+
+
+def ball_cage(halvings: int, radius: float) -> ControlCage:
+    """A cube, refined by halving its edges, whose limit surface is nearly a ball."""
+    cage = cube()
+    for _ in range(halvings):
+        cage = cage.refined()
+    cage = cage.with_positions(cage.positions / np.linalg.norm(cage.positions, axis=1, keepdims=True))
+    return cage.with_positions(radius / np.sqrt(LimitSurface(cage).area() / (4 * np.pi)) * cage.positions)
+
+
+def integrator(spp: int, edge_spp: int) -> SceneNode:
+    """The integrator, with gradients of outlines, too."""
+    return {"type": "direct_projective", "sppi": 0, "sppc": spp, "sppp": edge_spp}
+
+
+def _views_of(shape: mi.Shape, pixels: int) -> list[View]:
+    """Pictures of a shape from all around, alternately from above and from below."""
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **LIGHTS, "shape": shape})
+    film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "sample_border": True}
+    views = []
+    for view in range(VIEWS):
+        angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
+        origin = 4 * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+        to_world = mi.ScalarTransform4f().look_at(origin.tolist(), [0, 0, 0], [0, 0, 1])
+        sensor = {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
+        picture = mi.render(scene, sensor=mi.load_dict(sensor), spp=TARGET_SPP, seed=view)  # type: ignore[arg-type]
+        views.append(View(sensor, picture))
+    return views
+
+
+def _is_measured(step: int) -> bool:
+    """Whether the distance to the target is measured after a step: at steps spaced evenly on a logarithmic axis."""
+    return step in {0, *np.rint(np.geomspace(1, STEPS, MEASUREMENTS)).astype(int).tolist()}
+
+
+def _fit_cage(refine: list[int], views: list[View]) -> Course:
+    """Fit a cage, which is refined before some steps."""
+    fit = CageFit(
+        ball_cage(COARSE, RADIUS),
+        views,
+        {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
+        shape={"bsdf": GREY},
+        learning_rate=[(0, RATES[0]), (STEPS, RATES[1])],
+        smoothing=SMOOTHING,
+        refine=refine,
+        spp=SPP,
+    )
+    course = Course([], {0: fit.cage})
+    for step in range(1, STEPS + 1):
+        course.losses.append(fit.step())
+        if _is_measured(step):
+            course.cages[step] = fit.cage
+    return course
+
+
+def _fit_mesh(views: list[View]) -> Course:
+    """Fit a dense mesh of triangles, in the same way but for the surface."""
+    ball = ball_cage(DENSE, RADIUS)
+    mesh = ControlCage(ball.positions, ball.triangles)
+    shape = make_mesh(mesh.positions, ball.triangles, GREY)
+    scene = mi.load_dict({"type": "scene", "integrator": integrator(SPP, EDGE_SPP), **LIGHTS, "mesh": shape})
+    params, key = mi.traverse(scene), "mesh.vertex_positions"
+    targets = [upload(mi.TensorXf, view.picture) for view in views]
+    sensors = [with_sample_count(view.sensor, SPP) for view in views]
+    large_steps = LargeSteps(mesh.laplacian(), MESH_SMOOTHING)
+    optimizer = mi.ad.Adam(lr=1.0, uniform=True)
+    optimizer["u"] = large_steps.to_differential(mesh.positions)
+
+    def squared_error(image: mi.TensorXf, view: int) -> mi.TensorXf:
+        return dr.mean(dr.square(image - targets[view]), axis=None)
+
+    course, rate = Course([], {0: mesh}), Schedule.of([(0, MESH_RATES[0]), (STEPS, MESH_RATES[1])], "learning_rate")
+    for step in range(STEPS):
+        params[key] = large_steps.from_differential(optimizer["u"])
+        params.update()
+        loss = loss_of_views(scene, params, squared_error, sensors, seed=step, spp=0)
+        dr.backward(loss / len(views))
+        optimizer.set_learning_rate(rate(step) * DIAGONAL)
+        optimizer.step()
+        course.losses.append(float(np.array(loss).item()) / len(views))
+        with dr.suspend_grad():
+            params[key] = large_steps.from_differential(optimizer["u"])
+        if _is_measured(step + 1):
+            positions = np.array(params[key], dtype=np.float64).reshape(-1, 3)
+            course.cages[step + 1] = mesh.with_positions(positions)
+    return course
+
+
+def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
+    """Fit a box from a cube whose edges all have the same sharpness.
+
+    Returns target, start and result; and the sharpness of all edges after each step, ``(CREASE_STEPS + 1, 12)``.
+    """
+    edges, z = cube().edges, cube().positions[cube().edges, 2]
+    truth = np.where(z.min(axis=1) > 0, TOP, np.where(z.max(axis=1) < 0, BOTTOM, UPRIGHT))
+    sharpness = [np.full(len(edges), FIRST)]
+
+    def box(sides: tuple[float, float, float], sharpness: NDArray[np.float64]) -> ControlCage:
+        positions = SIDE / 2 * np.array(sides) * cube().positions
+        creases = np.column_stack([edges, sharpness])
+        return ControlCage(positions, cube().face_vertices.reshape(-1, 4), creases=creases)
+
+    start, target = box((1, 1, 1), sharpness[0]), box(SIDES, truth)
+    shape = {"type": "subdivision", **target.as_properties(mi), "tessellation_rate": BOX_RATE, "bsdf": GREY}
+    fit = CageFit(
+        start,
+        _views_of(mi.load_dict(shape), BOX_PIXELS),
+        {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
+        shape={"bsdf": GREY, "tessellation_rate": BOX_RATE},
+        learning_rate=[(0, BOX_RATES[0]), (CREASE_STEPS, BOX_RATES[1])],
+        smoothing=0,
+        sharp_edges=edges,
+        highest_sharpness=HIGHEST,
+        sharpness_rate=[(0, SHARPNESS_RATES[0]), (CREASE_STEPS, SHARPNESS_RATES[1])],
+        spp=SPP,
+        callbacks=[lambda fit: sharpness.append(fit.sharpness)],
+    ).run(CREASE_STEPS)
+    return [(target, truth), (start, sharpness[0]), (fit.cage, sharpness[-1])], np.array(sharpness)
+
+
+def distances(target: ControlCage, cages: Sequence[ControlCage]) -> NDArray[np.float64]:
+    """Chamfer's distances of surfaces to a target's triangles, in its diagonals: the means of both directions.
+
+    Cages are surfaces, but for those of triangles, which are meshes themselves.
+    """
+    points = mesh_samples(target.positions, target.triangles, SAMPLES, 0)[0]
+    tree = cKDTree(points)
+    measured = []
+    for cage in cages:
+        mesh = cage if (cage.face_sizes == 3).all() else LimitSurface(cage).tessellate(SEGMENTS)
+        samples = mesh_samples(mesh.positions, mesh.triangles, SAMPLES, 1)[0]
+        there, back = np.array(tree.query(samples)[0]), np.array(cKDTree(samples).query(points)[0])
+        measured.append(float(there.mean() + back.mean()) / 2 / DIAGONAL)
+    return np.array(measured)
+
+
+def _rendered(shown: Sequence[Panel], field_of_view: float, options: FigureOptions) -> tuple[Any, list[Picture]]:
+    """The camera, and renders of panels by their titles."""
+    stage = load_stage("fit", resolution=options.resolution, field_of_view=field_of_view)
+    pictures = []
+    for title, shapes in shown:
+        options.report(title.replace("\n", ", "))
+        pictures.append((title, render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]))
+    return stage.sensors()[0], pictures
+
+
+def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
     """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
     cages, mesh = courses["refined"].cages, courses["mesh"].cages[STEPS]
-    shown: list[Panel] = [(f"target\nseen in\n{VIEWS} pictures", _mesh(shape))]
-    for step in (0, *(min(cages, key=lambda each: abs(each - part * STEPS)) for part in SHOWN), STEPS):
+
+    def title(name: str, step: int, cage: ControlCage) -> str:
+        return f"{name}\n{VIEWS * step} renders,\n{cage.vertex_count:,} points"
+
+    def as_mesh(cage: ControlCage) -> SceneNode:
+        return {"mesh": make_mesh(cage.positions, cage.triangles, CLAY)}
+
+    shown: list[Panel] = [(f"target\nseen in\n{VIEWS} pictures", as_mesh(shape))]
+    for step in (0, *(min(cages, key=lambda step: abs(step - part * STEPS)) for part in SHOWN), STEPS):
         name = "start" if step == 0 else "result" if step == STEPS else "on the way"
-        shown.append((_title(name, step, cages[step]), with_cage(cages[step])))
-    return [*shown, (_title("dense mesh", STEPS, mesh), _mesh(mesh))]
-
-
-def _mesh(cage: ControlCage) -> SceneNode:
-    return {"mesh": make_mesh(cage.positions, cage.triangles, CLAY)}
-
-
-def _title(name: str, step: int, cage: ControlCage) -> str:
-    return f"{name}\n{VIEWS * step} renders,\n{cage.vertex_count:,} points"
-
-
-def with_cage(cage: ControlCage) -> SceneNode:
-    """A limit surface, and the cage's edges as rods."""
-    ends = cage.positions[cage.edges].tolist()
-    # A file of curves: both ends of each edge, and an empty line.
-    curves = ("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "edges.txt"
-        path.write_text("\n\n".join(curves), encoding="ascii")
-        rods = mi.load_dict({"type": "linearcurve", "filename": str(path), "bsdf": RODS})
-    return {"surface": _surface(cage), "rods": rods}
+        surface_and_edges = {"surface": _surface(cages[step]), "rods": _rods(cages[step])}
+        shown.append((title(name, step, cages[step]), surface_and_edges))
+    return [*shown, (title("dense mesh", STEPS, mesh), as_mesh(mesh))]
 
 
 def _surface(cage: ControlCage) -> mi.Shape:
     return mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": CLAY})
 
 
-def box_panels(fit: CreaseFit) -> list[Panel]:
+def _rods(cage: ControlCage) -> mi.Shape:
+    """A cage's edges as rods: a file of curves, which has both ends of each edge, and an empty line."""
+    ends = cage.positions[cage.edges].tolist()
+    curves = ("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "edges.txt"
+        path.write_text("\n\n".join(curves), encoding="ascii")
+        return mi.load_dict({"type": "linearcurve", "filename": str(path), "bsdf": RODS})
+
+
+def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
     """Panels of the last row: the target with its creases, the start, and the result."""
     shown: list[Panel] = []
     titles = "target\nthree kinds\nof creases", f"start\nall creases\n{FIRST:g}"
     last = f"found\n{VIEWS * CREASE_STEPS:,} renders"
-    for title, (cage, sharpness) in zip((*titles, last), fit.shown(), strict=True):
+    for title, (cage, sharpness) in zip((*titles, last), boxes, strict=True):
         # Rods are thicker, and of another colour, where creases are sharper.
-        looks = [(sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
-        shown.append((title, {"surface": _surface(cage), **edge_rods(cage, fit.edges, sharpness, looks)}))
+        looks = [(_sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
+        shown.append((title, {"surface": _surface(cage), **edge_rods(cage, cube().edges, sharpness, looks)}))
     return shown
 
 
-def sharpness_colour(sharpness: float) -> tuple[float, float, float]:
+def _sharpness_colour(sharpness: float) -> tuple[float, float, float]:
     """Colour in sRGB between those of `SHARPNESS_COLOURS`, for 0 to the highest sharpness."""
     channels = np.array([to_rgb(colour) for colour in SHARPNESS_COLOURS]).T
     at = np.linspace(0, HIGHEST, len(SHARPNESS_COLOURS))
@@ -156,46 +359,23 @@ def sharpness_colour(sharpness: float) -> tuple[float, float, float]:
     return r, g, b
 
 
-def composed(
-    options: FigureOptions,
-    balls: Sequence[Picture],
-    boxes: Sequence[Picture],
-    courses: Mapping[str, Course],
-    creases: CreaseFit,
-    sensor: mi.Sensor,
-) -> Any:
-    """Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete."""
-    is_page = options.width >= BETWEEN
-    figure, axes = panels(options, *((3, 4) if is_page else (4, 3)))
-    left = list(axes.flat)
-    of_box = [left.pop(len(balls) + 2 * is_page) for _ in boxes]
-    *of_balls, losses, distances, sharpness = left
-    for axis, (title, pixels) in zip((*of_balls, *of_box), (*balls, *boxes), strict=True):
-        show(axis, in_8_bits(pixels), *title.split("\n", 1))
-    for axis, (cage, values) in zip(of_box, creases.shown(), strict=True):
-        _label(axis, sensor, cage, creases.edges, values)
-    _plot_courses(losses, distances, courses)
-    _plot_sharpness(sharpness, creases)
-    figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
-    return figure
-
-
-def _plot_courses(losses: Axes, distances: Axes, courses: Mapping[str, Course]) -> None:
+def _plot_courses(losses: Axes, chamfer: Axes, shape: ControlCage, courses: Mapping[str, Course]) -> None:
     for (colour, marker), (name, course) in zip(SERIES, courses.items(), strict=True):
         losses.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=colour)
-        steps, values = np.array([*course.distances.items()])[1:].T
-        label = f"{LABELS[name]}, {course.cages[STEPS].vertex_count:,} points"
-        distances.loglog(VIEWS * steps, 100 * values, marker=marker, color=colour, label=label)
+        steps, cages = zip(*list(course.cages.items())[1:], strict=True)
+        label = f"{LABELS[name]}, {cages[-1].vertex_count:,} points"
+        values = 100 * distances(shape, cages)
+        chamfer.loglog(VIEWS * np.array(steps), values, marker=marker, color=colour, label=label)
     _finish(losses, "loss (thousandths)", is_logarithmic=True)
-    _finish(distances, "distance (%)", is_logarithmic=True)
+    _finish(chamfer, "distance (%)", is_logarithmic=True)
 
 
-def _plot_sharpness(axis: Axes, fit: CreaseFit) -> None:
-    renders = VIEWS * np.arange(len(fit.sharpness))
-    for values, truth in zip(fit.sharpness.T, fit.truth, strict=True):
-        axis.plot(renders, values, color=sharpness_colour(truth), linewidth=0.6)
-    for truth in np.unique(fit.truth):
-        axis.axhline(truth, color=sharpness_colour(truth), linestyle=(0, (5, 3)))
+def _plot_sharpness(axis: Axes, truth: FloatArray, sharpness: FloatArray) -> None:
+    renders = VIEWS * np.arange(len(sharpness))
+    for values, true_value in zip(sharpness.T, truth, strict=True):
+        axis.plot(renders, values, color=_sharpness_colour(true_value), linewidth=0.6)
+    for true_value in np.unique(truth):
+        axis.axhline(true_value, color=_sharpness_colour(true_value), linestyle=(0, (5, 3)))
     axis.set(xlim=(0, renders[-1]), ylim=(0, HIGHEST))
     _finish(axis, "sharpness")
 
@@ -205,26 +385,25 @@ def _finish(axis: Axes, quantity: str, *, is_logarithmic: bool = False) -> None:
     axis.set(title=quantity, xlabel="renders", box_aspect=1, axisbelow=True)
     axis.grid()
     if is_logarithmic:
-        for each in (axis.xaxis, axis.yaxis):
-            each.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            each.set_major_formatter(StrMethodFormatter("{x:g}"))
-            each.set_minor_formatter(NullFormatter())
+        for scale in (axis.xaxis, axis.yaxis):
+            scale.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            scale.set_major_formatter(StrMethodFormatter("{x:g}"))
+            scale.set_minor_formatter(NullFormatter())
         axis.set_xlim(VIEWS, VIEWS * STEPS)
 
 
-def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, edges: IntArray, sharpness: FloatArray) -> None:
+def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, sharpness: FloatArray) -> None:
     """Write their sharpness on the edges that the camera sees."""
-    camera = camera_matrix(sensor)[:3, 3]
     width = int(sensor.film().crop_size()[0])
     box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
-    for edge in np.flatnonzero(in_front(cage, edges, camera)):
-        x, y = project(sensor, cage.positions[edges[edge]].mean(axis=0), width).tolist()
+    for edge in np.flatnonzero(in_front(cage, camera_matrix(sensor)[:3, 3])):
+        x, y = project(sensor, cage.positions[cube().edges[edge]].mean(axis=0), width).tolist()
         axis.text(x, y, f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
 
 
-def in_front(cage: ControlCage, edges: IntArray, camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether one of an edge's two faces is turned to the camera."""
-    faces = cage.face_vertices.reshape(-1, 4)
-    a, b, c = (cage.positions[faces[:, corner]] for corner in range(3))
+def in_front(box: ControlCage, camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether one of the two faces of each edge of a box is turned to the camera."""
+    faces = box.face_vertices.reshape(-1, 4)
+    a, b, c = (box.positions[faces[:, corner]] for corner in range(3))
     is_turned = ((camera - a) * np.cross(b - a, c - a)).sum(axis=1) > 0
-    return np.array([(is_turned & (np.isin(faces, edge).sum(axis=1) == 2)).any() for edge in edges])
+    return np.array([(is_turned & (np.isin(faces, edge).sum(axis=1) == 2)).any() for edge in cube().edges])

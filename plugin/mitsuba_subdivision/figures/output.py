@@ -1,4 +1,4 @@
-"""Parts that all figures share: their options, the folder of the scenes, matplotlib, and how files are written."""
+"""Parts that all figures share: their options, matplotlib, and how files are written."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..examples import example_file
 from ..whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -79,10 +78,9 @@ class FigureOptions:
         self.output.mkdir(parents=True, exist_ok=True)
         return [self.output / f"{name}.{suffix}" for suffix in formats if suffix in self.formats]
 
-
-def scene_path(name: str) -> Path:
-    """File of a scene, in the installed package or in the source tree."""
-    return Path(example_file(f"{name}.xml"))
+    def name_for_scheme(self, name: str) -> str:
+        """Name of the files of a figure that shows one scheme of several."""
+        return name if self.scheme == type(self).scheme else f"{name}_{self.scheme}"
 
 
 def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:

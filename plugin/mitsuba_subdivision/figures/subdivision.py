@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..evaluation.patch_tree import lattice_stencils
+from ..examples import example_file
 from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
-from .figure_scenes import load_stage, make_mesh, on_white, render, staged
-from .output import FigureError, FigureOptions, panels, rows_of, scene_path, show, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, show, write_pixels, write_plot
 from .own_cage import in_ball, read
-from .projection import project, visible, visible_runs
+from .staging import load_stage, make_mesh, on_white, project, render, staged, visible, visible_runs
 
 LEVELS = 4
 # Of the ball that fills the picture, for cages of users.
@@ -32,7 +32,7 @@ RATE = 6
 def draw(options: FigureOptions) -> list[Path]:
     """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
     stage = load_stage("subdivision", resolution=options.resolution)
-    cages = [ControlCage.from_file(scene_path("subdivision").parent / "cages/propeller.obj")]
+    cages = [ControlCage.from_file(example_file("cages/propeller.obj"))]
     if options.cage:
         cages = [in_ball(read(options.cage), RADIUS)]
     while len(cages) < LEVELS:

@@ -19,11 +19,21 @@ from ..cage.named_cages import cube
 from ..regression.probe import normal_angle
 from ..regression.scene import render_pixels
 from ..surface import LimitSurface
-from .figure_scenes import grid_points, grid_triangles, load_stage, make_mesh, on_white, render, split_quads, staged
 from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
 from .own_cage import around_vertices, frame
 from .peers import blender, blender_mesh, osd_peer, osd_samples
-from .projection import camera_matrix, project
+from .staging import (
+    camera_matrix,
+    grid_points,
+    grid_triangles,
+    load_stage,
+    make_mesh,
+    on_white,
+    project,
+    render,
+    split_quads,
+    staged,
+)
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3

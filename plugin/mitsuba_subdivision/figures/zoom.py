@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -28,12 +27,11 @@ from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
-from .figure_scenes import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, render, staged
 from .normal_error import EQUATIONS, offset_cage
 from .output import FigureError, FigureOptions, label_powers, panels, scientific, write_pixels, write_plot
 from .own_cage import frame
 from .peers import osd_peer, osd_samples
-from .projection import project
+from .staging import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, project, render, staged
 
 VALENCE = 5
 OFFSET = 10
@@ -54,6 +52,7 @@ BAR = 0.1
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
 COLOURS, ERROR_SCALE = "YlOrRd", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
 LINE_POINTS = 33
+CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +73,14 @@ class TangentView:
         return (points - self.point) @ self.frame * (magnification / HALF_WIDTH)
 
 
+class Samples(NamedTuple):
+    """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage."""
+
+    uv: NDArray[np.float64]  # (s, 2): parameters, the same in each element
+    positions: NDArray[np.float64]  # (valence, s, 3), as the normals
+    normals: NDArray[np.float64]
+
+
 def draw(options: FigureOptions) -> list[Path]:
     """Draw the neighbourhood of a vertex of valence 5 at four magnifications, with normals by (11) and by (12).
 
@@ -85,35 +92,40 @@ def draw(options: FigureOptions) -> list[Path]:
     normals come from its patch tables (Far), where its program is found.
     """
     view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
-    stage = load_stage("zoom", resolution=options.resolution)
+    stage, resolution = load_stage("zoom", resolution=options.resolution), options.resolution
+    sensor, count = stage.sensors()[0], max(resolution // 2, 8)
+    triangles = grid_triangles(count, VALENCE)
     rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
     figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
     rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
-        extent = parameter_extent(magnification)
-        samples = _sample(view, magnification, max(options.resolution // 2, 8))
+        samples = sample(view, magnification, count)
         # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
-        projected = project(stage.sensors()[0], samples.positions.reshape(-1, 3), options.resolution)
-        centres = grid_points(np.arange(options.resolution) + 0.5).reshape(options.resolution, -1, 2)
-        nearest = np.asarray(cKDTree(projected).query(centres)[1])
-        lines = project(stage.sensors()[0], _level_lines(view, magnification), options.resolution)
+        positions = samples.positions.reshape(-1, 3)
+        centres = grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
+        nearest = np.asarray(cKDTree(project(sensor, positions, resolution)).query(centres)[1])
+        lines = project(sensor, _level_lines(view, magnification), resolution)
         for evaluator, axis in zip(rows, column, strict=True):
-            found = _magnified(stage, view, samples, evaluator)
+            normals, errors, median = normals_by(view, samples, evaluator)
+            mesh = make_mesh(positions, triangles, CLAY, normals=(normals @ view.frame).reshape(-1, 3))
             name = f"{LABELS[evaluator]}, x {magnification}".replace("\n", ", ")
-            options.report(f"{name}: median normal error {found.median:.1e} degrees")
-            pixels = render(found.scene, options, name)
-            _draw_halves(axis, pixels, found.errors.ravel()[nearest], lines)
-            axis.set_xlabel(_degrees(found.median))
-            _draw_bar(axis, magnification, options.resolution)
-            rendered.append(pixels)
-            records.append({"evaluator": evaluator, "magnification": magnification, "error": found.median})
-        column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(extent)}")
+            options.report(f"{name}: median normal error {median:.1e} degrees")
+            rendered.append(render(staged(stage, mesh=mesh), options, name))
+            _draw_halves(axis, rendered[-1], errors.ravel()[nearest], lines)
+            axis.set_xlabel(_degrees(median))
+            # The length of the scale bar is one on the surface, whose cage has the radius 1.
+            length = BAR / HALF_WIDTH / 2 * resolution
+            bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
+            bar.patch.set(alpha=0.85, linewidth=0)
+            axis.add_artist(bar)
+            records.append({"evaluator": evaluator, "magnification": magnification, "error": median})
+        column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(parameter_extent(magnification))}")
     for axis, evaluator in zip(axes[:, 0], rows, strict=True):
         axis.set_ylabel(LABELS[evaluator])
     scale = ScalarMappable(ERROR_SCALE, COLOURS)
-    bar = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
-    bar.set_label("error of the normal in degrees; medians below panels")
-    label_powers(bar.ax.yaxis)
+    colours = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
+    colours.set_label("error of the normal in degrees; medians below panels")
+    label_powers(colours.ax.yaxis)
     written = write_plot(options, "zoom", figure)
     strips = [np.concatenate(rendered[i :: len(rows)], axis=1) for i in range(len(rows))]
     metadata = {"pictures": records, "offset": OFFSET, "spp": options.spp}
@@ -126,51 +138,31 @@ def parameter_extent(magnification: float) -> float:
     return float(magnification ** (1 / np.log2(patch.basis.subdominant)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage."""
-
-    uv: NDArray[np.float64]  # (s, 2): parameters, the same in each element
-    triangles: NDArray[np.integer]  # (m, 3): of all elements
-    # (valence, s, 3)
-    positions: NDArray[np.float64]
-    normals: NDArray[np.float64]
-
-
-def _sample(view: TangentView, magnification: float, count: int) -> _Samples:
+def sample(view: TangentView, magnification: float, count: int) -> Samples:
+    """Sample a grid of ``count`` segments along each side in every element at the point, as far as a panel shows."""
     uv = grid_points(np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
     uv[0] = 0.1 / count
     uv *= parameter_extent(magnification)
     exact = [view.surface.evaluate(element, uv) for element in range(VALENCE)]
-    positions = np.stack([view.on_stage(found.p, magnification) for found in exact])
-    return _Samples(uv, grid_triangles(count, VALENCE), positions, np.stack([found.n for found in exact]))
+    positions = np.stack([view.on_stage(samples.p, magnification) for samples in exact])
+    return Samples(uv, positions, np.stack([samples.n for samples in exact]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Magnified:
-    """The magnified surface with normals by one method."""
+def normals_by(view: TangentView, samples: Samples, evaluator: Method) -> tuple[FloatArray, FloatArray, float]:
+    """Normals by one of our evaluators or by OpenSubdiv, both in float32, ``(valence, s, 3)``.
 
-    scene: mi.Scene
-    # (valence, s): angles between the normals and the exact normals of the samples, in degrees
-    errors: NDArray[np.float64]
-    median: float  # Of the errors inside the image
-
-
-def _magnified(stage: mi.Scene, view: TangentView, samples: _Samples, evaluator: Method) -> _Magnified:
-    found = [_normals(view.surface, element, samples.uv, evaluator) for element in range(VALENCE)]
-    normals = np.nan_to_num(np.stack(found))
+    Returns besides their angles to the exact normals in degrees ``(valence, s)``, and the median of those inside the
+    image.
+    """
+    found = np.nan_to_num(np.stack([_normals(view.surface, i, samples.uv, evaluator) for i in range(VALENCE)]))
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
-    angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
+    angle = np.where(found.any(axis=-1), normal_angle(found, samples.normals), 180)
     inside = np.abs(samples.positions[..., :2]).max(axis=-1) < 1
-    clay = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
-    positions, turned = (each.reshape(-1, 3) for each in (samples.positions, normals @ view.frame))
-    mesh = make_mesh(positions, samples.triangles, clay, normals=turned)
-    return _Magnified(staged(stage, mesh=mesh), angle, float(np.median(angle[inside])))
+    return found, angle, float(np.median(angle[inside]))
 
 
 def _normals(surface: LimitSurface, element: int, uv: FloatArray, evaluator: Method) -> FloatArray:
-    """Normals in float32 arithmetic, by one of our evaluators or by OpenSubdiv: ``(s, 3)``."""
     if evaluator == OPENSUBDIV:
         program = osd_peer()
         if program is None:
@@ -204,14 +196,6 @@ def _draw_halves(axis: Axes, pixels: NDArray[np.float32], errors: FloatArray, li
     axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.3, alpha=0.6))
     axis.axvline(width / 2, color="white")
     axis.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
-
-
-def _draw_bar(axis: Axes, magnification: float, resolution: int) -> None:
-    """Draw a scale bar: a length on the surface, whose cage has the radius 1."""
-    length = BAR / HALF_WIDTH / 2 * resolution
-    bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
-    bar.patch.set(alpha=0.85, linewidth=0)
-    axis.add_artist(bar)
 
 
 def _degrees(error: float) -> str:

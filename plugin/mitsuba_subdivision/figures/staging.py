@@ -1,8 +1,8 @@
-"""Staging: meshes are made in memory, put into a scene that has camera and lights, and rendered in parts."""
+"""Staging: meshes in memory in scenes that have camera and lights, renders, and where points appear in them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,20 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
+from ..device_arrays import upload
+from ..examples import example_file
 from ..mitsuba_mesh import mitsuba_mesh
 from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded
 from ..variants import SceneNode
-from .output import FigureOptions, panels, scene_path, show, write_pixels, write_plot
+from .output import FigureOptions, panels, show, write_pixels, write_plot
 
 # Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
 PART_SAMPLES = 1 << 26
 # A picture that stands alone is wider than those that share a figure, by this factor, and 8 : 5.
 WIDER, HEIGHT = 2.25, 0.625
+# Points are lifted off their surface by this part of their distance to the camera, before they are tested.
+LIFT = 2e-3
 
 
 def load_stage(name: str, **parameters: str | float) -> mi.Scene:
@@ -31,7 +35,7 @@ def load_stage(name: str, **parameters: str | float) -> mi.Scene:
     Its reconstruction filter becomes the box filter: with others, the order of sums, and so the last bits, vary from
     run to run.
     """
-    return load_scene(scene_path(name), parameters, "box").scene
+    return load_scene(example_file(f"{name}.xml"), parameters, "box").scene
 
 
 def make_mesh(
@@ -173,14 +177,44 @@ def render_panels(
     return np.concatenate(rendered, axis=1)
 
 
-def draw_row(
-    options: FigureOptions,
-    name: str,  # Of the scene and of the figure
-    cases: Mapping[str, Mapping[str, Any]],  # Parameters of the scene, by titles as in `render_panels`
-    metadata: dict[str, Any],  # For the figure's pixels, besides the samples
-) -> list[Path]:
-    """Render a scene once for each panel."""
-    figure, axes = panels(options, 1, len(cases))
-    scenes = ((title, load_stage(name, **case, resolution=options.resolution)) for title, case in cases.items())
-    pixels = render_panels(options, axes, scenes)
-    return write_plot(options, name, figure) + write_pixels(options, name, pixels, {**metadata, "spp": options.spp})
+def project(sensor: mi.Sensor, points: NDArray[np.floating], resolution: int) -> NDArray[np.float64]:
+    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square image of this width."""
+    parameters = mi.traverse(sensor)
+    camera = _in_camera(sensor, points)
+    # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera sees x and y from -1 to 1.
+    half_width = np.ones_like(camera[..., 2:])
+    if "x_fov" in parameters:
+        half_width = camera[..., 2:] * np.tan(np.radians(float(np.array(parameters["x_fov"]).item()) / 2))
+    return (1 - camera[..., :2] / half_width) / 2 * resolution
+
+
+def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether nothing of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
+    sensor = scene.sensors()[0]
+    backward = -camera_matrix(sensor)[:3, 2]
+    start = points + LIFT * _in_camera(sensor, points)[:, 2:] * backward
+    towards = mi.Vector3f(*(backward / np.linalg.norm(backward)).tolist())
+    if "scalar" in str(mi.variant()):
+        return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), towards)) for p in start], dtype=bool)
+    return ~np.array(scene.ray_test(mi.Ray3f(upload(mi.Point3f, start), towards)))
+
+
+def visible_runs(scene: mi.Scene, lines: NDArray[np.floating], resolution: int) -> list[NDArray[np.float64]]:
+    """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
+    seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
+    positions = project(scene.sensors()[0], lines, resolution)
+    runs = []
+    for line, shown in zip(positions, seen, strict=True):
+        changes = 1 + np.flatnonzero(np.diff(shown))
+        runs += np.split(line, changes)[0 if shown[0] else 1 :: 2]
+    return [run for run in runs if len(run) > 1]
+
+
+def camera_matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
+    """Transform ``(4, 4)`` from the camera to the world."""
+    return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+
+
+def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    to_camera = np.linalg.inv(camera_matrix(sensor))
+    return points @ to_camera[:3, :3].T + to_camera[:3, 3]

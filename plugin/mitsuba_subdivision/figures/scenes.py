@@ -1,0 +1,139 @@
+"""Figures that are renders of one scene each: a human figure, schemes, shading, and a jar that is displaced."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from ..device_arrays import upload
+from ..examples import example_file
+from ..mitsuba_mesh import mitsuba_mesh
+from ..shapes.tessellation_parameters import pixel_error_for
+from ..tessellation import HIGHEST_RATE
+from ..variants import SceneNode
+from .output import FigureOptions, panels, write_pixels, write_plot
+from .staging import draw_picture, load_stage, picture_size, render, render_panels, staged
+
+SCHEMES = {"catmull_clark": "Catmull-Clark", "doo_sabin": "Doo-Sabin", "loop": "Loop"}
+# Kinds of shading, and segments per edge.
+SHADINGS = (("vertex", 2), ("vertex", 8), ("exact", 2))
+SHADING_TITLES = {"vertex": "normals of vertices", "exact": "exact at every hit"}
+
+# Of the jar: how far triangles may be from the surface, in pixels, and in the slice where they are drawn.
+PIXEL_ERROR, PIXEL_ERROR_OF_LINES = 0.08, 1.5
+SCALE = 0.115
+# Where slices end, as parts of the width.
+ENDS = (0.0, 0.35, 0.64, 1.0)
+# Of the image of heights, around the jar and along its profile.
+COLUMNS, ROWS = 1536, 1536
+# How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
+AROUND, UP = 12, 10
+LOWEST, HIGHEST = 0.10, 0.70
+# Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
+# its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
+BEAD, FADE, SOFT = 0.21, 0.5, 0.1
+GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
+# Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
+LINE, LINE_IMAGE = 0.045, 256
+
+
+def draw_hero(options: FigureOptions) -> list[Path]:
+    """Render the scene `human`: the limit surface of a human figure beside its cage."""
+    width, height = picture_size(options)
+    scene = load_stage("human", width=width, height=height)
+    options.report("mannequin")
+    pixels = render(scene, options, "mannequin")[..., :3]
+    return draw_picture(options, "hero", pixels, {"spp": options.spp, "cage": "human.obj, (c) 2010 Tobias Rittig"})
+
+
+def draw_schemes(options: FigureOptions) -> list[Path]:
+    """Render one cage of triangles, with its edges, under Catmull-Clark, Doo-Sabin and Loop side by side."""
+    return _draw_row(options, "schemes", {title: {"scheme": scheme} for scheme, title in SCHEMES.items()})
+
+
+def draw_shading(options: FigureOptions) -> list[Path]:
+    """Render brushed metal with normals of vertices, and with those of the surface at every hit."""
+    titles = (f"{SHADING_TITLES[kind]}\n{rate} segments per edge" for kind, rate in SHADINGS)
+    cases = ({"shading": kind, "rate": rate} for kind, rate in SHADINGS)
+    return _draw_row(options, "shading", dict(zip(titles, cases, strict=True)))
+
+
+def _draw_row(options: FigureOptions, name: str, cases: Mapping[str, Mapping[str, Any]]) -> list[Path]:
+    """Render the scene of a figure with parameters for each panel, given by titles as in `render_panels`."""
+    figure, axes = panels(options, 1, len(cases))
+    scenes = ((title, load_stage(name, **case, resolution=options.resolution)) for title, case in cases.items())
+    pixels = render_panels(options, axes, scenes)
+    metadata = {key: [case[key] for case in cases.values()] for key in next(iter(cases.values()))}
+    return write_plot(options, name, figure) + write_pixels(options, name, pixels, {**metadata, "spp": options.spp})
+
+
+def draw_displacement(options: FigureOptions) -> list[Path]:
+    """Render a jar before it is displaced, displaced, and its triangles: three slices of one picture."""
+    width, height = picture_size(options)
+    sensor = load_stage("displacement", width=width, height=height, columns=width).sensors()[0]
+    plain = {
+        "type": "subdivision",
+        "filename": example_file("cages/jar.obj"),
+        **pixel_error_for(sensor, PIXEL_ERROR),
+        "max_rate": HIGHEST_RATE,
+        "bsdf": _glazed({"type": "rgb", "value": GLAZE}),
+    }
+    heights = mi.load_dict({"type": "bitmap", "data": upload(mi.TensorXf, quilt()[..., None]), "raw": True})
+    displaced = {**plain, "displacement": heights, "displacement_scale": SCALE}
+    coarse = mi.load_dict({**displaced, "pixel_error": PIXEL_ERROR_OF_LINES})
+    slices = {
+        "limit surface": mi.load_dict(plain),
+        "displaced": mi.load_dict(displaced),
+        "triangles": _with_lines(coarse),
+    }
+    columns = [round(end * width) for end in ENDS]
+    rendered = []
+    for i, (name, jar) in enumerate(slices.items()):
+        options.report(name)
+        first, count = columns[i], columns[i + 1] - columns[i]
+        stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
+        rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])
+    pixels = np.concatenate(rendered, axis=1)
+    metadata = {"spp": options.spp, "pixel_error": PIXEL_ERROR}
+    return draw_picture(options, "displacement", pixels, metadata, columns[1:-1])
+
+
+def quilt() -> NDArray[np.float32]:
+    """Heights of cushions between grooves that cross, with a bead at each crossing, ``(ROWS, COLUMNS)``, up to 1.
+
+    The image repeats around the jar.
+    """
+    x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
+    part = (y - LOWEST) / (HIGHEST - LOWEST)
+    # Grooves lie where either of these is an integer.
+    p, q = x * AROUND + part * UP / 2, x * AROUND - part * UP / 2
+    cushion = np.sqrt((np.sin(np.pi * p) * np.sin(np.pi * q)) ** 2 + SOFT**2) - SOFT
+    away = np.hypot((p + 0.5) % 1 - 0.5, (q + 0.5) % 1 - 0.5) / BEAD
+    bead = 0.6 * np.where(away < 1, 1 + np.cos(np.pi * np.minimum(away, 1)), 0) / 2
+    ends = np.clip(np.minimum(part, 1 - part) * UP / FADE, 0, 1)
+    return ((cushion**0.8 + bead) * ends * ends * (3 - 2 * ends)).astype(np.float32)
+
+
+def _glazed(colour: SceneNode) -> SceneNode:
+    glaze = {"roughness": 0.42, "specular": 0.4, "clearcoat": 1.0, "clearcoat_gloss": 0.97}
+    return {"type": "principled", "base_color": colour, **glaze}
+
+
+def _with_lines(shape: mi.Shape) -> mi.Mesh:
+    """A mesh of the shape's triangles, each with its own texture coordinates, and a texture that draws their edges."""
+    parameters = mi.traverse(shape)
+    faces = np.array(parameters["faces"])
+    corners = {key: np.array(parameters[key]).reshape(-1, 3)[faces] for key in ("vertex_positions", "vertex_normals")}
+    buffers = {**corners, "vertex_texcoords": np.tile([[0, 0], [1, 0], [0, 1]], (len(faces) // 3, 1))}
+    # Over the triangle (0, 0), (1, 0), (0, 1): lines along its sides, and the glaze.
+    u, v = np.meshgrid(*[(np.arange(LINE_IMAGE) + 0.5) / LINE_IMAGE] * 2)
+    part = np.clip(1.5 - np.minimum(np.minimum(u, v), 1 - u - v) / LINE, 0, 1)[..., None]
+    colours = upload(mi.TensorXf, part * np.array(LINES) + (1 - part) * np.array(GLAZE))
+    lines = {"type": "bitmap", "data": colours, "raw": True, "wrap_mode": "clamp"}
+    triangles = np.arange(len(faces)).reshape(-1, 3)
+    return mitsuba_mesh("triangles", triangles, buffers, bsdf=mi.load_dict(_glazed(lines)))
