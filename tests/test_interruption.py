@@ -71,7 +71,7 @@ def test_work_that_ends_itself_by_an_interrupt_is_told(monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mitsuba_subdivision.commands.cage._surface", interrupt)
+    monkeypatch.setattr("mitsuba_subdivision.commands.info._surface", interrupt)
     assert main(["info", "cube.obj"]) == 130
     assert capsys.readouterr().err == "mitsuba-subdivision: interrupted\n"
 

@@ -10,11 +10,9 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
-from . import __version__
 from .cage import CageWarning
-from .commands import cage, compare, doctor, figure, render
-from .commands.arguments import CommandParser
-from .messages import PROGRAM, USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
+from .commands import parser
+from .messages import USER_ERRORS, flushed_output, print_error, print_remark, printed_warnings
 from .whole_file import remove_unfinished
 
 INTERRUPTED = 130
@@ -26,9 +24,10 @@ INTERVAL = 0.1
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status; after Ctrl-C, end the process if its work cannot be stopped."""
+    words = sys.argv[1:] if arguments is None else arguments
     with flushed_output():
         try:
-            options, unknown = parser().parse_known_args(arguments)
+            options, unknown = parser(words).parse_known_args(words)
             if unknown:
                 # The command's own parser reports them, with its usage and exit status.
                 options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
@@ -92,22 +91,6 @@ def interruptible(work: Callable[[], T]) -> T:
             # The error's traceback would keep alive the objects that the work used.
             found.clear()
     return found["result"]
-
-
-def parser() -> CommandParser:
-    """The parser of the whole command line."""
-    program = CommandParser(
-        prog=PROGRAM,
-        description="Exact subdivision surfaces for Mitsuba 3.",
-        allow_abbrev=False,
-        epilog=f'"{PROGRAM} COMMAND --help" describes a command.',
-    )
-    program.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    program.set_defaults(error_status=1)
-    commands = program.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for module in (figure, render, cage, compare, doctor):
-        module.add_parser(commands)
-    return program
 
 
 if __name__ == "__main__":

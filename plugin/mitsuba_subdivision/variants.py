@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from .llvm import require_llvm
+from .llvm import best_variant, llvm_problem, require_llvm
 
 # The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
 Variant: TypeAlias = Any
@@ -30,22 +30,46 @@ def variant_module(
 
     name = variant_name(mi)
     if name not in mitsuba.variants():
-        raise ValueError(f'unknown variant "{name}"; expected one of {", ".join(mitsuba.variants())}')
+        raise ValueError(_unknown(name))
     return getattr(mitsuba, name)
 
 
-def set_variant(name: str) -> None:
-    """Set a variant of Mitsuba in a process of this package, such as a command.
+def _unknown(name: str) -> str:
+    import mitsuba
+
+    return f'unknown variant "{name}"; expected one of {", ".join(mitsuba.variants())}'
+
+
+def variant_problem(name: str) -> str | None:
+    """Why a variant cannot run here, None if it can."""
+    import drjit as dr
+    import mitsuba
+
+    if name not in mitsuba.variants():
+        return _unknown(name)
+    if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        return f"variant {name} needs an NVIDIA GPU, and Dr.Jit finds none"
+    return llvm_problem() if name.startswith("llvm") else None
+
+
+def chosen_variant(name: str | None) -> str:
+    """A variant that was asked for, or else the best. Raises ValueError if it cannot run here."""
+    problem = variant_problem(name) if name else None
+    if problem:
+        raise ValueError(problem)
+    return name or best_variant()
+
+
+def set_variant(name: str | None) -> None:
+    """Set a variant of Mitsuba, or else the best, in a process of this package, such as a command.
 
     On a machine with one core, Dr.Jit starts a thread more: without one, Mitsuba 3.9 waits for ever when it reads or
-    writes OpenEXR files.
+    writes OpenEXR files. Raises ValueError if the variant cannot run here.
     """
     import drjit as dr
     import mitsuba
 
-    if name.startswith("llvm"):
-        require_llvm()
-    mitsuba.set_variant(name)
+    mitsuba.set_variant(chosen_variant(name))
     dr.set_thread_count(max(dr.thread_count(), OPENEXR_THREADS))
 
 

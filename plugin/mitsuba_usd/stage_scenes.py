@@ -54,7 +54,7 @@ _TRAVERSED = {"fov": "x_fov"}
 
 
 class StageScenes:
-    """A `SceneSource` of a whole stage, with the camera and the lights of the studio where it has none.
+    """Scene source of a whole stage, with the camera and the lights of the studio where it has none.
 
     Everything may move: shapes, their control points, instances, lights and the stage's camera. Limit surfaces whose
     topology stays keep their patches and weights. Where only the camera moves, the scene stays loaded. The studio's

@@ -6,9 +6,9 @@ import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, studio_scene
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.commands.pictures import save_scene
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.studio.obj_materials import material_bsdf, read_materials
+from mitsuba_subdivision.studio.saving import save_scene
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 SMALL = {"size": (8, 6), "rate": 2, "shading": "vertex"}

@@ -91,7 +91,6 @@ def test_one_core_reads_and_writes_openexr(folder, options):
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_a_turntable_comes_round():
     table = Turntable(CageScenes(named_cages.cube(), Look(size=(24, 18), spp=64, rate=4, view="front")), 4)
-    assert list(table.numbers) == [1, 2, 3, 4]
     np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
     frames = (loaded for number in (1, 2, 1.5) for loaded in table.frames([number], None))
     first, quarter, between = (np.array(mi.render(loaded.scene)) for loaded in frames)

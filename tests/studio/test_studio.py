@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageError, named_cages
 from mitsuba_subdivision.cage.errors import CageWarning
-from mitsuba_subdivision.commands.pictures import save_scene
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
 from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, VIEWS, framed, outermost
 from mitsuba_subdivision.studio.model import CageWire, up_axis_of
+from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import sampler
 
 llvm, scalar = (pytest.mark.usefixtures(f"variant_{name}") for name in ("llvm_ad_rgb", "scalar_rgb"))

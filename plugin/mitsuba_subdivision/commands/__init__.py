@@ -1,5 +1,48 @@
-"""The commands of ``mitsuba-subdivision``: one module for each, or for two that belong together.
+"""The commands of ``mitsuba-subdivision``, and the parser of the command line.
 
-A new command is a module with a function ``add_parser(commands)``, which adds the command's parser and sets as its
-default ``run`` the function that gets the parsed options and returns the exit status; and its name in `command_line`.
+A new command is a line of `COMMANDS` and a function. The function gets the command's parser, adds its options, and sets
+as default ``run`` another one that gets the parsed options and returns the exit status.
 """
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+
+from .. import __version__
+from ..messages import PROGRAM
+from .arguments import CommandParser
+
+# ``module.function`` of this package, and what the program's help says. A module is imported where its command is named
+# only: some take longer to import than others to run.
+COMMANDS = {
+    "figure": ("figure.figure", "draw a figure of the documentation"),
+    "render": ("render.render", "render a scene, or a model in a studio"),
+    "info": ("info.info", "describe a control cage"),
+    "tessellate": ("info.tessellate", "write a limit surface as triangles"),
+    "compare": ("compare.compare", "compare two images, or a scene with its reference"),
+    "merge": ("compare.merge", "merge the passes of an image"),
+    "doctor": ("info.doctor", "test what works on this machine"),
+}
+
+
+def parser(
+    words: Sequence[str] = tuple(COMMANDS),  # Of the command line: only commands named there get options
+) -> CommandParser:
+    """The parser of the whole command line."""
+    program = CommandParser(
+        prog=PROGRAM,
+        description="Exact subdivision surfaces for Mitsuba 3.",
+        allow_abbrev=False,
+        epilog=f'"{PROGRAM} COMMAND --help" describes a command.',
+    )
+    program.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    program.set_defaults(error_status=1)
+    commands = program.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for name, (place, text) in COMMANDS.items():
+        command = commands.add_parser(name, help=text)
+        command.set_defaults(parser=command)
+        if name in words:
+            module, function = place.split(".")
+            getattr(importlib.import_module(f".{module}", __name__), function)(command)
+    return program

@@ -5,32 +5,22 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from typing import Any, NoReturn, TypeAlias
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
 
-from .. import variants
-from ..llvm import best_variant
-from ..regression.scene import require_variant
 from ..schemes import SCHEME_CLASSES
 from ..tessellation import HIGHEST_RATE
 
-# A text, as Python's class takes no type.
-Commands: TypeAlias = "argparse._SubParsersAction[CommandParser]"
 # Exit status of wrong usage, as argparse has it.
 USAGE_ERROR = 2
+
+N = TypeVar("N", int, float)
 
 
 def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
     """Add the option ``--variant`` to a command, with other names that it may have."""
     text = "variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)"
     parser.add_argument(*aliases, "--variant", dest="variant", metavar="VARIANT", help=text)
-
-
-def set_variant(name: str | None) -> None:
-    """Set the variant of Mitsuba that ``--variant`` names, or the best if there is none.
-
-    Raises RegressionError if the variant cannot run here.
-    """
-    variants.set_variant(require_variant(name) if name else best_variant())
 
 
 def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:
@@ -42,41 +32,48 @@ def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> N
     add("--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})")
 
 
+def number(kind: Callable[[str], N], is_allowed: Callable[[N], bool], expected: str) -> Callable[[str], N]:
+    """Make the parser of an argument that is a number, and of which messages say what was expected."""
+
+    def parsed(text: str) -> N:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not is_allowed(value):
+            raise argparse.ArgumentTypeError(f'"{text}"; expected {expected}')
+        return value
+
+    return parsed
+
+
+def _integer(text: str) -> int:
+    if not text.isdecimal():
+        raise ValueError(text)
+    return int(text)
+
+
+finite = number(float, math.isfinite, "a number")
+above_zero = number(float, lambda value: 0 < value < math.inf, "a number above 0")
+index = number(_integer, lambda _: True, "an integer, 0 or more")
+# Of 32 bits, as Mitsuba has it.
+seed = number(_integer, lambda value: value < 2**32, f"an integer from 0 to {2**32 - 1}")
+
+
 def positive(text: str) -> int:
     """Parse an argument that is an integer of at least 1."""
-    try:
-        number = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer, 1 or more') from None
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number}; expected 1 or more")
-    return number
-
-
-def seed(text: str) -> int:
-    """Parse a seed, an integer of 32 bits."""
-    if not (text.isdecimal() and int(text) < 2**32):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer from 0 to {2**32 - 1}')
-    return int(text)
+    value = number(int, lambda _: True, "an integer, 1 or more")(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value}; expected 1 or more")
+    return value
 
 
 def rate(text: str) -> int:
     """Parse a tessellation rate."""
-    number = positive(text)
-    if number > HIGHEST_RATE:
-        raise argparse.ArgumentTypeError(f"{number}; expected {HIGHEST_RATE} or less")
-    return number
-
-
-def finite(text: str) -> float:
-    """Parse a number that is finite."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected a number')
-    return number
+    value = positive(text)
+    if value > HIGHEST_RATE:
+        raise argparse.ArgumentTypeError(f"{value}; expected {HIGHEST_RATE} or less")
+    return value
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -106,10 +103,8 @@ class _HelpFormatter(argparse.HelpFormatter):
             self._action_max_length += self._indent_increment
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        paragraphs = text.split("\n\n")
-        return "\n\n".join(
-            p if "\n" in p else super(_HelpFormatter, self)._fill_text(p, width, indent) for p in paragraphs
-        )
+        fill = super()._fill_text
+        return "\n\n".join(p if "\n" in p else fill(p, width, indent) for p in text.split("\n\n"))
 
 
 def table(title: str, rows: dict[str, str]) -> str:

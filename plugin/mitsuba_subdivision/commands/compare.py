@@ -12,46 +12,57 @@ from ..regression import ImageError
 from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..variants import variant_set
 from ..whole_file import require_folder, require_writable, write_text
-from .arguments import Commands, positive, seed, table
-from .passes import TOLERANCES, add_tolerances
+from .arguments import CommandParser, positive, seed, table
 
 # Exit status of ``compare`` and ``merge`` for input or output that cannot be used: 1 and 2 say how images differ.
 UNUSABLE = 3
+TOLERANCES = f"Tolerances: {', '.join(Tolerances().as_dict())}."
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the commands to the program."""
-    compare = commands.add_parser(
-        "compare",
-        help="compare two images, or a scene with its reference",
-        description="Compare an image with a reference, or render a scene as its reference was rendered and compare "
-        "the two.\n\n" + table("tiers", TIERS),
-        epilog=f"{TOLERANCES}\n\nExit status: 0 pass, 1 warning, 2 fail, 3 unusable input or output.",
+def compare(parser: CommandParser) -> None:
+    """Add the options of ``compare``."""
+    parser.description = (
+        "Compare an image with a reference, or render a scene as its reference was rendered and compare the two.\n\n"
+        + table("tiers", TIERS)
     )
-    compare.add_argument("reference", type=Path, metavar="REFERENCE", help="OpenEXR file")
-    compare.add_argument("test", type=Path, metavar="TEST", help="OpenEXR file, or a Mitsuba scene (.xml) to render")
-    compare.add_argument(
-        "--tiers",
-        metavar="TIERS",
-        help=f"tiers to compare by, separated by commas (default: {', '.join(DEFAULT_TIERS)}, as far as the images "
-        "allow; flip if no other can compare their pixels)",
+    parser.epilog = f"{TOLERANCES}\n\nExit status: 0 pass, 1 warning, 2 fail, 3 unusable input or output."
+    add = parser.add_argument
+    add("reference", type=Path, metavar="REFERENCE", help="OpenEXR file")
+    add("test", type=Path, metavar="TEST", help="OpenEXR file, or a Mitsuba scene (.xml) to render")
+    text = (
+        f"tiers to compare by, separated by commas (default: {', '.join(DEFAULT_TIERS)}, as far as the images allow; "
     )
-    compare.add_argument("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
-    compare.add_argument("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
-    add_tolerances(compare, "tolerance to use instead of the reference's; can be repeated")
-    compare.add_argument("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
-    compare.add_argument("--html", type=Path, metavar="DIR", help="folder to write a report to")
-    compare.set_defaults(run=_compare, parser=compare, error_status=UNUSABLE, usage_status=UNUSABLE)
+    add("--tiers", metavar="TIERS", help=f"{text}flip if no other can compare their pixels)")
+    add("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
+    add("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
+    add_tolerances(parser, "tolerance to use instead of the reference's; can be repeated")
+    add("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
+    add("--html", type=Path, metavar="DIR", help="folder to write a report to")
+    parser.set_defaults(run=_compare, error_status=UNUSABLE, usage_status=UNUSABLE)
 
-    merge = commands.add_parser(
-        "merge",
-        help="merge the passes of an image",
-        description='Merge the passes of an image, which "render --pass" wrote.',
-        epilog="Exit status: 0 merged, 3 unusable input or output.",
+
+def merge(parser: CommandParser) -> None:
+    """Add the options of ``merge``."""
+    parser.description = 'Merge the passes of an image, which "render --pass" wrote.'
+    parser.epilog = "Exit status: 0 merged, 3 unusable input or output."
+    parser.add_argument("passes", type=Path, nargs="+", metavar="PASS", help="OpenEXR file of a pass")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="OpenEXR file to write")
+    parser.set_defaults(run=_merge, error_status=UNUSABLE, usage_status=UNUSABLE)
+
+
+def add_tolerances(group: argparse._ActionsContainer, text: str) -> None:
+    """Add the option ``--tolerance``, with a text for the help."""
+    group.add_argument(
+        "--tolerance", dest="tolerances", metavar="NAME=VALUE", type=_tolerance, action="append", default=[], help=text
     )
-    merge.add_argument("passes", type=Path, nargs="+", metavar="PASS", help="OpenEXR file of a pass")
-    merge.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="OpenEXR file to write")
-    merge.set_defaults(run=_merge, parser=merge, error_status=UNUSABLE, usage_status=UNUSABLE)
+
+
+def _tolerance(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=NUMBER') from None
 
 
 def _compare(options: argparse.Namespace) -> int:
@@ -81,20 +92,20 @@ def _compare(options: argparse.Namespace) -> int:
 
         with variant_set(variant_for(reference)):
             sampling = {"spp": options.spp or TEST_SPP, "seed": options.seed or 0}
-            found = compare_scene(reference, options.test, tiers, tolerances=tolerances, **sampling)
+            comparison = compare_scene(reference, options.test, tiers, tolerances=tolerances, **sampling)
     else:
-        found = compare(reference, test, tiers, tolerances)
-    text = json.dumps(found.as_dict(), indent=1)
+        comparison = compare(reference, test, tiers, tolerances)
+    text = json.dumps(comparison.as_dict(), indent=1)
     if options.json and options.json != "-":
         write_text(Path(options.json), f"{text}\n")
     # The result first, which a report that cannot be written does not hide.
-    print_result(text if options.json == "-" else found)
-    page = write_report(options.html, found) if options.html else None
+    print_result(text if options.json == "-" else comparison)
+    page = write_report(options.html, comparison) if options.html else None
     if page and options.json == "-":
         print_remark(f"report: {page}")
     elif page:
         print_result(f"  report: {page}")
-    return found.exit_status
+    return comparison.exit_status
 
 
 def _merge(options: argparse.Namespace) -> None:

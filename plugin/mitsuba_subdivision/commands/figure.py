@@ -10,8 +10,9 @@ from ..figures import FIGURES, FigureOptions, require_options
 from ..figures.output import COLUMN, INCH, PAGE
 from ..messages import print_result
 from ..schemes import SCHEME_CLASSES
+from ..variants import set_variant
 from ..whole_file import require_folder, require_writable
-from .arguments import Commands, add_variant, positive, set_variant, table
+from .arguments import CommandParser, add_variant, positive, table
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
@@ -19,29 +20,27 @@ DRAWN = Path("renders/drawn")
 WIDEST = 1200.0
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the program."""
-    figure = commands.add_parser(
-        "figure",
-        help="draw a figure of the documentation",
-        description="Draw a figure of the documentation, or all. Options that do not change the figure are refused.",
-        epilog=table("figures", {name: figure.shows for name, figure in FIGURES.items()}),
+def figure(parser: CommandParser) -> None:
+    """Add the options of ``figure``."""
+    parser.description = (
+        "Draw a figure of the documentation, or all. Options that do not change the figure are refused."
     )
-    add = figure.add_argument
+    parser.epilog = table("figures", {name: figure.shows for name, figure in FIGURES.items()})
+    add = parser.add_argument
     add("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
     add("-o", "--output", type=Path, default=DRAWN, metavar="DIR", help="folder to write to (default: %(default)s)")
     add("--resolution", type=positive, metavar="N", help="width of a panel in pixels (default: 512)")
     add("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
     text = f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)"
-    add("--width", type=width, metavar="LENGTH", help=text)
+    add("--width", type=_width, metavar="LENGTH", help=text)
     text = f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)"
     add("--scheme", choices=list(SCHEME_CLASSES), metavar="SCHEME", help=text)
     takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
     add("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
     text = "png, pdf or exr; can be repeated (default: all that the figure has)"
     add("--format", choices=FigureOptions.formats, action="append", dest="formats", metavar="FORMAT", help=text)
-    add_variant(figure)
-    figure.set_defaults(run=_figure, parser=figure)
+    add_variant(parser)
+    parser.set_defaults(run=_figure)
 
 
 def _figure(options: argparse.Namespace) -> None:
@@ -63,13 +62,10 @@ def _figure(options: argparse.Namespace) -> None:
                 print_result(path)
 
 
-def width(text: str) -> float:
+def _width(text: str) -> float:
     """Parse a width in millimetres or inches; returns millimetres."""
-    number, unit = text.removesuffix("mm"), 1.0
-    if text.endswith("in"):
-        number, unit = text.removesuffix("in"), INCH
     try:
-        length = unit * float(number)
+        length = INCH * float(text.removesuffix("in")) if text.endswith("in") else float(text.removesuffix("mm"))
     except ValueError:
         length = math.nan
     if not COLUMN <= length <= WIDEST:

@@ -1,17 +1,15 @@
-"""Pictures and scene files that the options of ``render`` ask for, here or on the workers of a cluster."""
+"""Pictures and passes that the options of ``render`` ask for, here or on the workers of a cluster."""
 
 from __future__ import annotations
 
 import argparse
 import pickle
-import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
-from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
@@ -21,27 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageWarning, warn
-from ..regression.scene import LoadedScene, render_image
-from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
+from ..messages import print_result
+from ..regression.scene import BOX, LoadedScene, load_scene, render_image
+from ..regression.tiers import Tolerances
+from ..studio.animation import FrameRange, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.camera import DEFAULT_VIEW, VIEWS
 from ..studio.denoising import denoised
 from ..studio.picture import shading_for
-from ..studio.scene_parts import SceneParts
-from ..studio.studio_entries import Look, variant_in_use
-from ..variants import SceneNode
-from ..whole_file import require_writable, write_text
+from ..studio.saving import save_scene
+from ..studio.studio_entries import Look, sampler, variant_in_use
+from ..whole_file import require_writable
 
 # Options that select one mesh of a USD file.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
-
-_NUMBERS = re.compile(r"<(float|rgb|lookat|scale|matrix|translate|rotate|point|vector) [^>]*>")
-_NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
-# Significant digits where single precision is not enough.
-DIGITS = 9
-_MATRIX = re.compile(r'( *)<matrix value="([^"]+)"/>')
-# Tolerance for the orthogonality of a matrix that is written as a scale and a direction.
-_ORTHOGONAL = 1e-6
 
 
 def render_picture(
@@ -52,12 +43,12 @@ def render_picture(
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
         seed = (options.seed * count + part) % 2**32
-        with threads(options.threads):
-            found = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
+        with _threads(options.threads):
+            image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
                 # Each by itself, as its albedo and normals are those of its time.
-                found = denoised(loaded, found, seed)
-        total = total + found / count
+                image = denoised(loaded, image, seed)
+        total = total + image / count
     return total
 
 
@@ -72,20 +63,47 @@ def pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tu
     return ((number, render_picture(options, islice(scenes, options.shutter or 1))) for number in numbers)
 
 
-def load_still(given: dict[str, Any]) -> LoadedScene:
-    """The scene of a model's picture, by options `as_data`."""
-    options = argparse.Namespace(**given)
-    return next(_shown(options).frames([1], options.filter))
+def render_by_passes(options: argparse.Namespace, *, is_model: bool = False) -> None:
+    """Render by passes, in the current variant, here or on a cluster, and write the image.
 
+    Raises RegressionError if there are fewer batches than passes, or no cluster answers.
+    """
+    from ..regression.image import save_image
+    from ..regression.passes import BATCH, LEAST_BATCHES, Sampling, merge_passes, render_on_cluster, render_pass
+    from ..regression.references import REFERENCE_SPP, as_reference
 
-def as_data(options: argparse.Namespace) -> dict[str, Any]:
-    """Options by which another process, in another folder, renders the same pictures."""
-    given = {name: value for name, value in vars(options).items() if name not in ("run", "parser")}
-    return given | {"scene": options.scene.resolve()}
+    # Workers get it, too, and may be in another folder.
+    load: Callable[[], LoadedScene] = partial(_load_still, _as_data(options))
+    if not is_model:
+        path = options.scene.resolve() if options.dask else options.scene
+        load = partial(load_scene, path, dict(options.parameters), BOX if options.reference else options.filter)
+    loaded = load()
+    require_writable(options.output, loaded.file_paths)
+    spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
+    tolerances = Tolerances().with_values(dict(options.tolerances))
+    number, count = options.share or (1, options.passes or 1)
+    batch = options.batch or min(BATCH, max(1, spp // max(LEAST_BATCHES, count)))
+    if is_model:
+        # Mitsuba would round each batch up, and more samples than recorded would count.
+        batch = sampler(batch)["sample_count"]
+    sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
+    settings = {"with_probe": options.reference}
+    with _threads(options.threads):
+        if options.dask:
+            variant = str(mi.variant())
+            image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
+        elif options.share:
+            image = render_pass(loaded, sampling, number, count, **settings)
+        else:
+            image = merge_passes([render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1)])
+    if options.reference:
+        image = as_reference(image, options.scene, options.output, sampling, tolerances)
+    save_image(options.output, image)
+    print_result(options.output)
 
 
 @contextmanager
-def threads(count: int | None) -> Iterator[None]:
+def _threads(count: int | None) -> Iterator[None]:
     """Render with so many threads. With one, nothing may be read or written meanwhile; see `set_variant`."""
     before = dr.thread_count()
     dr.set_thread_count(count or before)
@@ -95,11 +113,23 @@ def threads(count: int | None) -> Iterator[None]:
         dr.set_thread_count(before)
 
 
+def _as_data(options: argparse.Namespace) -> dict[str, Any]:
+    """Options by which another process, in another folder, renders the same pictures."""
+    given = {name: value for name, value in vars(options).items() if name not in ("run", "parser")}
+    return given | {"scene": options.scene.resolve()}
+
+
+def _load_still(given: dict[str, Any]) -> LoadedScene:
+    """The scene of a model's picture, by options `_as_data`."""
+    options = argparse.Namespace(**given)
+    return next(_shown(options).frames([1], options.filter))
+
+
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
     from ..regression.passes import cluster, results
 
     # The command's own number: files may change until the next one.
-    command = pickle.dumps(as_data(options) | {"command": uuid4().hex})
+    command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})
     warned: set[str] = set()
     with cluster(options.dask) as client:
         for number, (image, messages) in results(client, partial(_frame, command), str(mi.variant()), numbers):
@@ -116,7 +146,7 @@ def _frame(command: bytes, number: int) -> tuple[NDArray[np.float32], list[str]]
         warnings.simplefilter("always", CageWarning)
         options, shown = _kept(command)
         image = render_picture(options, shown.frames([number], options.filter))
-    return image, [str(each.message) for each in caught if issubclass(each.category, CageWarning)]
+    return image, [str(warning.message) for warning in caught if issubclass(warning.category, CageWarning)]
 
 
 @lru_cache(maxsize=1)
@@ -136,9 +166,14 @@ def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture
     return StillPicture(source, follows_sensor=not options.save_scene)
 
 
-def _source(options: argparse.Namespace) -> SceneSource[Any]:
-    """One mesh, or a whole USD file."""
-    look, which = _look(options), {"time": options.time, "numbers": options.frames}
+def _source(options: argparse.Namespace) -> Any:
+    """Scene source of one mesh, or of a whole USD file."""
+    azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
+    azimuth = azimuth if options.azimuth is None else options.azimuth
+    elevation = elevation if options.elevation is None else options.elevation
+    chosen = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage", "texture_size")}
+    look = Look(view=(azimuth, elevation), **{name: value for name, value in chosen.items() if value is not None})
+    which = {"time": options.time, "numbers": options.frames}
     is_usd = options.scene.suffix.lower().startswith(".usd")
     if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
         from mitsuba_usd import StageScenes
@@ -153,76 +188,3 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
         raise ValueError(f"--texture-size was given for {what}; expected it for a whole USD file")
     shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
     return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
-
-
-def _look(options: argparse.Namespace) -> Look:
-    azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
-    azimuth = azimuth if options.azimuth is None else options.azimuth
-    elevation = elevation if options.elevation is None else options.elevation
-    given = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage", "texture_size")}
-    return Look(view=(azimuth, elevation), **{name: value for name, value in given.items() if value is not None})
-
-
-def save_scene(
-    # As for `mi.load_dict`; a polygon mesh may have the type "ply" and, as `mesh`, an object with a method `save`
-    # that takes a path
-    scene: SceneNode,
-    path: Path,
-    inputs: Iterable[Path] = (),  # Files that must not be written to, besides those that the scene names
-) -> list[Path]:
-    """Write a scene as XML, so that it renders to the same picture.
-
-    Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
-    with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
-    meshes as PLY files; pictures as PNG or EXR files.
-    Returns list of Path: the files that were written; the scene is the last. Raises ValueError if the path does not end
-    in .xml, something in memory can be written to no file, or a file to write is one that the scene reads. Nothing has
-    been written then. Raises OSError if a file cannot be written.
-    """
-    if path.suffix.lower() != ".xml":
-        raise ValueError(f'scene "{path}"; expected a name ending in .xml')
-    named = [Path(entry["filename"]) for entry in scene.values() if isinstance(entry, Mapping) and "filename" in entry]
-    require_writable(path, inputs)
-    parts = SceneParts(path, [*named, *inputs])
-    entries = {
-        name: parts.in_files(name, dict(entry)) if isinstance(entry, Mapping) else entry
-        for name, entry in scene.items()
-    }
-    config = mi.parser.ParserConfig(str(mi.variant()))
-    text = _readable(mi.parser.write_string(mi.parser.parse_dict(config, entries)))
-    written = parts.write()
-    write_text(path, f'<?xml version="1.0"?>\n{text}')
-    return [*written, path]
-
-
-def _readable(text: str) -> str:
-    """The text that Mitsuba writes, with transforms as look-at, and without digits beyond single precision.
-
-    The difference of a look-at's points is a direction: they get more digits.
-    """
-
-    def shortened(tag: re.Match[str]) -> str:
-        if tag[1] == "lookat":
-            return _NUMBER.sub(lambda found: f"{float(found[0]):.{DIGITS}g}", tag[0])
-        return _NUMBER.sub(lambda found: str(np.float32(float(found[0]))).removesuffix(".0"), tag[0])
-
-    return _NUMBERS.sub(shortened, _MATRIX.sub(_placed, text))
-
-
-def _placed(found: re.Match[str]) -> str:
-    matrix = np.array(found[2].split(), dtype=np.float64).reshape(4, 4)
-    linear, origin = matrix[:3, :3], matrix[:3, 3]
-    if np.array_equal(linear, np.diag(np.diag(linear))):
-        return f"{found[1]}{_tag('scale', np.diag(linear))}\n{found[1]}{_tag('translate', origin)}"
-    sides = np.linalg.norm(linear, axis=0)
-    axes = linear / sides
-    if np.abs(axes.T @ axes - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(axes) < 0:
-        return found[0]
-    vectors = {"origin": origin, "target": origin + axes[:, 2], "up": axes[:, 1]}
-    directions = " ".join(f'{name}="{", ".join(map(str, vector))}"' for name, vector in vectors.items())
-    return f"{found[1]}{_tag('scale', sides)}\n{found[1]}<lookat {directions}/>"
-
-
-def _tag(name: str, values: NDArray[np.float64]) -> str:
-    coordinates = " ".join(f'{axis}="{value}"' for axis, value in zip("xyz", values.tolist(), strict=True))
-    return f"<{name} {coordinates}/>"

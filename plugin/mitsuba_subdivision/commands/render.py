@@ -7,7 +7,6 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,14 @@ from ..regression.scene import BOX, kept_search_folders, load_scene
 from ..shapes.parameter_table import SHADINGS
 from ..studio.camera import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..studio.denoising import require_denoiser
+from ..variants import set_variant
 from ..whole_file import require_writable, whole_file
-from .arguments import Commands, add_cage_options, add_variant, finite, positive, seed, set_variant
-from .passes import add_pass_options, render_by_passes, validate_pass_options, wants_passes
-from .pictures import as_data, load_still, pictures, render_picture
+from .arguments import CommandParser, above_zero, add_cage_options, add_variant, finite, index, positive, seed
+from .compare import TOLERANCES, add_tolerances
+from .pictures import pictures, render_by_passes, render_picture
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
+VIDEO_SUFFIXES = (".gif", ".mp4")
 SCENE_SUFFIX = ".xml"
 DEFAULT_FPS = 24
 # Options about models, by the names that they have after parsing; others are about every scene.
@@ -39,21 +40,18 @@ _OF_MODELS = (
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
-
-VIDEO_SUFFIXES = (".gif", ".mp4")
 # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
 EVEN = 2
 
 
-def add_parser(commands: Commands) -> None:
-    """Add the command to the program."""
-    render = commands.add_parser(
-        "render",
-        help="render a scene, or a model in a studio",
-        description="Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, "
-        "in a neutral studio.",
+def render(parser: CommandParser) -> None:
+    """Add the options of ``render``."""
+    parser.description = (
+        "Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, in a neutral "
+        "studio."
     )
-    add = render.add_argument
+    parser.epilog = TOLERANCES
+    add = parser.add_argument
     add("scene", type=Path, metavar="FILE", help="Mitsuba scene (.xml), or a model: a control cage")
     text = "image to write: .exr, .png, .jpg or .hdr; of frames also .gif or .mp4"
     add("-o", "--output", type=Path, required=True, metavar="FILE", help=text)
@@ -62,21 +60,24 @@ def add_parser(commands: Commands) -> None:
     many: dict[str, Any] = {"action": "append", "default": []}
     text = "value of a parameter of the scene; can be repeated"
     add("-D", "--define", dest="parameters", metavar="NAME=VALUE", type=_assignment, help=text, **many)
-    add("-s", "--sensor", type=_index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
+    add("-s", "--sensor", type=index, metavar="N", help="sensor of the scene, from 0 on (default: 0)")
     add("--denoise", action="store_true", help="render with the box filter, and remove noise by Open Image Denoise")
-    add_variant(render, "-m", "--mode")
+    add_variant(parser, "-m", "--mode")
     add("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
-    text = 'folders to search for files, separated by ";"'
-    add("-a", "--append", metavar="PATHS", help=text, **many)
+    add("-a", "--append", metavar="PATHS", help='folders to search for files, separated by ";"', **many)
     add("-v", "--verbose", action="count", default=0, help="print messages of Mitsuba; repeat for more")
-    _add_model_options(render)
-    _add_frame_options(render)
-    add_pass_options(render)
-    render.set_defaults(run=_render, parser=render)
+    _add_model_options(parser.add_argument_group("models"))
+    text = (
+        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an interrupted command can "
+    )
+    _add_frame_options(parser.add_argument_group("frames of models", f"{text}be repeated."))
+    add("--filter", help='reconstruction filter instead of the scene\'s; "box" is deterministic')
+    text = "The image is an OpenEXR file with the variance and the number of samples of each pixel."
+    _add_pass_options(parser.add_argument_group("rendering by passes", text))
+    parser.set_defaults(run=_render)
 
 
-def _add_model_options(render: argparse.ArgumentParser) -> None:
-    group = render.add_argument_group("models")
+def _add_model_options(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add("--view", choices=list(VIEWS), help=f"view of the camera (default: {DEFAULT_VIEW})")
     add("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
@@ -94,18 +95,26 @@ def _add_model_options(render: argparse.ArgumentParser) -> None:
     add("--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered")
 
 
-def _add_frame_options(render: argparse.ArgumentParser) -> None:
-    group = render.add_argument_group(
-        "frames of models",
-        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an "
-        "interrupted command can be repeated.",
-    )
-    group.add_argument("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
+def _add_frame_options(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
     text = "times of a USD file, or numbers of files whose name has %%04d in it"
-    group.add_argument("--frames", type=_frame_range, metavar="FIRST:LAST[:STEP]", help=text)
+    add("--frames", type=_frame_range, metavar="FIRST:LAST[:STEP]", help=text)
     text = "motion blur of a USD file: mean of N times while the shutter of its camera is open (default: none)"
-    group.add_argument("--shutter", type=positive, metavar="N", help=text)
-    group.add_argument("--fps", type=_fps, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
+    add("--shutter", type=positive, metavar="N", help=text)
+    add("--fps", type=above_zero, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
+
+
+def _add_pass_options(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add("--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together')
+    add("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
+    text = "render the passes, or the frames of a model, on the Dask cluster of this scheduler"
+    add("--dask", metavar="ADDRESS", help=text)
+    add("--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)")
+    text = 'write a reference for "compare": with the box filter, geometry AOVs and tolerances'
+    add("--reference", action="store_true", help=text)
+    add_tolerances(group, "tolerance to store with the reference; can be repeated")
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -114,14 +123,22 @@ def _render(options: argparse.Namespace) -> None:
     if not is_model and suffix != SCENE_SUFFIX and not options.scene.is_file():
         expected = f"a Mitsuba scene ({SCENE_SUFFIX}) or a model ({', '.join(FORMATS)})"
         raise ValueError(f'"{options.scene}" is not a file; expected {expected}')
+    # A worker of a cluster renders a frame as a whole.
+    on_cluster = options.dask and not (options.frames or options.turntable or options.shutter)
+    by_passes = bool(options.share or options.passes or options.reference or on_cluster)
     _validate(options, is_model)
+    _validate_passes(options, by_passes)
+    if options.denoise:
+        require_denoiser()
+        options.filter = BOX
+    _validate_output(options)
     set_variant(options.variant)
     with _settings(options):
-        (_render_model if is_model else _render_scene)(options)
+        (_render_model if is_model else _render_scene)(options, by_passes)
 
 
 def _validate(options: argparse.Namespace, is_model: bool) -> None:
-    """Refuse options that have no effect with this input, and outputs of an unknown kind."""
+    """Refuse options that have no effect with this input."""
     what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
     for name in useless:
@@ -131,19 +148,41 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
             flags = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance"}
             flag = flags.get(name, f"--{name.replace('_', '-')}")
             raise ValueError(f'{flag} was given for the {what} "{options.scene}"; expected it for {other}')
-    validate_pass_options(options)
-    if options.denoise:
-        require_denoiser()
-        options.filter = BOX
-    has_frames = options.turntable or options.frames
+
+
+def _validate_passes(options: argparse.Namespace, by_passes: bool) -> None:
+    """Refuse options for passes that contradict each other, or have no effect with the others."""
+    has_other_filter = options.filter not in (None, BOX)
+    all_options = "--pass, --passes, --dask or --reference"
+    if by_passes and options.output.suffix.lower() != ".exr":
+        raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which keeps the variance')
+    if options.share and (options.passes or options.dask):
+        raise ValueError("--pass renders one pass, --passes and --dask render all; expected one of them")
+    if options.reference and has_other_filter:
+        raise ValueError(f'references have the filter "{BOX}", not "{options.filter}"')
+    if options.denoise and by_passes:
+        removed = "the noise that passes and references measure"
+        raise ValueError(f"--denoise removes {removed}; expected no {all_options} beside it")
+    if options.denoise and has_other_filter:
+        raise ValueError(f'--denoise needs the filter "{BOX}", not "{options.filter}"')
+    if options.sensor and by_passes:
+        raise ValueError(f"--sensor is for whole images; expected no {all_options} beside it")
+    if options.batch and not by_passes:
+        raise ValueError(f"--batch is for passes; expected {all_options} beside it")
+    if options.tolerances and not options.reference:
+        raise ValueError("--tolerance is stored with a reference; expected --reference beside it")
+
+
+def _validate_output(options: argparse.Namespace) -> None:
+    """Refuse outputs of an unknown kind, and options for frames that contradict each other."""
+    suffix, has_frames = options.output.suffix.lower(), options.turntable or options.frames
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
-    if options.output.suffix.lower() not in known:
-        is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
-        more = ", or --turntable or --frames for a video" if is_video else ""
+    if suffix not in known:
+        more = ", or --turntable or --frames for a video" if suffix in VIDEO_SUFFIXES else ""
         raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(known)}{more}')
     if options.turntable and options.frames:
         raise ValueError("--turntable turns one model, --frames shows several; expected only one of them")
-    if options.fps and options.output.suffix.lower() not in VIDEO_SUFFIXES:
+    if options.fps and suffix not in VIDEO_SUFFIXES:
         raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(VIDEO_SUFFIXES)}")
     if options.passes and has_frames:
         raise ValueError("--passes are of one picture; expected no --frames or --turntable beside it")
@@ -172,10 +211,10 @@ def _settings(options: argparse.Namespace) -> Iterator[None]:
             mi.set_log_level(level)
 
 
-def _render_scene(options: argparse.Namespace) -> None:
+def _render_scene(options: argparse.Namespace, by_passes: bool) -> None:
     if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
-    if wants_passes(options):
+    if by_passes:
         render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
@@ -187,27 +226,26 @@ def _render_scene(options: argparse.Namespace) -> None:
     _write_image(options, render_picture(options, [loaded], options.spp), options.output)
 
 
-def _render_model(options: argparse.Namespace) -> None:
+def _render_model(options: argparse.Namespace, by_passes: bool) -> None:
     if not options.frames:
         if not options.scene.is_file():
             hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         require_writable(options.output, [options.scene])
-    if wants_passes(options):
-        render_by_passes(options, partial(load_still, as_data(options)))
-        return
-    if options.frames or options.turntable:
+    if by_passes:
+        render_by_passes(options, is_model=True)
+    elif options.frames or options.turntable:
         _write_frames(options)
-        return
-    _, image = next(pictures(options, [1]))
-    _write_image(options, image, options.output)
+    else:
+        _, image = next(pictures(options, [1]))
+        _write_image(options, image, options.output)
 
 
 def _write_frames(options: argparse.Namespace) -> None:
     """Render the missing frames, and join all to a video if requested."""
     is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
-        require_encoder(options.output)
+        _require_encoder(options.output)
     suffix = ".png" if is_video else options.output.suffix
     numbers = options.frames or range(1, options.turntable + 1)
     paths = {n: options.output.with_name(f"{options.output.stem}_{n:04d}{suffix}") for n in numbers}
@@ -216,12 +254,12 @@ def _write_frames(options: argparse.Namespace) -> None:
     if len(missing) < len(paths):
         there = len(paths) - len(missing)
         print_remark(f"{there} of {len(paths)} frames exist and are kept; remove them to render them again")
-    found = pictures(options, missing)
+    rendered = pictures(options, missing)
     for _ in counted(missing, "Frames"):
-        number, image = next(found)
+        number, image = next(rendered)
         _write_image(options, image, paths[number])
     if is_video:
-        write_video(options.output, list(paths.values()), options.fps or DEFAULT_FPS)
+        _write_video(options.output, list(paths.values()), options.fps or DEFAULT_FPS)
         print_result(options.output)
 
 
@@ -235,32 +273,19 @@ def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: 
     print_result(path)
 
 
-def _index(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f'"{text}"; expected an integer, 0 or more')
-    return int(text)
-
-
-def _fps(text: str) -> float:
-    number = finite(text)
-    if number <= 0:
-        raise argparse.ArgumentTypeError(f'"{text}"; expected a number above 0')
-    return number
-
-
 def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not found or not all(map(int, found.groups())):
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match or not all(map(int, match.groups())):
         raise argparse.ArgumentTypeError(f'"{text}"; expected width and height of 1 or more, such as 1280x720')
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def _frame_range(text: str) -> range:
-    found = re.fullmatch(r"(-?\d+):(-?\d+)(?::(\d+))?", text)
-    step = int(found[3] or 1) if found else 0
-    if not found or not step or int(found[1]) > int(found[2]):
+    match = re.fullmatch(r"(-?\d+):(-?\d+)(?::(\d+))?", text)
+    step = int(match[3] or 1) if match else 0
+    if not match or not step or int(match[1]) > int(match[2]):
         raise argparse.ArgumentTypeError(f'"{text}"; expected FIRST:LAST or FIRST:LAST:STEP, such as 1:24')
-    return range(int(found[1]), int(found[2]) + 1, step)
+    return range(int(match[1]), int(match[2]) + 1, step)
 
 
 def _assignment(text: str) -> tuple[str, str]:
@@ -270,7 +295,14 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
-def require_encoder(path: Path) -> None:
+def _share(text: str) -> tuple[int, int]:
+    number, _, count = text.partition("/")
+    if not (number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
+        raise argparse.ArgumentTypeError(f'"{text}"; expected I/N with I from 1 to N, such as 2/8')
+    return int(number), int(count)
+
+
+def _require_encoder(path: Path) -> None:
     """Raise ValueError if a package that writes a video is missing, before frames are rendered."""
     try:
         import imageio.v2  # noqa: F401 - only to find out whether it is there
@@ -284,12 +316,8 @@ def require_encoder(path: Path) -> None:
         ) from None
 
 
-def write_video(
-    path: Path,
-    frames: Sequence[Path],  # PNG files of one size
-    fps: float,  # Frames per second
-) -> None:
-    """Write images as a video, an animated GIF that repeats or an MP4 file."""
+def _write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
+    """Write PNG files of one size as a video, an animated GIF that repeats or an MP4 file."""
     import imageio.v2 as imageio
 
     # A GIF file repeats for ever, and its durations are milliseconds.

@@ -14,8 +14,7 @@ from typing import Any
 
 import pytest
 
-from ..llvm import best_variant
-from ..variants import variant_set
+from ..variants import chosen_variant, variant_set
 from . import ImageError, RegressionError
 from .compare import Comparison
 from .image import save_image
@@ -30,7 +29,7 @@ from .references import (
     variant_for,
 )
 from .report import write_report
-from .scene import SceneSource, require_variant
+from .scene import SceneSource
 from .tiers import Status, Tolerances
 
 
@@ -96,7 +95,7 @@ class RenderRegression:
         new_limits = Tolerances().with_values(tolerances or {})
 
         def write() -> None:
-            with variant_set(require_variant(variant or best_variant())):
+            with variant_set(chosen_variant(variant)):
                 sampling = Sampling.of_spp(reference_spp, batch)
                 save_image(path, render_reference(scene, path, given, sampling, new_limits))
 
@@ -114,7 +113,7 @@ class RenderRegression:
             # All scenes with a reference share the probability of a false alarm, whichever tests are run.
             suite_size = max(1, len(list(self.references.glob("*.exr"))))
             spp = max(1, round(spp * self.spp_scale))
-            with variant_set(require_variant(variant) if variant else variant_for(reference)):
+            with variant_set(chosen_variant(variant) if variant else variant_for(reference)):
                 found = compare_scene(reference, scene, tiers, spp, limits, suite_size, seed)
         except UnusableReference as problem:
             if self.update == "no":

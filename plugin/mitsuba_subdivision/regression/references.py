@@ -13,11 +13,12 @@ import numpy as np
 
 from ..llvm import best_variant
 from ..messages import PROGRAM
+from ..variants import variant_problem
 from . import ImageError, RegressionError
 from .compare import Comparison, compare
 from .image import Image, load_image, require_finite
 from .passes import Sampling, probe_scene, render_pass
-from .scene import BOX, SEEDS, SceneSource, load_scene, variant_problem
+from .scene import BOX, SEEDS, SceneSource, load_scene
 from .tiers import Status, Tolerances
 
 # Samples per pixel: four batches for a test, and 64 times as many for a reference.

@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ..llvm import llvm_problem, loaded_version
+from ..llvm import loaded_version
 from ..progress import timed
 from . import RegressionError
 
@@ -256,25 +256,6 @@ def environment(variant: str) -> dict[str, str]:
     if variant.startswith("llvm"):
         found["llvm"] = str(loaded_version())
     return found
-
-
-def require_variant(variant: str) -> str:
-    """Return the name of a variant that can run here. Raises RegressionError if it cannot."""
-    problem = variant_problem(variant)
-    if problem:
-        raise RegressionError(problem)
-    return variant
-
-
-def variant_problem(variant: str) -> str | None:
-    """Why a variant cannot run here, None if it can."""
-    if variant not in mi.variants():
-        return f'unknown variant "{variant}"; expected one of {", ".join(mi.variants())}'
-    if variant.startswith("llvm"):
-        return llvm_problem()
-    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        return f"variant {variant} needs an NVIDIA GPU, and Dr.Jit finds none"
-    return None
 
 
 def _processor() -> str:

@@ -1,6 +1,8 @@
-"""A still picture, a turntable and a range of frames of a cage or a stage, for the command ``render``.
+"""A still picture, a turntable and a range of frames of a scene source, for the command ``render``.
 
-Each has ``scene``, the entries of its first frame, ``numbers``, and ``frames``, which loads the scenes of some frames.
+Each has ``scene``, the entries of its first frame, and ``frames``, which loads the scenes of some frames, one after the
+other. A scene source builds scenes from contents at a time: `CageScenes` of one cage, or `StageScenes` of a whole USD
+file, which has the same methods.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -20,100 +22,44 @@ from ..cage import CageError, CageWarning
 from ..device_arrays import upload
 from ..regression.scene import LoadedScene, load_scene
 from ..variants import SceneNode
-from .camera import View, outermost, studio_axes, turned
+from .camera import outermost, studio_axes, turned
 from .polygon_mesh import points_at, with_meshes
 from .studio_entries import RIG
-
-C = TypeVar("C")
 
 PATTERN = re.compile(r"%(0\d+)?d")
 
 
-class SceneSource(Protocol[C]):
-    """Builds the scenes of a cage or a stage from its contents at a time and points that must be visible."""
-
-    name: str  # The cage or the stage as messages name it
-
-    def at(self, number: int | None = None) -> C:
-        """Contents of a frame; by default, of a still picture."""
-
-    def framing(self, contents: C) -> tuple[str, View, tuple[int, int]]:
-        """Axis that points up, view and size of the picture."""
-
-    def points(self, contents: C) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world that the studio's camera must see."""
-
-    def has_studio(self, contents: C) -> bool:
-        """Whether the camera or the lights are those of the studio, which depend on the points."""
-
-    def scene(
-        self,
-        contents: C,
-        # (n, 3): points that the camera must see in all frames; by default, the points of the contents
-        points: NDArray[np.float64] | None = None,
-        *,
-        # Whether only the scene's own sensor renders it, so that triangles may depend on the sensor
-        follows_sensor: bool = False,
-        # (4, 4) each: of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it
-        turns: Sequence[NDArray[np.float64]] = (),
-    ) -> SceneNode:
-        """Entries of a scene."""
-
-    def frames(
-        self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
-    ) -> Iterator[LoadedScene]:
-        """The scenes of some frames, loaded one after the other, for points that the camera must see in all frames.
-
-        Where the camera has a shutter, each frame has as many scenes as sub-frames.
-        """
-
-
 class StillPicture:
-    """One picture."""
+    """One picture of a source. If only the scene's own sensor renders it, triangles may depend on the sensor."""
 
-    numbers = (1,)
-
-    def __init__(
-        self,
-        source: SceneSource[C],
-        *,
-        follows_sensor: bool = True,  # Whether the scene is rendered by its own sensor only
-    ) -> None:
-        self.scene = source.scene(source.at(), follows_sensor=follows_sensor)
+    def __init__(self, source: Any, *, follows_sensor: bool = True) -> None:
+        self.scene: SceneNode = source.scene(source.at(), follows_sensor=follows_sensor)
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
-        """The scene, loaded."""
-        for _ in numbers:
-            yield load_quietly(self.scene, filter_name)
+        return (load_quietly(self.scene, filter_name) for _ in numbers)
 
 
 class Turntable:
-    """A cage or a stage that turns once around the middle of its bounds, with its own lights.
+    """A cage or a stage that turns once, in frames 1 to ``count``, around the middle of its bounds.
 
     In Mitsuba the model stands still: the camera turns around it the other way, with the lights and the backdrop of the
     studio. The studio's camera sees all of it in all frames. Frame 1 is the still picture; in the next ones, what is
-    shown is turned counter-clockwise, seen from above.
+    shown is turned counter-clockwise, seen from above, with its own lights.
     """
 
-    def __init__(
-        self,
-        source: SceneSource[C],
-        count: int,  # Number of frames
-        *,
-        follows_sensor: bool = True,  # Whether the scene is rendered by its own sensor only, which turns
-    ) -> None:
-        self.numbers, self._count = range(1, count + 1), count
-        contents = source.at()
+    def __init__(self, source: Any, count: int, *, follows_sensor: bool = True) -> None:
+        self._count, contents = count, source.at()
         points, framing = source.points(contents), source.framing(contents)
         self._axes = studio_axes(framing[0])
         in_studio = points @ self._axes
         bounds = np.stack([in_studio.min(axis=0), in_studio.max(axis=0)]) if len(points) else np.zeros((2, 3))
         self._pivot = self._axes @ bounds.mean(axis=0)
+        numbers = range(1, count + 1)
         if len(points):
-            turned_points = (points_at(points, self.matrix(number)) for number in self.numbers)
-            points = np.concatenate([outermost(each, *framing) for each in turned_points])
-        turns = [self.matrix(2 - number) for number in self.numbers] if follows_sensor else []
-        self.scene = source.scene(contents, points, turns=turns)
+            turned_points = (points_at(points, self.matrix(number)) for number in numbers)
+            points = np.concatenate([outermost(frame, *framing) for frame in turned_points])
+        turns = [self.matrix(2 - number) for number in numbers] if follows_sensor else []
+        self.scene: SceneNode = source.scene(contents, points, turns=turns)
 
     def matrix(self, number: float) -> NDArray[np.float64]:
         """Transform ``(4, 4)`` of the contents in frame ``number``."""
@@ -122,7 +68,7 @@ class Turntable:
         matrix[:3, :3], matrix[:3, 3] = linear, self._pivot - linear @ self._pivot
         return matrix
 
-    def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
+    def frames(self, numbers: Sequence[float], filter_name: str | None) -> Iterator[LoadedScene]:
         """The scene at each of these frames; it is loaded once."""
         loaded = load_quietly(self.scene, filter_name)
         parameters = mi.traverse(loaded.scene)
@@ -141,30 +87,22 @@ class FrameRange:
     Raises CageError, OSError if a frame cannot be read, or nothing is visible in any of them.
     """
 
-    def __init__(
-        self,
-        source: SceneSource[C],
-        numbers: range,  # Times or numbers of files
-    ) -> None:
+    def __init__(self, source: Any, numbers: range) -> None:
         self.numbers, self._source = numbers, source
         contents = source.at(numbers[0])
         framing, self._points = source.framing(contents), source.points(contents)
         if not len(self._points) or source.has_studio(contents):
-            found = [np.zeros((0, 3))]
-            for number in numbers:
-                points = source.points(source.at(number))
-                found += [outermost(points, *framing)] if len(points) else []
-            self._points = np.concatenate(found)
+            points = (source.points(source.at(number)) for number in numbers)
+            outer = [outermost(frame, *framing) for frame in points if len(frame)]
+            self._points = np.concatenate([np.zeros((0, 3)), *outer])
         if not len(self._points):
             raise CageError(f"{source.name}: nothing is visible in any frame; expected visible meshes")
 
     @cached_property
     def scene(self) -> SceneNode:
-        """Entries of the first frame."""
         return self._source.scene(self._source.at(self.numbers[0]), self._points)
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
-        """The scene at each of these frames."""
         return self._source.frames(numbers, self._points, filter_name)
 
 
@@ -210,7 +148,7 @@ class FrameFiles:
         """File of a frame."""
         if not self.are_many:
             return self._path
-        return self._path.with_name(PATTERN.sub(lambda found: found[0] % number, self._path.name, count=1))
+        return self._path.with_name(PATTERN.sub(lambda match: match[0] % number, self._path.name, count=1))
 
     def time(self, number: int) -> float | None:
         """Time code of a frame; None in files of their own."""

@@ -9,7 +9,7 @@ import warnings
 import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -39,15 +39,12 @@ WIRE_COLOUR = (0.015, 0.05, 0.12)
 WIRE_RATE = 2
 
 
-class PosedModel(NamedTuple):
-    """A model with control points of a frame, ``(n, 3)`` float64."""
-
-    model: Model
-    positions: NDArray[np.float64]
+# A model with control points of a frame, ``(n, 3)`` float64.
+PosedModel = tuple[Model, NDArray[np.float64]]
 
 
 class CageScenes:
-    """A `SceneSource` of one cage in the studio.
+    """Scene source of one cage in the studio: its contents at a time, and scenes of these.
 
     Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
     stay. Each file is read once: its control points are kept in a temporary file.
@@ -84,45 +81,48 @@ class CageScenes:
         """The cage of a frame; by default, of the file or in memory."""
         if number is None:
             model = Model(self._cage, prim=self._prim, time=self._time, scheme=self._scheme)
-            return PosedModel(model, model.cage.positions)
+            return model, model.cage.positions
         if number not in self._offsets:
             return self._read(number)
         self._kept.seek(self._offsets[number])
-        found = pickle.load(self._kept)
-        if not isinstance(found, CageContents):
-            return PosedModel(self._model, found)
+        kept = pickle.load(self._kept)
+        if not isinstance(kept, CageContents):
+            return self._model, kept
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
-            model = self._model_of(number, found)
-        return PosedModel(model, model.cage.positions)
+            model = self._model_of(number, kept)
+        return model, model.cage.positions
 
     def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
         """Axis that points up, view and size of the picture."""
-        return self._look.up or contents.model.up, self._look.view, self._size
+        return self._look.up or contents[0].up, self._look.view, self._size
 
     def points(self, contents: PosedModel) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` of the limit surface, and of the cage if it is drawn."""
+        """Points ``(n, 3)`` in the world that the camera must see: the limit surface, and the cage if it is drawn."""
         model, positions = contents
         points = model.points if positions is model.cage.positions else model.limit_points(positions)
         return np.concatenate([points, model.wire.positions(positions)]) if self._look.cage else points
 
     def has_studio(self, contents: PosedModel) -> bool:  # noqa: ARG002 - as all sources have it
-        """A cage has neither camera nor lights."""
+        """Whether the camera or the lights are those of the studio, which depend on the points: of a cage they are."""
         return True
 
     def scene(
         self,
         contents: PosedModel,
+        # (n, 3): points that the camera must see in all frames; by default, the points of the contents
         points: NDArray[np.float64] | None = None,
         *,
+        # Whether only the scene's own sensor renders it, so that triangles may depend on the sensor
         follows_sensor: bool = False,
+        # (4, 4) each: of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it
         turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
     ) -> SceneNode:
         """Entries of a scene: "surface", "cage" if it is drawn, and those of the studio.
 
         Raises CageError if ``checker`` is set, and there are no texture coordinates.
         """
-        look, model = self._look, contents.model
+        look, (model, _) = self._look, contents
         if look.checker and model.cage.texcoords is None:
             raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
         points = self.points(contents) if points is None else points
@@ -137,16 +137,20 @@ class CageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames; frames with the first frame's topology share one loaded scene."""
-        scene = self.scene(PosedModel(self._model, self._model.cage.positions), points)
-        loaded = None
+        """The scenes of some frames; frames with the first frame's topology share one loaded scene.
+
+        Where the camera has a shutter, which a cage has not, each frame has as many scenes as sub-frames.
+        """
+        scene = self.scene((self._model, self._model.cage.positions), points)
+        shared = None
         for number in numbers:
             model, positions = self.at(number)
+            loaded = shared if model is self._model else None
+            loaded = loaded or load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
             if model is not self._model:
-                yield load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
+                yield loaded
                 continue
-            if loaded is None:
-                loaded = load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
+            shared = loaded
             surfaces = [name for name in scene if re.fullmatch(r"surface(_\d+)?", name)]
             moved = {f"{name}.control_points": positions for name in surfaces}
             if self._look.cage:
@@ -164,17 +168,17 @@ class CageScenes:
         if self._first is not None and same_topology(contents, self._first):
             positions = np.asarray(contents.positions, dtype=np.float64)
             pickle.dump(positions, self._kept)
-            return PosedModel(self._model, positions)
+            return self._model, positions
         # Frames of the same topology have the same warnings.
-        for each in caught:
-            warn(str(each.message))
+        for warning in caught:
+            warn(str(warning.message))
         model = self._model_of(number, contents)
         if self._first is None:
             self._first, self._model = contents, model
             pickle.dump(model.cage.positions, self._kept)
         else:
             pickle.dump(contents, self._kept)
-        return PosedModel(model, model.cage.positions)
+        return model, model.cage.positions
 
     def _model_of(self, number: int, contents: CageContents) -> Model:
         time = self._files.time(number)
@@ -190,13 +194,8 @@ class CageScenes:
         if not look.cage:
             return surfaces
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}}
-        wire = {
-            "type": "subdivision",
-            **model.wire.cage.as_properties(mi),
-            "tessellation_rate": WIRE_RATE,
-            "bsdf": bsdf,
-        }
-        return {**surfaces, "cage": wire}
+        wire = {"type": "subdivision", **model.wire.cage.as_properties(mi), "tessellation_rate": WIRE_RATE}
+        return {**surfaces, "cage": {**wire, "bsdf": bsdf}}
 
 
 def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
