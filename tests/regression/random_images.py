@@ -1,8 +1,7 @@
 """Images made of random numbers instead of renders."""
 
 import numpy as np
-from mitsuba_subdivision.regression.image import Estimate, Image, combine
-from mitsuba_subdivision.regression.probe import Probe
+from mitsuba_subdivision.regression.image import Estimate, Image, Probe, combine
 
 SIZE = 32
 # Standard deviation of a sample, in parts of its mean.

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
-from ..regression.probe import normal_angle
 from ..regression.scene import render_pixels
+from ..regression.tier_tests import normal_angle
 from ..surface import LimitSurface
 from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
 from .own_cage import around_vertices, frame

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from . import ImageError
 from .image import Image
-from .probe import compare_probes
-from .radiance_tiers import compare_flip, compare_paired, compare_tiles
-from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, pixel_of_largest, skipped_without
+from .tier_tests import compare_flip, compare_paired, compare_probes, compare_tiles, pixel_of_largest
+from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +143,7 @@ def compare(
             return Comparison(reference, test, Status.FAIL, [result], [], _worst(reference, test, [result]), limits)
 
     compared_by: dict[str, Callable[[], TierResult]] = {
-        "probe": lambda: _compare_probes(reference, test, limits),
+        "probe": lambda: compare_probes(reference, test, limits),
         "paired": lambda: compare_paired(reference, test, limits),
         "tile": lambda: compare_tiles(reference, test, limits, suite_size),
         "flip": lambda: compare_flip(reference, test, limits),
@@ -167,12 +166,6 @@ def compare(
 def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float:
     """Mean of ``(a - b)^2 / (b^2 + 0.01)`` over pixels and channels, where b is the reference."""
     return float(np.mean((test - reference) ** 2 / (reference**2 + 0.01)))
-
-
-def _compare_probes(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
-    if reference.probe is None or test.probe is None:
-        return skipped_without("probe", reference.probe, test.probe, "geometry probe (channels P, Ns, uv, prim)")
-    return compare_probes(reference.probe, test.probe, tolerances)
 
 
 def _decide(

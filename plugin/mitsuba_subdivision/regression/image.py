@@ -18,14 +18,19 @@ from numpy.typing import NDArray
 
 from ..whole_file import whole_file
 from . import ImageError
-from .probe import Probe
 
 SCHEMA = 1
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
+# Index that stands for no shape, no triangle or no element.
+NOTHING = 2**32 - 1
 
 Channels = dict[str, NDArray]
 
 _RGB = ("R", "G", "B")
+# Channels of the fields of a probe.
+_FLOATS = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
+_INTEGERS = {"shape": "shape", "triangle": "prim", "element": "element"}
+_PROBE_CHANNELS = (*(name for names in _FLOATS.values() for name in names), *_INTEGERS.values())
 _MAGIC = b"\x76\x2f\x31\x01"
 _LONGEST = 60
 _quieting = threading.Lock()
@@ -71,12 +76,7 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
     """Combine estimates with independent samples into one, in double precision.
 
     The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
-    same order, the same estimates give the same bits.
-
-    Raises
-    ------
-    ImageError
-        If there is no estimate, or their sizes differ.
+    same order, the same estimates give the same bits. Raises ImageError if there is no estimate, or their sizes differ.
     """
     rest = iter(estimates)
     total = next(rest, None)
@@ -97,6 +97,47 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
             squares = squares + squares_within + step**2 * share * total.count[..., None]
             total = Estimate(total.mean + step * share, squares / (batches - 1), count, batches)
     return total
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """The geometry probe: AOVs of the first hits of the rays through pixel centres, which have no noise.
+
+    Attributes
+    ----------
+    position, normal : (height, width, 3) float32
+        In world space; the normal is the shading normal, of unit length. Zero where the ray hits nothing.
+    uv : (height, width, 2) float32
+        Surface parameters by the renderer: for a mesh without texture coordinates, those of the triangle.
+    shape, triangle, element : (height, width) uint32
+        Indices of the shape, of the triangle, and of the face of the cage that the triangle belongs to; `NOTHING` where
+        there is none.
+    """
+
+    position: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    uv: NDArray[np.float32]
+    shape: NDArray[np.uint32]
+    triangle: NDArray[np.uint32]
+    element: NDArray[np.uint32]
+
+    @property
+    def hit(self) -> NDArray[np.bool_]:
+        """Pixels whose ray hits something."""
+        return self.shape != NOTHING
+
+    def channels(self) -> Channels:
+        """Channels of an OpenEXR file."""
+        floats = {n: getattr(self, name)[..., i] for name, names in _FLOATS.items() for i, n in enumerate(names)}
+        return floats | {n: getattr(self, name) for name, n in _INTEGERS.items()}
+
+    def describe(self, y: int, x: int) -> str:
+        """Text of the first hit of the ray through a pixel."""
+        if not self.hit[y, x]:
+            return "its ray hits nothing"
+        u, v = self.uv[y, x]
+        element = "" if self.element[y, x] == NOTHING else f"element {self.element[y, x]}, "
+        return f"{element}triangle {self.triangle[y, x]} of shape {self.shape[y, x]}, (u, v) = ({u:.4f}, {v:.4f})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,12 +173,12 @@ class Image:
 
     def channels(self) -> Channels:
         """Channels of an OpenEXR file, in single precision."""
-        found = _rgb_channels("", self.pixels)
+        channels = _rgb_channels("", self.pixels)
         if self.estimate is not None:
-            found |= _rgb_channels("variance.", self.estimate.variance) | {"N": self.estimate.count}
+            channels |= _rgb_channels("variance.", self.estimate.variance) | {"N": self.estimate.count}
         if self.paired is not None:
-            found |= _rgb_channels("paired.", self.paired)
-        return found | (self.probe.channels() if self.probe is not None else {})
+            channels |= _rgb_channels("paired.", self.paired)
+        return channels | (self.probe.channels() if self.probe is not None else {})
 
     def not_finite(self) -> tuple[str, tuple[int, int]] | None:
         """Values that are not finite, in words, and row and column of the first; None if there are none."""
@@ -153,13 +194,7 @@ class Image:
 
 
 def require_finite(image: Image) -> None:
-    """Refuse an image with values that are not finite, which merging would spread, and no tier can compare.
-
-    Raises
-    ------
-    ImageError
-        If there are any; the message names the first.
-    """
+    """Raise ImageError if an image has values that are not finite, which merging spreads and no tier can compare."""
     broken = image.not_finite()
     if broken:
         raise ImageError(f'image "{image.name}" is not finite: {broken[0]}')
@@ -175,10 +210,8 @@ def save_image(path: str | Path, image: Image) -> None:
 def load_image(path: str | Path) -> Image:
     """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
 
-    Raises
-    ------
-    ImageError
-        If the file cannot be read, channels are missing, or the number of samples or the variance is impossible.
+    Raises ImageError if the file cannot be read, channels are missing, or the number of samples or the variance is
+    impossible.
     """
     channels, metadata = read_channels(path)
     source = str(path)
@@ -191,8 +224,7 @@ def load_image(path: str | Path) -> Image:
         )
     _require_metadata(metadata, source)
     estimate = _estimate(channels, pixels, metadata, source)
-    paired, probe = _rgb(channels, "paired.", source), Probe.from_channels(channels, source)
-    return Image(source, pixels, estimate, paired, probe, metadata)
+    return Image(source, pixels, estimate, _rgb(channels, "paired.", source), _probe(channels, source), metadata)
 
 
 def _estimate(
@@ -216,6 +248,17 @@ def _estimate(
     return Estimate(pixels, variance, count, batches)
 
 
+def _probe(channels: Channels, source: str) -> Probe | None:
+    missing = [name for name in _PROBE_CHANNELS if name not in channels]
+    if len(missing) == len(_PROBE_CHANNELS):
+        return None
+    if missing:
+        expected = f"without {', '.join(missing)}; expected {', '.join(_PROBE_CHANNELS)}"
+        raise ImageError(f'image "{source}" has a geometry probe {expected}')
+    floats: dict[str, Any] = {name: np.stack([channels[n] for n in ns], axis=-1) for name, ns in _FLOATS.items()}
+    return Probe(**floats, **{name: channels[n] for name, n in _INTEGERS.items()})
+
+
 def _rgb_channels(prefix: str, values: NDArray[np.floating]) -> Channels:
     return {f"{prefix}{name}": values[..., i].astype(np.float32) for i, name in enumerate(_RGB)}
 
@@ -232,52 +275,39 @@ def _rgb(channels: Channels, prefix: str, source: str) -> NDArray[np.float64] | 
 
 def _require_metadata(metadata: dict[str, Any], source: str) -> None:
     """Refuse metadata of another form than `save_image` writes. Any entry may be missing."""
-    for name, (is_right, expected) in _FORMS.items():
+
+    def are_texts(value: Any) -> bool:
+        return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+    def has_integers(value: Any, **least: int) -> bool:
+        return isinstance(value, dict) and all(type(value.get(k)) is int and value[k] >= n for k, n in least.items())
+
+    def is_sampling(value: Any) -> bool:
+        ranges = value.get("batches") if has_integers(value, seed=0, batch=1) else None
+        if not isinstance(ranges, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in ranges):
+            return False
+        ends = [end for pair in ranges for end in pair]
+        if not (ends and all(type(end) is int and end >= 0 for end in ends) and ends == sorted(ends)):
+            return False
+        # Files of older versions have neither of these.
+        counts = {"total": ends[-1], "passes": 1, **value}
+        is_whole = has_integers(counts, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
+        return is_whole and all(start < end for start, end in ranges)
+
+    forms = {
+        "sampling": (is_sampling, "a seed, the samples of a batch, and ranges of batches"),
+        "paired": (lambda value: has_integers(value, seed=0, spp=1), "a seed and samples per pixel"),
+        **dict.fromkeys(("variant", "filter"), (lambda value: isinstance(value, str), "a name")),
+        "files": (are_texts, "checksums by name"),
+        "parameters": (are_texts, "values by name"),
+        "environment": (are_texts, "versions by name"),
+        "tolerances": (lambda value: isinstance(value, dict), "numbers by name"),
+    }
+    for name, (is_right, expected) in forms.items():
         if name in metadata and not is_right(metadata[name]):
-            found = str(metadata[name])
-            shown = found[:_LONGEST] + ".." * (len(found) > _LONGEST)
+            text = str(metadata[name])
+            shown = text[:_LONGEST] + ".." * (len(text) > _LONGEST)
             raise ImageError(f'metadata of image "{source}": {name} is {shown}; expected {expected}')
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, dict) and all(map(_is_text, value.values()))
-
-
-def _are_integers(value: Any, **least: int) -> bool:
-    """Whether a dictionary has these integers, each of at least the value given."""
-    return isinstance(value, dict) and all(type(value.get(key)) is int and value[key] >= n for key, n in least.items())
-
-
-def _is_sampling(value: Any) -> bool:
-    if not _are_integers(value, seed=0, batch=1) or not _are_ranges(value.get("batches")):
-        return False
-    # Files of older versions have neither of these.
-    counts = {"total": value["batches"][-1][1], "passes": 1, **value}
-    return _are_integers(counts, total=value["batches"][-1][1], passes=1) and counts["passes"] <= counts["total"]
-
-
-def _are_ranges(value: Any) -> bool:
-    if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
-        return False
-    ends = [end for pair in value for end in pair]
-    are_integers = bool(ends) and all(type(end) is int and end >= 0 for end in ends)
-    return are_integers and ends == sorted(ends) and all(a < b for a, b in value)
-
-
-_FORMS = {
-    "sampling": (_is_sampling, "a seed, the samples of a batch, and ranges of batches"),
-    "paired": (lambda value: _are_integers(value, seed=0, spp=1), "a seed and samples per pixel"),
-    "variant": (_is_text, "a name"),
-    "filter": (_is_text, "a name"),
-    "files": (_are_texts, "checksums by name"),
-    "parameters": (_are_texts, "values by name"),
-    "environment": (_are_texts, "versions by name"),
-    "tolerances": (lambda value: isinstance(value, dict), "numbers by name"),
-}
 
 
 def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
@@ -313,11 +343,8 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
-    Raises
-    ------
-    ImageError
-        If there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep pixels or broken
-        metadata.
+    Raises ImageError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep
+    pixels or broken metadata.
     """
     path = Path(path)
     if not path.is_file():
@@ -325,21 +352,17 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     try:
         with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = len(file.parts)
-            if not parts:
-                raise RuntimeError("its pixels cannot be read")
-            if parts != 1:
-                raise ImageError(
-                    f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part'
-                )
-            header = dict(file.header())
-            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except ImageError:
-        raise
+            # A file whose pixels cannot be read has none.
+            header = dict(file.header()) if parts == 1 else {}
+            channels = {n: np.array(c.pixels) for n, c in file.channels().items()} if parts == 1 else {}
     except (RuntimeError, ValueError, OSError):
+        parts = 0
+    if not parts:
         with path.open("rb") as start:
             is_exr = start.read(len(_MAGIC)) == _MAGIC
-        problem = "is truncated, or damaged" if is_exr else "is not an OpenEXR file"
-        raise ImageError(f'image "{path}" {problem}') from None
+        raise ImageError(f'image "{path}" {"is truncated, or damaged" if is_exr else "is not an OpenEXR file"}')
+    if parts > 1:
+        raise ImageError(f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part')
     if any(values.dtype == object or values.ndim != 2 for values in channels.values()):
         raise ImageError(f'image "{path}" has deep or subsampled channels; expected one value per pixel')
     try:

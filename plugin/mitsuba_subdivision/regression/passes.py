@@ -18,8 +18,7 @@ from .. import __version__
 from ..progress import timed
 from ..variants import set_variant
 from . import RegressionError
-from .image import Estimate, Image, combine
-from .probe import NOTHING, Probe
+from .image import NOTHING, Estimate, Image, Probe, combine
 from .scene import SEEDS, LoadedScene, environment, render_pixels
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import ImageError
 
-# Names, and what each compares. The functions are in `compare`.
+# Names, and what each compares. The functions are in `tier_tests`.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
     "paired": "pixels from the same samples, which must be the same",
@@ -47,24 +47,6 @@ class TierResult:
     worst: tuple[int, int] | None = None
     # Values of every pixel, (height, width), for the report.
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
-
-
-def skipped(name: str, reason: str) -> TierResult:
-    """Result of a tier that cannot compare these images."""
-    return TierResult(name, Status.SKIPPED, [reason])
-
-
-def skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
-    """Result of a tier that needs data of both images that at least one of them lacks."""
-    if reference is None and test is None:
-        return skipped(name, f"the images have no {what}")
-    return skipped(name, f"the {'reference' if reference is None else 'test'} has no {what}")
-
-
-def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
-    """Row and column of the largest value of a map ``(height, width)``."""
-    row, column = np.unravel_index(np.argmax(values), values.shape)
-    return int(row), int(column)
 
 
 @dataclass(frozen=True)

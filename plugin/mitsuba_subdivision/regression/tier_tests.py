@@ -1,4 +1,4 @@
-"""The tiers that compare pixels: the same samples, noise in tiles of several sizes, and what an eye sees."""
+"""The tests of the tiers: geometry probes, the same samples, noise in tiles of several sizes, and what an eye sees."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from . import ImageError
 from .image import Estimate, Image
-from .tiers import Status, TierResult, Tolerances, pixel_of_largest, skipped, skipped_without
+from .tiers import Status, TierResult, Tolerances
 
 # The difference of a pixel that is darker than this part of the image's mean is taken relative to that part.
 DARK = 1e-3
@@ -34,6 +34,98 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)
 _MOST_STOPS = 12
 
 
+def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
+    """Row and column of the largest value of a map ``(height, width)``."""
+    row, column = np.unravel_index(np.argmax(values), values.shape)
+    return int(row), int(column)
+
+
+def _skipped(name: str, reason: str) -> TierResult:
+    return TierResult(name, Status.SKIPPED, [reason])
+
+
+def _skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
+    """Result of a tier that needs data of both images that at least one of them lacks."""
+    lacking = "images have" if reference is test is None else "reference has" if reference is None else "test has"
+    return _skipped(name, f"the {lacking} no {what}")
+
+
+def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolerances) -> TierResult:
+    """Compare the geometry probes of two images.
+
+    Normals, points and parameters are compared away from silhouettes. At a silhouette, where a pixel or one of its
+    eight neighbours hits another shape than its own neighbours or than the other probe, rounding decides what is hit.
+    Other triangles of the same surface are only a warning, since a mesh may be numbered in another order.
+    """
+    from scipy.ndimage import binary_dilation, generate_binary_structure, morphological_gradient
+
+    reference, test = reference_image.probe, test_image.probe
+    if reference is None or test is None:
+        return _skipped_without("probe", reference, test, "geometry probe (channels P, Ns, uv, prim)")
+    pixels = reference.shape.size
+    both = reference.hit & test.hit
+    other_shape = reference.shape != test.shape
+    shapes = np.stack([reference.shape, test.shape])
+    # Pixels beside, above or below a pixel that hits another shape; then these and their eight neighbours.
+    cross = generate_binary_structure(2, 1)[None]
+    edges = (morphological_gradient(shapes, footprint=cross, mode="nearest") > 0).any(axis=0) | other_shape
+    inside = both & ~binary_dilation(edges, generate_binary_structure(2, 2))
+    same_triangle = inside & (reference.triangle == test.triangle)
+    other_element = inside & (reference.element != test.element)
+
+    angle = np.where(both, normal_angle(reference.normal, test.normal), 0)
+    points = reference.position[reference.hit].astype(np.float64)
+    diagonal = (float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0) or 1.0
+    distance = np.linalg.norm(reference.position.astype(float) - test.position, axis=-1) / diagonal
+    parameters = np.abs(reference.uv.astype(float) - test.uv).max(axis=-1)
+    other_triangle = float((inside & ~same_triangle).sum() / pixels)
+
+    numbers = {
+        "mask_fraction": float(other_shape.sum() / pixels),
+        "element_fraction": float(other_element.sum() / pixels),
+        "angle_p999": _percentile(angle[inside]),
+        "angle_max": float(angle[inside].max(initial=0)),
+        "position": float(distance[inside].max(initial=0)),
+        "uv_p999": _percentile(parameters[same_triangle]),
+        "triangle_fraction": other_triangle,
+    }
+    # Each measurement's name, limit, text, and value at each pixel.
+    criteria = [
+        ("mask_fraction", tolerances.mask_fraction, "of the pixels hit another shape", other_shape),
+        ("element_fraction", tolerances.mask_fraction, "of the pixels hit another element", other_element),
+        ("angle_p999", tolerances.angle_p999, "degrees between normals, 99.9th percentile", angle * inside),
+        ("angle_max", tolerances.angle_max, "degrees between normals, maximum", angle * inside),
+        ("position", tolerances.position, f"of the diagonal {diagonal:.4g} between hit points", distance * inside),
+        ("uv_p999", tolerances.uv_p999, "between surface parameters, 99.9th percentile", parameters * same_triangle),
+    ]
+    broken = [criterion for criterion in criteria if not numbers[criterion[0]] <= criterion[1]]
+    worst, status = None, Status.PASS
+    lines = [
+        f"same shapes and elements, normals within {numbers['angle_max']:.2g} degrees, "
+        f"points within {numbers['position']:.2g} of the diagonal"
+    ]
+    if broken:
+        status, worst = Status.FAIL, pixel_of_largest(np.nan_to_num(broken[0][3], nan=np.inf))
+        lines = [f"{numbers[name]:.3g} {what}; at most {limit:.3g} expected" for name, limit, what, _ in broken]
+    elif other_triangle > tolerances.mask_fraction:
+        status = Status.WARN
+        lines = [f"{other_triangle:.3g} of the pixels hit another triangle of the same element"]
+    return TierResult("probe", status, lines, numbers, worst, {"angle": np.where(inside, angle, np.nan)})
+
+
+def normal_angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Angle in degrees between unit vectors, accurate for tiny angles. Not a number where one of them is zero."""
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+        b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def _percentile(values: NDArray[np.floating]) -> float:
+    return float(np.percentile(values, 99.9)) if values.size else 0.0
+
+
 def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
     """Compare the first batches of two images, which are drawn from the same samples.
 
@@ -42,10 +134,10 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
     """
     if reference.paired is None or test.paired is None:
         what = "first batch to pair (channels paired.R, paired.G, paired.B)"
-        return skipped_without("paired", reference.paired, test.paired, what)
+        return _skipped_without("paired", reference.paired, test.paired, what)
     reason = _different_samples(reference, test)
     if reason:
-        return skipped("paired", reason)
+        return _skipped("paired", reason)
     difference = np.abs(test.paired - reference.paired)
     size = np.maximum(np.abs(reference.paired), DARK * np.abs(reference.paired).mean())
     relative = difference / np.where(size > 0, size, 1)
@@ -117,10 +209,10 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     """
     expected, found = reference.estimate, test.estimate
     if expected is None or found is None:
-        return skipped_without("tile", expected, found, "channels variance.R, .G, .B and N")
+        return _skipped_without("tile", expected, found, "channels variance.R, .G, .B and N")
     for estimate, role in ((expected, "reference"), (found, "test")):
         if estimate.batches < 2:
-            return skipped("tile", f"the {role} has one batch only, which gives no variance")
+            return _skipped("tile", f"the {role} has one batch only, which gives no variance")
     height, width, _ = expected.mean.shape
     scales, failing, evidence = {}, [], {}
     for scale in SCALES:
