@@ -53,18 +53,21 @@ def variant_problem(name: str) -> str | None:
 
 
 def chosen_variant(name: str | None) -> str:
-    """A variant that was asked for, or else the best. Raises ValueError if it cannot run here."""
-    problem = variant_problem(name) if name else None
-    if problem:
+    """A variant that was asked for, or else the best. Raises ValueError, RuntimeError if it cannot run here."""
+    if name is None:
+        return best_variant()
+    if name.startswith("llvm"):
+        require_llvm()
+    if problem := variant_problem(name):
         raise ValueError(problem)
-    return name or best_variant()
+    return name
 
 
 def set_variant(name: str | None) -> None:
     """Set a variant of Mitsuba, or else the best, in a process of this package, such as a command.
 
     On a machine with one core, Dr.Jit starts a thread more: without one, Mitsuba 3.9 waits for ever when it reads or
-    writes OpenEXR files. Raises ValueError if the variant cannot run here.
+    writes OpenEXR files. Raises as `chosen_variant` does.
     """
     import drjit as dr
     import mitsuba
