@@ -115,7 +115,6 @@ def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
 @pytest.mark.parametrize("longer", [-2, 0])
 def test_parallel_tangents_have_no_normal_and_no_derivatives(longer):
     du = vector((1, 2, 4))
-    normal = UnitNormal(du, longer * du)
-    assert not numbers(normal.exists)[0]
+    normal = UnitNormal(du, longer * du, 0, du)
     for found in (normal.value, normal.forward(vector((1, 0, 0)), vector((0, 1, 0))), *normal.backward(du)):
         np.testing.assert_array_equal(np.array(found), 0)

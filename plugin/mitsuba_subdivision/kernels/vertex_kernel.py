@@ -60,14 +60,14 @@ class VertexKernel:
         """
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
-        padded, buffers = self._padded(control_points), self._vectors()
+        padded, buffers = self._padded(control_points), self._buffers()
         for part in self._parts:
             part.evaluate(padded, buffers)
         return EvaluatedVertices(self, control_points, *buffers)
 
-    def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+    def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, ...]:
         """Directional derivatives of points and normals for a change of the control points; flat, detached."""
-        padded, padded_change, buffers = self._padded(control_points), self._padded(change), self._vectors()
+        padded, padded_change, buffers = self._padded(control_points), self._padded(change), self._buffers()
         for part in self._parts:
             part.evaluate(padded, buffers, padded_change)
         return buffers
@@ -91,8 +91,8 @@ class VertexKernel:
         """Positions that are bitwise equal on both sides of a crease, see `VertexTable.weld_target`."""
         return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
 
-    def _vectors(self) -> tuple[FloatBuffer, FloatBuffer]:
-        return dr.empty(self._types.float, 3 * self.vertex_count), dr.empty(self._types.float, 3 * self.vertex_count)
+    def _buffers(self) -> tuple[FloatBuffer, ...]:
+        return tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(2))
 
 
 class _Part:
@@ -114,38 +114,33 @@ class _Part:
         # Whether each polynomial has one vertex, as on planes: then a loop would take longer to trace than to run.
         self._are_single = len(part.kind) == len(part.block) and bool((np.diff(part.first_entry)[part.kind] == 1).all())
 
-    def evaluate(
-        self, padded: FloatBuffer, buffers: Sequence[FloatBuffer], padded_change: FloatBuffer | None = None
-    ) -> None:
+    def evaluate(self, padded: FloatBuffer, buffers: Sequence[FloatBuffer], change: FloatBuffer | None = None) -> None:
         """Scatter points and normals, or their directional derivatives for a change of the control points."""
         coefficients, *bound = self._coefficients(padded)
-        change = None if padded_change is None else self._blocks.vectors(padded_change)[0]
+        changes = None if change is None else self._blocks.vectors(change)[0]
 
-        def add(vertex: Index, s: Float, t: Float) -> tuple:
+        def add(vertex, s, t):
             p, du, dv = self._monomials.values(coefficients, s, t)
             normal = UnitNormal(du, dv, *bound)
-            vectors = p, normal.value
-            if change is not None:
-                p, change_u, change_v = self._monomials.values(change, s, t)
-                vectors = p, normal.forward(change_u, change_v)
-            for buffer, value in zip(buffers, vectors, strict=True):
+            n = normal.value
+            if changes is not None:
+                p, change_u, change_v = self._monomials.values(changes, s, t)
+                n = normal.forward(change_u, change_v)
+            for buffer, value in zip(buffers, (p, n), strict=True):
                 dr.scatter(buffer, value, vertex, mode=NO_CONFLICTS)
             return ()
 
         self._loop((), add, "vertices")
 
-    def add_transposed(
-        self, padded: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer, sums: FloatBuffer
-    ) -> None:
+    def add_transposed(self, padded: FloatBuffer, by_p: FloatBuffer, by_n: FloatBuffer, sums: FloatBuffer) -> None:
         """Scatter-add gradients by padded control points, from the gradients by points and normals."""
         types = self._types
         coefficients, *bound = self._coefficients(padded)
 
-        def add(vertex: Index, s: Float, t: Float, *gradients: Vector3) -> tuple:
+        def add(vertex, s, t, *gradients):
             _, du, dv = self._monomials.values(coefficients, s, t)
-            p: Vector3 = dr.gather(types.vector3, positions, vertex)
-            normal: Vector3 = dr.gather(types.vector3, normals, vertex)
-            by_u, by_v = UnitNormal(du, dv, *bound).backward(normal)
+            p, n = (dr.gather(types.vector3, buffer, vertex) for buffer in (by_p, by_n))
+            by_u, by_v = UnitNormal(du, dv, *bound).backward(n)
             totals = []
             for (monomial, monomial_s, monomial_t), gradient in zip(self._monomials.each(s, t), gradients, strict=True):
                 total = dr.fma(p, monomial, gradient)
@@ -169,33 +164,31 @@ class _Part:
         types = self._types
         lane: Index = dr.arange(types.index, self._blocks.count)
 
-        def range_of(table: IndexBuffer, index: Index) -> tuple[Index, Index]:
-            return dr.gather(types.index, table, index), dr.gather(types.index, table, index + 1)
+        def range_of(run):
+            """The first vertex of a run, and its entries."""
+            kind, first_vertex = (dr.gather(types.index, column, run) for column in (self._kind, self._first_vertex))
+            return first_vertex, *(dr.gather(types.index, self._first_entry, kind + end) for end in (0, 1))
 
-        def add_entry(first_vertex: Index, entry: Index, *state) -> tuple:
+        def add_entry(first_vertex, entry, *state):
             vertex = first_vertex + dr.gather(types.index, self._offset, entry)
             s, t = dr.gather(types.vector2, self._st, entry)
             return add(vertex, s, t, *state)
 
-        def vertices_of_run(run: Index) -> tuple[Index, Index, Index]:
-            kind, first_vertex = (dr.gather(types.index, column, run) for column in (self._kind, self._first_vertex))
-            return first_vertex, *range_of(self._first_entry, kind)
-
-        def add_run(run: Index, *state) -> tuple:
-            first_vertex, first_entry, last_entry = vertices_of_run(run)
-            _, *final_state = dr.while_loop(
-                (first_entry, *state),
-                lambda entry, *_: entry < last_entry,
+        def add_run(run, *state):
+            first_vertex, entry, end = range_of(run)
+            _, *state = dr.while_loop(
+                (entry, *state),
+                lambda entry, *_: entry < end,
                 lambda entry, *state: (entry + 1, *add_entry(first_vertex, entry, *state)),
                 label=f"{label}_of_run",
             )
-            return run + 1, *final_state
+            return run + 1, *state
 
         if self._are_single:
-            return add_entry(*vertices_of_run(lane)[:2], *start)
-        first_run, last_run = range_of(self._first_run, lane)
-        _, *final_state = dr.while_loop((first_run, *start), lambda run, *_: run < last_run, add_run, label=label)
-        return tuple(final_state)
+            return add_entry(*range_of(lane)[:2], *start)
+        run, end = (dr.gather(types.index, self._first_run, lane + end) for end in (0, 1))
+        _, *state = dr.while_loop((run, *start), lambda run, *_: run < end, add_run, label=label)
+        return tuple(state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,29 +249,25 @@ class UnitNormal:
         # Rounding error of a tangent, relative to the extent of the points that it is a sum of: their largest distance
         # from the first one, along each axis. The normal is also zero where tangents are parallel within this error, as
         # in `evaluation.normals.unit_normals`.
-        rounding: Float = 0,
-        extent: Vector3 = None,
+        rounding: Float,
+        extent: Vector3,
     ) -> None:
         # The normal does not depend on the tangents' lengths; its derivative does by these factors.
-        self._scale_u, self._scale_v = _scale(du), _scale(dv)
+        self._scale_u, self._scale_v = (dr.rcp(dr.maximum(dr.max(dr.abs(x)), SHORTEST)) for x in (du, dv))
         self._du, self._dv = du * self._scale_u, dv * self._scale_v
         cross = dr.cross(self._du, self._dv)
         squared = dr.squared_norm(cross)
-        self.exists = squared > (0 if extent is None else self._rounding_of_cross(rounding, extent))
-        self._inverse_length = dr.select(self.exists, dr.rsqrt(squared), 0)
-        self.value = cross * self._inverse_length
-
-    def _rounding_of_cross(self, rounding: Float, extent: Vector3) -> Float:
-        """Squared rounding error of the cross product of parallel tangents."""
-        error_u, error_v = rounding * self._scale_u, rounding * self._scale_v
         # Components of one tangent times the error of the other; products with the extent bound the error of each
-        # component.
+        # component of the cross product of parallel tangents.
+        error_u, error_v = rounding * self._scale_u, rounding * self._scale_v
         a, b = dr.fma(dr.abs(self._du), error_v, dr.abs(self._dv) * error_u), extent
-        return (
+        squared_error = (
             dr.square(dr.fma(a.y, b.z, a.z * b.y))
             + dr.square(dr.fma(a.z, b.x, a.x * b.z))
             + dr.square(dr.fma(a.x, b.y, a.y * b.x))
         )
+        self._inverse_length = dr.select(squared > squared_error, dr.rsqrt(squared), 0)
+        self.value = cross * self._inverse_length
 
     def forward(self, change_u: Vector3, change_v: Vector3) -> Vector3:
         """Directional derivative of the normal for changes of the tangents; zero where there is no normal."""
@@ -293,7 +282,3 @@ class UnitNormal:
     def _across(self, vector: Vector3) -> Vector3:
         """Component of a vector perpendicular to the normal, divided by the length of the cross product."""
         return (vector - self.value * dr.dot(self.value, vector)) * self._inverse_length
-
-
-def _scale(tangent: Vector3) -> Float:
-    return dr.rcp(dr.maximum(dr.max(dr.abs(tangent)), SHORTEST))
