@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.fit.regularizers import LEAST_COSINE, folds
+from mitsuba_subdivision.fit.smoothness import LEAST_COSINE, folds
 
 # Of sums of float32 numbers.
 ROUNDING = 1e-6

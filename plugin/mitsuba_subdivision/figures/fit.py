@@ -21,8 +21,8 @@ from ..cage import ControlCage
 from ..cage.named_cages import cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
+from ..fit.cage_fit import with_sample_count
 from ..fit.point_fit import mesh_samples
-from ..fit.views import with_sample_count
 from ..schemes.domain import FloatArray
 from ..shapes.moving_vertices import loss_of_views
 from ..surface import LimitSurface

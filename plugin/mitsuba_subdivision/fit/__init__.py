@@ -1,10 +1,8 @@
 """Fitting: control cages from pictures, points or dense meshes."""
 
-from .cage_fit import CageFit
+from .cage_fit import CageFit, View
 from .fitting import Schedule
-from .large_steps import LargeSteps
 from .point_fit import PointFit, to_mesh
-from .regularizers import regularizer
-from .views import View
+from .smoothness import LargeSteps, regularizer
 
 __all__ = ["CageFit", "LargeSteps", "PointFit", "Schedule", "View", "regularizer", "to_mesh"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import drjit as dr
@@ -16,14 +17,20 @@ from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
+from ..shapes.moving_vertices import loss_of_views
 from ..surface import LimitSurface
-from .checkpoint import Checkpoint, State, adam_state, restore_adam
-from .fitting import Fit, Schedulable, Schedule
-from .large_steps import LargeSteps, rows
-from .regularizers import regularizer
+from .fitting import Fit, Schedulable, Schedule, State
+from .smoothness import LargeSteps, regularizer, rows
 from .unknown_creases import UnknownCreases
-from .views import CONTROL_POINTS, SHAPE, Loss, Pictures, View
 
+# The name of the fitted shape in its scene.
+SHAPE = "surface"
+CONTROL_POINTS = f"{SHAPE}.control_points"
+# Where outlines move, gradients need an integrator that knows of them. There are shadows, but few scenes need theirs.
+DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
+DEFAULT_SHAPE = {"tessellation_rate": 4}
+
+Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
 # The optimiser's name of the coordinates of the control points.
 U = "u"
 # Its name of the sharpness of creases.
@@ -32,6 +39,125 @@ SHARPNESS = "sharpness"
 CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
 # A surface of this size, in that of the initial one, has collapsed: its triangles have no area in single precision.
 COLLAPSED = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture, and the sensor that took it.
+
+    Attributes
+    ----------
+    sensor : dict or mi.Sensor
+        Its film has the size of the picture, the box filter, and ``sample_border``, if outlines may leave the picture.
+    picture : (height, width, channels) array, mi.Bitmap, or path of a file
+        In linear light, with the channels of the film; bitmaps are converted.
+    mask : (height, width) array, optional
+        Weight of each pixel; 0 where the picture is not to be compared.
+    """
+
+    sensor: Any
+    picture: Any
+    mask: ArrayLike | None = None
+
+
+class Pictures:
+    """A scene with a subdivision surface, rendered in its views.
+
+    Raises ValueError if the variant has no derivatives, there are no views, a picture does not fit its film, or an
+    entry of ``scene`` has the shape's name.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        # What there is besides the surface: emitters, and the integrator if it is to be another one
+        scene: Mapping[str, Any],
+        shape: Mapping[str, Any],  # Parameters of the surface besides its cage
+        # Means over pixels of absolute or squared differences; or a function of a picture and the index of its view
+        loss: Loss,
+        spp: int,  # Samples of each pixel
+        edge_spp: int,  # Samples of outlines for each pixel, where the integrator has such
+    ) -> None:
+        if not mi.variant() or not dr.is_diff_v(mi.Float):
+            raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
+        if not views:
+            raise ValueError("no views: expected one at least")
+        if SHAPE in scene:
+            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
+        self._shape = {**DEFAULT_SHAPE, **shape}
+        self._scene = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
+        integrator = self._scene["integrator"]
+        if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
+            # Counts for derivatives, unless it has its own.
+            self._scene["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
+        self.sensors = [with_sample_count(view.sensor, spp) for view in views]
+        self._targets, self._masks = [], []
+        for index, (view, sensor) in enumerate(zip(views, self.sensors, strict=True)):
+            width, height = map(int, sensor.film().crop_size())
+            self._targets.append(_target(view.picture, (height, width), f"view {index}"))
+            self._masks.append(_mask(view.mask, (height, width), f"view {index}"))
+        if not callable(loss) and loss not in ("l1", "l2"):
+            raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
+        self._loss = loss
+
+    def load(
+        self,
+        cage: ControlCage,
+        halvings: int = 0,  # How often it was refined: its edges have half as many segments each time
+    ) -> None:
+        """Make the scene with a cage's surface."""
+        rate = max(1, self._shape["tessellation_rate"] >> halvings)
+        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}
+        self.scene = mi.load_dict({**self._scene, SHAPE: shape})
+        self.params = mi.traverse(self.scene)
+
+    def loss(self, values: Mapping[str, Any], seed: int) -> mi.TensorXf:
+        """The loss of all views at values of the scene's parameters, by their names.
+
+        It is one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
+        """
+        for name, value in values.items():
+            self.params[name] = value
+        self.params.update()
+        loss = self._loss if callable(self._loss) else self._difference
+        return loss_of_views(self.scene, self.params, loss, self.sensors, seed=seed, spp=0) / len(self.sensors)
+
+    def _difference(self, image: mi.TensorXf, view: int) -> mi.TensorXf:
+        difference = image - self._targets[view]
+        size = dr.square(difference) if self._loss == "l2" else dr.abs(difference)
+        mask = self._masks[view]
+        return dr.mean(size if mask is None else size * mask, axis=None)
+
+
+def with_sample_count(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
+    """A sensor with a number of samples per pixel."""
+    loaded = mi.load_dict(dict(sensor)) if isinstance(sensor, Mapping) else sensor
+    loaded.sampler().set_sample_count(spp)
+    return loaded
+
+
+def _target(picture: Any, size: tuple[int, int], where: str) -> mi.TensorXf:
+    if isinstance(picture, (str, Path)):
+        picture = mi.Bitmap(str(picture))
+    if isinstance(picture, mi.Bitmap):
+        picture = picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    values = np.array(picture, dtype=np.float32)
+    if values.ndim != 3 or values.shape[:2] != size:
+        raise ValueError(f"{where}: a picture of the shape {values.shape}; expected ({size[0]}, {size[1]}, channels)")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{where}: a picture with values that are not finite")
+    return upload(mi.TensorXf, values)
+
+
+def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.TensorXf | None:
+    if mask is None:
+        return None
+    values = np.array(mask, dtype=np.float32)
+    if values.shape != size:
+        raise ValueError(f"{where}: a mask of the shape {values.shape}; expected {size}")
+    if not np.isfinite(values).all() or (values < 0).any():
+        raise ValueError(f"{where}: a mask with weights that are negative or not finite")
+    return upload(mi.TensorXf, values[:, :, None])
 
 
 class CageFit(Fit):
@@ -132,8 +258,10 @@ class CageFit(Fit):
         self._size = float(np.linalg.norm(np.ptp(cage.positions, axis=0)))
         self._learning_rate = Schedule.of(learning_rate, "learning_rate")
         self._smoothing, self._laplacian, self._seed = smoothing, laplacian, seed
-        self._weights = {name: Schedule.of(each, f"regularizer {name}") for name, each in (regularizers or {}).items()}
-        self._other_rates = {name: Schedule.of(each, f"others {name}") for name, each in (others or {}).items()}
+        self._weights = {
+            name: Schedule.of(weight, f"regularizer {name}") for name, weight in (regularizers or {}).items()
+        }
+        self._other_rates = {name: Schedule.of(rate, f"others {name}") for name, rate in (others or {}).items()}
         # Without the sharpness of creases.
         self._other_names = tuple(self._other_rates)
         self._creases: UnknownCreases | None = None
@@ -190,7 +318,7 @@ class CageFit(Fit):
             return self._start.with_positions(self.control_points)
         contents = self._start.contents
         known = {TEXCOORDS: contents.texcoords, **contents.attributes}
-        fitted: dict[str, Any] = {name: each for name, each in known.items() if each is not None}
+        fitted: dict[str, Any] = {name: attribute for name, attribute in known.items() if attribute is not None}
         for name in names:
             values = np.array(self._others[f"{CAGE_VALUES}{name}"], dtype=np.float64)
             fitted[name] = replace(fitted[name], values=values.reshape(fitted[name].values.shape))
@@ -258,36 +386,50 @@ class CageFit(Fit):
         return float(np.linalg.norm(np.ptp(rows(self._optimizer[U]), axis=0)))
 
     def _states(self) -> dict[str, State]:
-        others = {f"other {name}": adam_state(self._others, name) for name in self._other_rates}
+        others = {f"other {name}": _adam_state(self._others, name) for name in self._other_rates}
         if self._creases is not None:
             # The refined cage depends on the sharpness at that time.
             others["start"] = {"positions": self._start.positions, "sharpness": self._creases.initial}
-        return {"points": adam_state(self._optimizer, U), **others}
+        return {"points": _adam_state(self._optimizer, U), **others}
 
-    def _restore(self, found: Checkpoint) -> None:
+    def _restore(self, states: Mapping[str, State]) -> None:
         creases = self._creases
         if creases is not None:
-            start = found.state("start", self._states()["start"])
+            start = states["start"]
             self._start = creases.with_sharpness(start["sharpness"], start["positions"])
             self._creases = UnknownCreases(self._start, creases.edges, creases.crease_of, creases.highest, self._scheme)
             self._load(LimitSurface(self._start, self._scheme), self._start.positions)
-        states = {name: found.state(name, own) for name, own in self._states().items()}
-        restore_adam(self._optimizer, U, states["points"])
+        _restore_adam(self._optimizer, U, states["points"])
         for name in self._other_rates:
-            restore_adam(self._others, name, states[f"other {name}"])
+            _restore_adam(self._others, name, states[f"other {name}"])
+
+
+def _adam_state(optimizer: mi.ad.Optimizer, name: str) -> State:
+    """A variable of ``mi.ad.Adam``, with the moving averages of its gradient and of that squared."""
+    value, _, _, (steps, first, second, *_) = optimizer.state[name]
+    return {"value": np.array(value), "steps": np.array(steps), "first": np.array(first), "second": np.array(second)}
+
+
+def _restore_adam(optimizer: mi.ad.Optimizer, name: str, state: State) -> None:
+    """Give a state to a variable of ``mi.ad.Adam``."""
+    value, _, _, (steps, first, second, *_) = optimizer.state[name]
+    optimizer[name] = upload(type(value), state["value"])
+    value, promoted, rate, (*_, more) = optimizer.state[name]
+    moments = [upload(type(now), state[key]) for key, now in (("steps", steps), ("first", first), ("second", second))]
+    optimizer.state[name] = value, promoted, rate, (*moments, more)
 
 
 def _checked_creases(crease_of: ArrayLike | None, edge_count: int) -> IntArray:
-    """Creases of edges, checked."""
-    found = np.arange(edge_count) if crease_of is None else np.asarray(crease_of)
-    if found.shape != (edge_count,) or not np.issubdtype(found.dtype, np.integer):
+    """Return the crease of each edge, checked."""
+    creases = np.arange(edge_count) if crease_of is None else np.asarray(crease_of)
+    if creases.shape != (edge_count,) or not np.issubdtype(creases.dtype, np.integer):
         raise ValueError(
-            f"crease_of of the shape {found.shape} and type {found.dtype}; expected ({edge_count},) integers, one for "
-            "each of sharp_edges"
+            f"crease_of of the shape {creases.shape} and type {creases.dtype}; expected ({edge_count},) integers, one "
+            "for each of sharp_edges"
         )
-    missing = np.setdiff1d(np.arange(found.max(initial=-1) + 1), found)
-    if (found < 0).any() or len(missing):
-        wrong = int(found.min()) if (found < 0).any() else int(missing[0])
+    missing = np.setdiff1d(np.arange(creases.max(initial=-1) + 1), creases)
+    if (creases < 0).any() or len(missing):
+        wrong = int(creases.min()) if (creases < 0).any() else int(missing[0])
         what = f"has a crease {wrong}" if wrong < 0 else f"skips crease {wrong}"
         raise ValueError(f"crease_of {what}; expected consecutive indices from 0")
-    return found.astype(np.int64)
+    return creases.astype(np.int64)

@@ -1,22 +1,24 @@
-"""The base of all fits of cages: steps, refinement on the way, checkpoints."""
+"""The base of all fits of cages: steps, refinement on the way, checkpoints, schedules."""
 
 from __future__ import annotations
 
+import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..progress import counted
 from ..refinement.cage_refinement import CageRefinement
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from .checkpoint import Checkpoint, State
+from ..whole_file import whole_file
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -24,6 +26,11 @@ if TYPE_CHECKING:
 # A loss has stopped falling when its mean over this many steps is within this part of that over as many before.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
+# Layout of checkpoints.
+FORMAT = 1
+
+# Arrays by their names.
+State = Mapping[str, NDArray]
 # A number, or what users may give instead.
 Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
 
@@ -82,8 +89,8 @@ class Fit(ABC):
         """State that steps have changed."""
 
     @abstractmethod
-    def _restore(self, found: Checkpoint) -> None:
-        """Restore the states of a checkpoint."""
+    def _restore(self, states: Mapping[str, State]) -> None:
+        """Restore `_states`, with arrays of the same shapes."""
 
     @property
     @abstractmethod
@@ -159,7 +166,12 @@ class Fit(ABC):
         OSError
             If the file cannot be written; an existing one is then unchanged.
         """
-        Checkpoint(self.refinements, self._since, np.array(self.losses), self._states()).save(Path(path))
+        arrays: dict[str, Any] = {"format": FORMAT, "losses": self.losses}
+        arrays.update(refinements=self.refinements, since=self._since)
+        for name, state in self._states().items():
+            arrays.update({f"{name}: {field}": values for field, values in state.items()})
+        with whole_file(Path(path)) as unfinished, unfinished.open("wb") as file:
+            np.savez(file, **arrays)
 
     def resume(self, path: str | Path) -> Self:
         """Resume from a checkpoint of a fit with the same arguments.
@@ -171,15 +183,37 @@ class Fit(ABC):
         OSError
             If the file cannot be read.
         """
-        found = Checkpoint.load(Path(path))
-        if self.refinements > found.refinements:
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+        except (ValueError, AttributeError, zipfile.BadZipFile, EOFError) as error:
+            raise ValueError(f'"{path}" is no checkpoint of a fit: {error}') from error
+        if "format" not in arrays or int(arrays["format"]) != FORMAT:
+            raise ValueError(f'"{path}" is no checkpoint of a fit, or one of another version of this package')
+        refinements = int(arrays["refinements"])
+        if self.refinements > refinements:
             raise ValueError(
-                f'"{path}" was saved after {found.refinements} refinements; this fit has had {self.refinements} already'
+                f'"{path}" was saved after {refinements} refinements; this fit has had {self.refinements} already'
             )
-        while self.refinements < found.refinements:
+        while self.refinements < refinements:
             self.refine()
-        self._restore(found)
-        self.losses, self._since = found.losses.tolist(), found.since
+        states: dict[str, dict[str, NDArray]] = {}
+        for key, values in arrays.items():
+            name, _, field = key.rpartition(": ")
+            if name:
+                states.setdefault(name, {})[field] = values
+        for name, state in self._states().items():
+            saved, expected = (
+                {field: np.shape(values) for field, values in fields.items()}
+                for fields in (states.get(name, {}), state)
+            )
+            if saved != expected:
+                raise ValueError(
+                    f'the checkpoint has no "{name}" of this fit; expected that of a fit with the same arguments'
+                )
+        self._restore(states)
+        self.losses, self._since = arrays["losses"].tolist(), int(arrays["since"])
         return self
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,9 +16,8 @@ from ..mesh.connectivity import IntArray
 from ..patches import AreaSamples, ClosestPoints
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from .checkpoint import Checkpoint, State
-from .fitting import Fit, Schedulable, Schedule
-from .regularizers import Regularizer
+from .fitting import Fit, Schedulable, Schedule, State
+from .smoothness import quadratic_form
 
 POINTS = "points"
 # Parts of the surface have no points nearby if these are further than this many median distances of a point from
@@ -31,24 +29,9 @@ DAMPING = 1e-8
 POINTS_PER_CONTROL_POINT = 8
 
 
-@dataclass(frozen=True, eq=False)
-class _Pairs:
-    """Points of the surface, and their targets."""
-
-    weights: sparse.csr_array  # (s, n) CSR array of float64: points of the surface over control points
-    goals: FloatArray  # (s, 3) float64
-    across: FloatArray  # (s, 3) float64: unit normals, along which distances count in full; zero where there is none
-
-    @classmethod
-    def joined(cls, parts: Sequence[_Pairs]) -> _Pairs:
-        weights = sparse.csr_array(sparse.vstack([part.weights for part in parts]))
-        columns = zip(*((part.goals, part.across) for part in parts), strict=True)
-        return cls(weights, *(np.concatenate(column) for column in columns))
-
-    def forms(self, sliding: float) -> FloatArray:
-        """``(s, 3, 3)`` quadratic forms of squared distances, with weighted tangential components."""
-        along = np.where(self.across.any(axis=1), sliding, 1)[:, None, None]
-        return along * np.eye(3) + (1 - along) * self.across[:, :, None] * self.across[:, None, :]
+# Points of the surface, as (s, n) weights over control points; their targets, (s, 3); and unit normals, (s, 3), along
+# which distances count in full, zero where there is none.
+Pairs = tuple[sparse.csr_array, FloatArray, FloatArray]
 
 
 class PointFit(Fit):
@@ -125,12 +108,12 @@ class PointFit(Fit):
         self._size = float(np.linalg.norm(np.ptp(self._points, axis=0)))
         self._sliding, self._seed = Schedule.of(sliding, "sliding"), seed
         regularizers = {"bending": 1e-8, **({} if regularizers is None else regularizers)}
-        self._rates = {name: Schedule.of(each, f"regularizer {name}") for name, each in regularizers.items()}
+        self._rates = {name: Schedule.of(weight, f"regularizer {name}") for name, weight in regularizers.items()}
         super().__init__(cage, scheme, refine, callbacks)
 
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
         self._control_points: FloatArray = positions
-        self._regularizers = {name: Regularizer.named(name, start) for name in self._rates}
+        self._regularizers = {name: quadratic_form(name, start) for name in self._rates}
 
     @property
     def control_points(self) -> FloatArray:
@@ -138,81 +121,75 @@ class PointFit(Fit):
 
     def _step(self, number: int) -> float:
         pairs = self._pairs(LimitSurface(self.cage, self._scheme), self._seed + number)
-        away = pairs.weights @ self._control_points - pairs.goals
+        matrix, goals, _ = pairs
+        away = matrix @ self._control_points - goals
         loss = float((away**2).sum(axis=1).mean())
         weights = {name: rate(number) * self._size**2 for name, rate in self._rates.items()}
-        terms = [(weights[name], each) for name, each in self._regularizers.items() if weights[name] > 0]
+        terms = [(weights[name], *form) for name, form in self._regularizers.items() if weights[name] > 0]
         self._control_points = _least_squares(pairs, self._sliding(number), terms, self._control_points)
         return loss
 
-    def _pairs(self, surface: LimitSurface, seed: int) -> _Pairs:
+    def _pairs(self, surface: LimitSurface, seed: int) -> Pairs:
         """Current pairs of nearest points."""
-        near = surface.closest_point(self._points)
-        found = [_paired(surface, near, self._points, self._normals, np.arange(len(self._points)))]
+        parts = [self._paired(surface, surface.closest_point(self._points), np.arange(len(self._points)))]
         if self._tree is not None:
             samples = surface.sample(len(self._points), seed)
-            distance, at = (np.array(each) for each in self._tree.query(samples.p))
-            goal = np.where(distance > self._near, at, -1)
-            found.append(_paired(surface, samples, self._points, self._normals, goal))
-        pairs = _Pairs.joined(found)
-        if not len(pairs.goals):
+            distance, nearest = (np.array(column) for column in self._tree.query(samples.p))
+            parts.append(self._paired(surface, samples, np.where(distance > self._near, nearest, -1)))
+        weights, goals, across = zip(*parts, strict=True)
+        if not sum(map(len, goals)):
             raise ValueError("no point has a normal like that of the surface nearby; expected normals to the outside")
-        return pairs
+        return sparse.csr_array(sparse.vstack(weights)), np.concatenate(goals), np.concatenate(across)
+
+    def _paired(self, surface: LimitSurface, at: ClosestPoints | AreaSamples, goal: IntArray) -> Pairs:
+        """Pair locations on a surface with their target points, given by index; -1 for none.
+
+        A point whose normal shows that it belongs to another side has no pair either.
+        """
+        is_pair = goal >= 0
+        if self._normals is not None:
+            is_pair &= (at.n * self._normals[goal]).sum(axis=1) >= 0
+        weights = surface.matrix(at.element[is_pair], at.uv[is_pair], at.corner[is_pair]).p
+        return weights, self._points[goal[is_pair]], np.nan_to_num(at.n[is_pair])
 
     def _states(self) -> dict[str, State]:
         return {POINTS: {"value": self._control_points}}
 
-    def _restore(self, found: Checkpoint) -> None:
-        self._control_points = found.state(POINTS, self._states()[POINTS])["value"]
-
-
-def _paired(
-    surface: LimitSurface,
-    at: ClosestPoints | AreaSamples,
-    points: FloatArray,
-    normals: FloatArray | None,
-    goal: IntArray,
-) -> _Pairs:
-    """Locations on a surface with the indices of their target points; -1 for none.
-
-    A point whose normal shows that it belongs to another side has no pair either.
-    """
-    is_pair = goal >= 0
-    if normals is not None:
-        is_pair &= (at.n * normals[goal]).sum(axis=1) >= 0
-    weights = surface.matrix(at.element[is_pair], at.uv[is_pair], at.corner[is_pair]).p
-    return _Pairs(weights, points[goal[is_pair]], np.nan_to_num(at.n[is_pair]))
+    def _restore(self, states: Mapping[str, State]) -> None:
+        self._control_points = states[POINTS]["value"]
 
 
 def _least_squares(
-    pairs: _Pairs, sliding: float, terms: Sequence[tuple[float, Regularizer]], before: FloatArray
+    pairs: Pairs, sliding: float, terms: Sequence[tuple[float, sparse.csr_array, FloatArray]], before: FloatArray
 ) -> FloatArray:
     """Control points of least mean squared distance, with tangential distances weighted less, plus regularizers."""
-    weights, count = pairs.weights, pairs.weights.shape[0]
-    forms = pairs.forms(sliding) / count
+    weights, goals, across = pairs
+    # (s, 3, 3) quadratic forms of squared distances.
+    along = np.where(across.any(axis=1), sliding, 1)[:, None, None]
+    forms = (along * np.eye(3) + (1 - along) * across[:, :, None] * across[:, None, :]) / len(goals)
     blocks: list[list[Any]] = [[weights.T @ weights.multiply(forms[:, i, j, None]) for j in range(3)] for i in range(3)]
-    right = np.stack([weights.T @ (forms[:, i] * pairs.goals).sum(axis=1) for i in range(3)])
+    right = np.stack([weights.T @ (forms[:, i] * goals).sum(axis=1) for i in range(3)])
     # Control points that no pair and no term affects stay where they are.
     damping = DAMPING * np.mean([block[i].diagonal().mean() for i, block in enumerate(blocks)])
     for axis in range(3):
         blocks[axis][axis] = blocks[axis][axis] + damping * sparse.eye_array(len(before))
         right[axis] += damping * before[:, axis]
-        for factor, term in terms:
-            blocks[axis][axis] = blocks[axis][axis] + factor / 2 * term.matrix
-            right[axis] += factor / 2 * (term.matrix @ term.origin[:, axis])
+        for factor, form, origin in terms:
+            blocks[axis][axis] = blocks[axis][axis] + factor / 2 * form
+            right[axis] += factor / 2 * (form @ origin[:, axis])
     system = sparse.block_array(blocks, format="csc")
     factors = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     return np.ascontiguousarray(factors.solve(right.ravel()).reshape(3, -1).T)
 
 
 def _checked(values: ArrayLike, name: str) -> FloatArray:
-    found = np.asarray(values, dtype=np.float64)
-    if found.ndim != 2 or found.shape[1] != 3 or not len(found):
-        raise ValueError(f"{name} of the shape {found.shape}; expected (m, 3)")
-    if not np.isfinite(found).all():
-        row = int(np.flatnonzero(~np.isfinite(found).all(axis=1))[0])
-        raise ValueError(f"row {row} of {name} is {found[row].tolist()}; expected finite numbers")
-    return found
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise ValueError(f"{name} of the shape {array.shape}; expected (m, 3)")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise ValueError(f"row {row} of {name} is {array[row].tolist()}; expected finite numbers")
+    return array
 
 
 def to_mesh(
@@ -262,8 +239,9 @@ def mesh_samples(positions: FloatArray, triangles: IntArray, count: int, seed: i
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions of the shape {positions.shape}; expected (n, 3)")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or not np.issubdtype(triangles.dtype, np.integer):
-        found = f"triangles of the shape {triangles.shape} and type {triangles.dtype}"
-        raise ValueError(f"{found}; expected (m, 3) integers")
+        raise ValueError(
+            f"triangles of the shape {triangles.shape} and type {triangles.dtype}; expected (m, 3) integers"
+        )
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
         row = int(np.flatnonzero(((triangles < 0) | (triangles >= len(positions))).any(axis=1))[0])
         expected = f"expected vertices from 0 to {len(positions) - 1}"

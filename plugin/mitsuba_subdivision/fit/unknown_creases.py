@@ -23,7 +23,7 @@ from ..mesh.cuts import Sharpness
 from ..refinement.adapted_scheme import adapted_scheme
 from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
-from .large_steps import rows
+from .smoothness import rows
 
 # More refinements than these would make a thousand faces and more of each.
 MOST_REFINEMENTS = 6
@@ -75,14 +75,14 @@ class UnknownCreases:
     def matrix(self, sharpness: FloatArray) -> sparse.csr_array:
         """Control points of `refined` as weights of those of the cage, ``(n, n_v)``; rows sum to one."""
         cut = self.with_sharpness(sharpness).cut_mesh
-        topology, found = cut.topology, sparse.eye_array(self._cage.vertex_count, format="csr")[cut.vertex]
+        topology, matrix = cut.topology, sparse.eye_array(self._cage.vertex_count, format="csr")[cut.vertex]
         for _ in range(self.highest):
             refinement = self._scheme.refine(topology)
-            topology, found = refinement.topology, refinement.stencils.matrix @ found
+            topology, matrix = refinement.topology, refinement.stencils.matrix @ matrix
         # Face corners have the same numbers in the refined cage and in the refined cut mesh; vertices may have others.
         kept = np.arange(self.refined.vertex_count)
         kept[self.refined.face_vertices] = topology.face_vertices
-        return found[kept]
+        return matrix[kept]
 
     def derivatives(self, sharpness: FloatArray, positions: FloatArray) -> list[FloatArray]:
         """Derivatives of the control points of `refined` by the sharpness of each crease, ``(n, 3)`` each."""

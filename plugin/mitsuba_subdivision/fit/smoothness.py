@@ -1,0 +1,191 @@
+"""What keeps a fitted cage even: coordinates in which steps are large and smooth, and regularizers.
+
+A gradient of pictures moves the few points that pictures see. In the coordinates u = (I + λ L) x, with the Laplacian L
+of a mesh [Nicolet et al. 2021], the same step also moves their surroundings: in x it is the step times
+the inverse of the matrix. Here L may be that of the cage's edges, or the stiffness matrix of the limit surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from ..cage import ControlCage
+from ..device_arrays import upload
+from ..kernels.linear_maps import SparseMatrix
+from ..mesh.connectivity import IntArray, Topology
+from ..schemes.domain import FloatArray
+from ..surface import LimitSurface
+
+# Regularizers that are half of ``(x - x0)^T Q (x - x0)``, added up over the coordinates of control points x, and the
+# others.
+QUADRATIC, FOLDS = ("laplacian", "bending", "anchor"), "folds"
+# Faces count from this cosine between their normals on, 107 degrees. Where a part is about to grow, those on both sides
+# of its end turn by a right angle and more.
+LEAST_COSINE = -0.3
+
+
+class LargeSteps:
+    """Differentiable change between control points and large-step coordinates.
+
+    It stands in for ``mitsuba.ad.LargeSteps``, which requires a mesh of triangles.
+
+    Parameters
+    ----------
+    laplacian : (n, n) sparse array
+        Symmetric and positive semi-definite, with constants in its null space: `ControlCage.laplacian` or
+        `LimitSurface.stiffness`.
+    lambda_ : float
+        How far steps reach: more than 0. Where it is large, all of the surface moves together.
+
+    Raises
+    ------
+    ValueError
+        If ``lambda_`` is not positive.
+    """
+
+    def __init__(self, laplacian: sparse.csr_array, lambda_: float) -> None:
+        if not lambda_ > 0:
+            raise ValueError(f"lambda_ is {lambda_}; expected a positive number")
+        self.matrix = sparse.csr_array(sparse.eye_array(laplacian.shape[0]) + lambda_ * laplacian)
+        # Pivots of a positive definite matrix are on its diagonal: the factors are those of Cholesky, but for a scale.
+        options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
+        self._factors = splu(self.matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
+
+    def to_differential(self, points: dr.ArrayBase | NDArray) -> mi.Float:
+        """Large-step coordinates of control points, flat x, y, z; not differentiable, as they are computed once.
+
+        Parameters
+        ----------
+        points : (n, 3) array, or flat Dr.Jit array
+
+        Returns
+        -------
+        mi.Float
+        """
+        return upload(mi.Float, self.matrix @ rows(points))
+
+    def from_differential(self, u: dr.ArrayBase) -> mi.Float:
+        """Control points, flat x, y, z, of large-step coordinates; differentiable in forward and reverse mode."""
+        return dr.custom(_Solve, self._factors, u)
+
+
+class _Solve(dr.CustomOp):
+    """Solves the system. As its matrix is symmetric, gradients pass through the same solution."""
+
+    def eval(self, factors, u):
+        self.factors = factors
+        return self._solved(u)
+
+    def forward(self):
+        self.set_grad_out(self._solved(self.grad_in("u")))
+
+    def backward(self):
+        self.set_grad_in("u", self._solved(self.grad_out()))
+
+    def name(self):
+        return "LargeSteps"
+
+    def _solved(self, flat: dr.ArrayBase) -> mi.Float:
+        return upload(mi.Float, self.factors.solve(rows(flat)))
+
+
+def rows(points: dr.ArrayBase | NDArray) -> FloatArray:
+    """Points ``(n, 3)``, given as such or flat."""
+    return np.array(points, dtype=np.float64).reshape(-1, 3)
+
+
+def quadratic_form(name: str, start: LimitSurface) -> tuple[sparse.csr_array, FloatArray]:
+    """Return Q and x0 of a quadratic regularizer, ``(n, n)`` and ``(n, 3)``, for a surface as a fit begins.
+
+    Q is symmetric and positive semi-definite. "laplacian" is the mean squared distance of control points from the mean
+    of their neighbours, "anchor" that from their initial positions. Raises ValueError if there is none of that name.
+    """
+    _require_name(name, QUADRATIC)
+    points, count = start.cage.positions, start.cage.vertex_count
+    if name == "anchor":
+        return sparse.csr_array(sparse.eye_array(count) / count), points
+    laplacian = start.cage.laplacian()
+    form = start.bending() if name == "bending" else laplacian.T @ laplacian / count
+    return form.tocsr(), np.zeros_like(points)
+
+
+def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
+    """Term that keeps a cage even, as a loss of control points on the device, for optimisations of one's own.
+
+    Parameters
+    ----------
+    name : "laplacian" | "bending" | "anchor" | "folds"
+        As in `CageFit`.
+    start : LimitSurface
+        Where the optimisation begins: "anchor" measures distances from its control points, "bending" derivatives in its
+        metric, see `LimitSurface.bending`.
+
+    Returns
+    -------
+    callable
+        Maps control points, a flat ``mi.Float`` of x, y, z of each such as the shape's parameter ``control_points``, to
+        a ``mi.Float`` of one number, differentiable by them. "laplacian", "bending" and "anchor" are half a sum of
+        squares, for a mean over control points or an integral over the surface.
+
+    Raises
+    ------
+    ValueError
+        If there is none of that name.
+    """
+    _require_name(name, (*QUADRATIC, FOLDS))
+    if name == FOLDS:
+        return folds(start.cage)
+    form, x0 = quadratic_form(name, start)
+    matrix, origin = SparseMatrix(form, mi.Float, is_relative=False), upload(mi.Float, x0)
+
+    def energy(points: dr.ArrayBase) -> mi.Float:
+        away = points - origin
+        # The derivative of the form is the product, which need not be differentiated.
+        product = matrix.product(dr.detach(away))
+        return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2
+
+    return energy
+
+
+def _require_name(name: str, names: tuple[str, ...]) -> None:
+    if name not in names:
+        raise ValueError(f'regularizer "{name}"; expected one of {", ".join(names)}')
+
+
+def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
+    """Penalty of folds between neighbouring faces: a function of control points, flat x, y, z, differentiable by them.
+
+    The mean over edges between two faces of ``max(0, -0.3 - cos a)^2``, where a is the angle between normals: between
+    those of the two quadrilaterals, or triangles, that the edge makes with the next vertices around each face.
+    """
+    t = cage.topology
+    half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
+    sides = [_quadrilaterals(t, side) for side in (half_edges, t.twin[half_edges])]
+
+    def energy(points: dr.ArrayBase) -> mi.Float:
+        if not len(half_edges):
+            return mi.Float(0)
+        cosine: Any = dr.dot(*(_normals(points, side) for side in sides))
+        return dr.sum(dr.square(dr.maximum(LEAST_COSINE - cosine, 0))) / len(half_edges)
+
+    return energy
+
+
+def _quadrilaterals(t: Topology, half_edges: IntArray) -> list[mi.UInt32]:
+    """Vertices of a face around its edge: one before it, the ends, and one after it, which may be the first one."""
+    corners = t.prev[half_edges], half_edges, t.next[half_edges], t.next[t.next[half_edges]]
+    return [upload(mi.UInt32, t.face_vertices[half_edge]) for half_edge in corners]
+
+
+def _normals(points: dr.ArrayBase, corners: list[mi.UInt32]) -> mi.Normal3f:
+    before, start, end, after = (dr.gather(mi.Point3f, points, corner) for corner in corners)
+    normal = dr.cross(end - before, after - start)
+    return normal * dr.rsqrt(dr.maximum(dr.squared_norm(normal), dr.smallest(mi.Float)))
