@@ -26,7 +26,7 @@ SOURCES = [Path(__file__).with_name(name) for name in ("osd_peer.cpp", "peer_com
 FLAGS = ["-std=c++17", "-O1", "-DNDEBUG", "-pthread"]
 # Corners of a face that has one domain.
 REGULAR_SIZE = {"catmark": 4, "bilinear": 4, "loop": 3}
-LEVELS = {"far": 10, "bfr": 2, "refine": 6}
+LEVELS = {"far": 10, "refine": 6}
 
 
 class PeerError(RuntimeError):
@@ -116,9 +116,8 @@ def evaluate(
 ) -> PeerSamples:
     """Samples of a cage's limit surface; ``element``, ``uv`` and ``corner`` as for `LimitSurface.evaluate`.
 
-    The method is "far", patch tables after adaptive refinement; "bfr", surfaces of single faces; or "refine", uniform
-    refinement and limit masks, which know vertices of the level only. Levels of refinement are 10 for "far", which can
-    no more, 2 for "bfr", its own default, and 6 for "refine", unless given.
+    The method is "far", patch tables after adaptive refinement, or "refine", uniform refinement and limit masks, which
+    know vertices of the level only. Levels of refinement are 10 for "far", which can no more, and 6 for "refine".
     """
     program = find()
     if not isinstance(program, Path):

@@ -6,6 +6,8 @@ from decimal import Decimal, getcontext, localcontext
 from functools import cache
 from operator import mul
 
+import mpmath
+
 Vector = tuple[Decimal, ...]
 
 
@@ -18,32 +20,9 @@ def precision(digits: int):
 
 
 @cache
-def _pi(digits: int) -> Decimal:
-    """Pi by Machin's formula."""
-    with precision(digits + 10):
-
-        def arctan_of_inverse(n: int) -> Decimal:
-            power, total, k = 1 / Decimal(n), Decimal(0), 1
-            while power > Decimal(10) ** -(digits + 10):
-                total += power / (k if k % 4 == 1 else -k)
-                power /= n * n
-                k += 2
-            return total
-
-        return 4 * (4 * arctan_of_inverse(5) - arctan_of_inverse(239))
-
-
-@cache
 def _cos_of_turn(k: int, n: int, digits: int) -> Decimal:
-    with precision(digits + 10):
-        x = 2 * _pi(digits + 10) * (k % n) / n
-        term = total = Decimal(1)
-        i = 0
-        while abs(term) > Decimal(10) ** -(digits + 10):
-            i += 2
-            term *= -x * x / (i * (i - 1))
-            total += term
-    return total
+    with mpmath.workdps(digits + 10):
+        return Decimal(mpmath.nstr(mpmath.cospi(mpmath.mpf(2 * k) / n), digits + 5))
 
 
 def cos_of_turn(k: int, n: int) -> Decimal:

@@ -3,8 +3,7 @@
 import json
 import math
 from decimal import Decimal
-from fractions import Fraction
-from itertools import pairwise, product
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 
 from reference.brute_force import BruteForce, ring
 from reference.decimals import precision
-from reference.rules import RULES, limit_masks, rotate
+from reference.rules import RULES, limit_masks
 from reference.splines import box_weights
 
 LIMIT_STENCILS = json.loads((Path(__file__).parents[1] / "data" / "limit_stencils.json").read_text())
@@ -74,12 +73,6 @@ def torus(m, n, triangles=False):
     return bumpy(points), [t for a, b, c, d in quads for t in ((a, b, d), (b, c, d))] if triangles else quads
 
 
-def torus_with_hexagon():
-    """Quads but for one hexagon, beside which an element has ordinary vertices only."""
-    points, faces = torus(6, 6)
-    return points, [(0, 6, 12, 13, 7, 1), *(f for f in faces if f not in ((0, 6, 7, 1), (6, 12, 13, 7)))]
-
-
 CAGES = [
     ("catmull_clark", *double_pole(3)),
     ("catmull_clark", *double_pole(7)),
@@ -92,17 +85,10 @@ CAGES = [
 IDS = [f"{scheme}-{len(points)}" for scheme, points, _ in CAGES]
 
 
-def element_sizes(scheme, points, faces):
-    """Number of corners of each element."""
-    if scheme == "doo_sabin":
-        return [sum(v in f for f in faces) for v in range(len(points))]
-    return [len(f) for f in faces]
-
-
 def some_samples(scheme, points, faces, count, seed=2):
     """Elements, corners and (u, v), many of them close to the corners."""
     rng = np.random.default_rng(seed)
-    sizes = element_sizes(scheme, points, faces)
+    sizes = [sum(v in f for f in faces) for v in range(len(points))] if scheme == "doo_sabin" else [*map(len, faces)]
     for _ in range(count):
         element = int(rng.integers(len(sizes)))
         u, v = rng.uniform(0.05, 0.95, 2) * 0.5 ** rng.integers(0, 8)
@@ -117,15 +103,6 @@ def gap(a, b):
 
 def rows(sample):
     return sample.p, sample.dp_du, sample.dp_dv, sample.d2p_duu, sample.d2p_duv, sample.d2p_dvv
-
-
-@pytest.mark.parametrize("cage", CAGES, ids=IDS)
-def test_weights_sum_to_one_and_of_derivatives_to_zero(cage):
-    scheme, points, faces = cage
-    evaluator = BruteForce(scheme, np.eye(len(points)), faces)
-    for sample in some_samples(*cage, 5):
-        sums = map(sum, rows(evaluator.evaluate(*sample, derivatives=2)))
-        assert gap(sums, [1, 0, 0, 0, 0, 0]) < EXACT
 
 
 BICUBIC = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
@@ -168,89 +145,6 @@ def test_one_more_level_changes_nothing(cage):
             fine = evaluator.evaluate(*sample, derivatives=2, min_level=coarse.level + more)
             assert fine.level == coarse.level + more
             assert max(map(gap, rows(coarse), rows(fine))) < EXACT
-
-
-@pytest.mark.parametrize("cage", CAGES, ids=IDS)
-def test_derivatives_are_finite_differences(cage):
-    evaluator = BruteForce(*cage)
-    h, step = Fraction(1, 10**16), Decimal("1e-16")
-    for *place, u, v in some_samples(*cage, 3):
-        sample = evaluator.evaluate(*place, Fraction(u), Fraction(v), derivatives=2)
-        near = {
-            (a, b): np.array(evaluator.evaluate(*place, Fraction(u) + a * h, Fraction(v) + b * h).p)
-            for a, b in product((-1, 0, 1), repeat=2)
-        }
-        # Errors are h^2 times third and fourth derivatives, of size 1e8 at most here.
-        tolerance = Decimal("1e-22")
-        for (a, b), first, second in (((1, 0), sample.dp_du, sample.d2p_duu), ((0, 1), sample.dp_dv, sample.d2p_dvv)):
-            assert gap((near[a, b] - near[-a, -b]) / (2 * step), first) < tolerance
-            assert gap((near[a, b] - 2 * near[0, 0] + near[-a, -b]) / step**2, second) < tolerance
-        mixed = near[1, 1] - near[1, -1] - near[-1, 1] + near[-1, -1]
-        assert gap(mixed / (4 * step**2), sample.d2p_duv) < tolerance
-
-
-@pytest.mark.parametrize("cage", CAGES, ids=IDS)
-def test_corner_turns_the_domain(cage):
-    scheme, evaluator = cage[0], BruteForce(*cage)
-    u, v = Fraction(3, 10), Fraction(1, 7)
-    for element, size in enumerate(element_sizes(*cage)):
-        if scheme != "loop" and size != 4:
-            continue
-        zero = evaluator.evaluate(element, 0, *((1 - u - v, u) if scheme == "loop" else (1 - v, u)))
-        one = evaluator.evaluate(element, 1, u, v)
-        assert gap(zero.p, one.p) < EXACT
-        assert gap(zero.n, one.n) < EXACT
-
-
-def assert_refined(coarse, place, fine, child, factor):
-    """One place of both cages, where the element's corner has a domain that is smaller by a factor."""
-    a, b = coarse.evaluate(*place, 0.4 / factor, 0.375 / factor), fine.evaluate(child, 0, 0.4, 0.375)
-    assert gap(a.p, b.p) < EXACT
-    assert gap([x / factor for x in a.dp_du], b.dp_du) < EXACT
-
-
-@pytest.mark.parametrize(
-    ("scheme", "cage"), [("catmull_clark", prism(5)), ("catmull_clark", torus_with_hexagon()), ("loop", bipyramid(5))]
-)
-def test_refining_the_whole_cage_keeps_the_limit_surface(scheme, cage):
-    points, faces = cage
-    keyed, point = RULES[scheme](faces, decimals(points))
-    names = {key: i for i, key in enumerate(dict.fromkeys(key for f in keyed for key in f))}
-    with precision(80):
-        fine = BruteForce(scheme, [point(key) for key in names], [[names[key] for key in f] for f in keyed])
-    coarse = BruteForce(scheme, points, faces)
-    child = 0
-    for element, face in enumerate(faces):
-        for corner in range(len(face)):
-            factor = 2 if scheme == "loop" or len(face) == 4 else 1
-            assert_refined(coarse, (element, corner), fine, child, factor)
-            child += 1
-        child += scheme == "loop"
-
-
-def test_refining_the_whole_doo_sabin_cage_keeps_the_limit_surface():
-    points, faces = prism(5)
-    rings = [ring(v, faces) for v in range(len(points))]
-    names, fine_points = {}, []
-    for fan in rings:
-        with precision(80):
-            _, point = RULES["doo_sabin"](fan, decimals(points))
-            for k, face in enumerate(fan):
-                names[face[0], frozenset(face)] = len(fine_points)
-                fine_points.append(point((face[0], k)))
-    fine_faces = [[names[v, frozenset(f)] for v in f] for f in faces]
-    fine_faces += [[names[fan[0][0], frozenset(f)] for f in fan] for fan in rings]
-    # Of each edge, between two faces.
-    edges = [(v, f[-1], f, g) for v, fan in enumerate(rings) for f, g in zip(fan, rotate(fan, 1), strict=True)]
-    for v, w, f, g in edges:
-        if v < w:
-            fine_faces.append([names[x, frozenset(y)] for x, y in ((v, f), (w, f), (w, g), (v, g))])
-    fine, coarse = BruteForce("doo_sabin", fine_points, fine_faces), BruteForce("doo_sabin", points, faces)
-    for v, fan in enumerate(rings):
-        factor = 2 if len(fan) == 4 else 1
-        for corner, f in enumerate(fan):
-            # The face of the old face has the least index about every new vertex.
-            assert_refined(coarse, (v, corner), fine, names[v, frozenset(f)], factor)
 
 
 @pytest.mark.core
