@@ -4,8 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, regular_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, regular_signature
 from mitsuba_subdivision.mesh.signature import Fan, Signature
 from mitsuba_subdivision.schemes import scheme_named
 
@@ -128,7 +127,7 @@ def test_the_table_of_eigenvalues_is_what_the_rules_give():
         is_face = scheme.element == "face"
         fan = Fan((scheme.regular_face_size,) * valence if is_face else (valence, *first.ahead[1:]))
         signature = Signature(scheme.element, (fan, *others))
-        basis = irregular_patch(scheme, irregular_structure(scheme, signature)).basis
+        basis = irregular_patch(scheme, signature).basis
         second, fourth = basis.subdominant, basis.moduli[3]
         assert stated == [f"{value:.4f}" for value in (second, fourth / second, fourth / second**2)], (name, valence)
 

@@ -8,7 +8,7 @@ import pytest
 from evaluation.common import both_sides, evaluate_from
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
-from mitsuba_subdivision.evaluation import irregular_patch
+from mitsuba_subdivision.evaluation import irregular_patch, patch_tree
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from reference.exact_samples import angle, faces_of
@@ -110,15 +110,19 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     expected = surface.evaluate(*places)
     computed = irregular_patch.eigenbasis
 
+    def clear_caches():
+        for function in (patch_tree.irregular_patch, patch_tree.whole_piece, patch_tree.patch_tree):
+            function.cache_clear()
+
     def turned(*given):
         return with_vectors_turned_over(computed(*given), np_rng)
 
     monkeypatch.setattr(irregular_patch, "eigenbasis", turned)
-    irregular_patch.irregular_patch.cache_clear()
+    clear_caches()
     try:
         found = surface.evaluate(*places)
     finally:
-        irregular_patch.irregular_patch.cache_clear()
+        clear_caches()
     assert np.abs(found.p - expected.p).max() <= POSITION
     for derivative in ("dp_du", "dp_dv"):
         np.testing.assert_allclose(getattr(found, derivative), getattr(expected, derivative), rtol=0, atol=WEIGHTS)

@@ -1,12 +1,13 @@
 import re
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.evaluation import irregular_patch
+from mitsuba_subdivision.evaluation import irregular_patch as patch_module
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, EigenbasisError, eigenbasis
 from mitsuba_subdivision.evaluation.equations import times_powers
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, isolated_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, isolated_signature
 from mitsuba_subdivision.schemes import CatmullClark
 from reference.exact_samples import subdominant
 from scipy.linalg import block_diag
@@ -25,11 +26,11 @@ EVERY_VALENCE = pytest.mark.parametrize("valence", VALENCES)
 
 @cache
 def basis_of(valence):
-    return eigenbasis(structure_of(valence).matrix)
+    return eigenbasis(patch_of(valence).matrix)
 
 
-def structure_of(valence):
-    return irregular_structure(CatmullClark(), isolated_signature(CatmullClark(), valence))
+def patch_of(valence):
+    return irregular_patch(CatmullClark(), isolated_signature(CatmullClark(), valence))
 
 
 def similar(block_matrix, seed=1):
@@ -69,7 +70,7 @@ WITHOUT_BLOCKS = ("diagonal", "repeated", "opposite to the subdominant", "opposi
 @pytest.mark.core
 @EVERY_VALENCE
 def test_basis_of_a_subdivision_matrix_satisfies_its_equations_and_has_closed_forms(valence):
-    matrix, basis, n = structure_of(valence).matrix, basis_of(valence), valence
+    matrix, basis, n = patch_of(valence).matrix, basis_of(valence), valence
     blocks = basis.block_matrix()
     assert np.abs(basis.inverse @ basis.vectors - np.eye(len(matrix))).max() < RESIDUAL
     assert np.abs(matrix @ basis.vectors - basis.vectors @ blocks).max() < RESIDUAL
@@ -175,8 +176,8 @@ def test_orientation_of_the_computed_eigenvectors_does_not_matter(valence, monke
     uv = np.array([(0.0, 0.0), (0.3, 0.7), (2.0**-20, 2.0**-21)])
     found = []
     for turn in (Eigenbasis.turned_over, lambda basis: basis):
-        monkeypatch.setattr(irregular_patch, "eigenbasis", lambda *given, turn=turn: turn(eigenbasis(*given)))
-        patch = irregular_patch.irregular_patch.__wrapped__(CatmullClark(), structure_of(valence))
+        monkeypatch.setattr(patch_module, "eigenbasis", lambda *given, turn=turn: turn(eigenbasis(*given)))
+        patch = replace(patch_of(valence))
         found.append(patch.rows(uv, "stabilized", np.float64).rows @ patch.basis.inverse)
     np.testing.assert_allclose(*found, rtol=0, atol=RESIDUAL)
 

@@ -11,8 +11,7 @@ from mitsuba_subdivision.evaluation.equations import (
     stabilized_rows,
     stam_rows,
 )
-from mitsuba_subdivision.evaluation.irregular_patch import irregular_patch
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, isolated_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, isolated_signature
 from mitsuba_subdivision.schemes import scheme_named
 
 # Sums of some twenty terms whose size is about one; derivatives and points are divided by their own factors.
@@ -25,7 +24,7 @@ EVERY_CASE = pytest.mark.parametrize(("scheme", "valence"), CASES)
 
 def patch_of(name, valence):
     scheme = scheme_named(name)
-    return irregular_patch(scheme, irregular_structure(scheme, isolated_signature(scheme, valence)))
+    return irregular_patch(scheme, isolated_signature(scheme, valence))
 
 
 def samples_of(scheme):
@@ -45,7 +44,7 @@ def at_samples(patch, derivative):
     """Of each sample, its level and ``b^T P_k``."""
     for n, k, local, _ in samples_of(patch.scheme):
         b = patch.scheme.regular_basis(local[None], 2)[derivative, 0]
-        yield n, b @ patch.structure.children[k - 1]
+        yield n, b @ patch.children[k - 1]
 
 
 def sums(patch, first_term, base, derivative):
@@ -79,11 +78,11 @@ def test_samples_are_found_in_their_child(scheme, valence):
 @EVERY_CASE
 def test_equation_4(scheme, valence):
     patch = patch_of(scheme, valence)
-    level, rows = rows_of(patch, patch.structure.children)
-    found = power_rows(rows, level, patch.structure.matrix)
+    level, rows = rows_of(patch, patch.children)
+    found = power_rows(rows, level, patch.matrix)
     for derivative, order in enumerate(ORDERS):
         samples = at_samples(patch, derivative)
-        expected = [row @ np.linalg.matrix_power(patch.structure.matrix, n) for n, row in samples]
+        expected = [row @ np.linalg.matrix_power(patch.matrix, n) for n, row in samples]
         scale = factors(patch, order)[:, None]
         np.testing.assert_allclose(found[derivative] / scale, expected, rtol=0, atol=ROUNDING)
 
@@ -123,7 +122,7 @@ def test_equation_13(scheme, valence):
     coordinates = patch.basis.inverse @ control_points
     point, first, second = limit_rows(len(coordinates)) @ coordinates
     normal = np.cross(first, second)
-    assert characteristic_jacobian(patch.scheme, patch.structure.children, patch.basis.vectors) > 0
+    assert characteristic_jacobian(patch.scheme, patch.children, patch.basis.vectors) > 0
     near = patch.rows(np.array([(2.0**-300, 2.0**-300)]), "stabilized", np.float64).rows[:, 0] @ coordinates
     np.testing.assert_allclose(near[0], point, rtol=0, atol=ROUNDING)
     found, expected = (each / np.linalg.norm(each) for each in (np.cross(near[1], near[2]), normal))

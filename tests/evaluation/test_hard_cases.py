@@ -9,7 +9,7 @@ from evaluation.common import assert_exact, evaluate_from
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
 from mitsuba_subdivision.evaluation.equations import times_powers
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch
 from mitsuba_subdivision.mesh.signature import signature_at
 from patches.closed_cages import cube_with_valence_2
 from reference.bars import DERIVATIVE, NORMAL, POINT
@@ -29,17 +29,17 @@ DEEP = (60, 75, 90)
 ZERO = 1e-12
 
 
-def structure_of(scheme, valence):
+def patch_of(scheme, valence):
     surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
     half_edge = int(surface.patches.half_edge_of_corner[0])
     signature = signature_at(surface.cage.topology, half_edge, surface.scheme.element)
-    return irregular_structure(surface.scheme, signature)
+    return irregular_patch(surface.scheme, signature)
 
 
 @EVERY_DEFECTIVE
 def test_the_matrix_is_defective_and_its_basis_keeps_a_block(case):
     scheme, valence, eigenvalue, algebraic, geometric = case
-    matrix = structure_of(scheme, valence).matrix
+    matrix = patch_of(scheme, valence).matrix
     shifted = matrix - eigenvalue * np.eye(len(matrix))
     for power, expected in ((1, geometric), (2, algebraic), (3, algebraic)):
         singular = np.linalg.svd(np.linalg.matrix_power(shifted, power), compute_uv=False)
@@ -56,7 +56,7 @@ def test_the_matrix_is_defective_and_its_basis_keeps_a_block(case):
 def test_scaled_powers_of_a_defective_matrix_match_mpmath(case, level):
     """``V (T / lambda_2)^n L`` without its first eigenvector is ``(A^n - 1 l) / lambda_2^n``, in 60 digits."""
     scheme, valence, *_ = case
-    matrix = structure_of(scheme, valence).matrix
+    matrix = patch_of(scheme, valence).matrix
     basis = eigenbasis(matrix)
     with mpmath.workdps(60):
         exact = mpmath.matrix(matrix.tolist())

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from evaluation.common import ChangedCatmullClark
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, lattice_stencils, patch_tree, rotation_order
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, lattice_stencils, patch_tree, rotation_order
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
@@ -66,9 +66,8 @@ def test_pieces_cover_the_domain_once_and_lie_inside_and_stencils_sum_to_one():
             sums = [piece.stencils.sum(axis=1)]
             own = 16
             if piece.patch is not None:
-                structure = piece.patch.structure
-                own = one_ring(structure.signature).vertex_count
-                sums += [structure.matrix.sum(axis=1), structure.children.sum(axis=2).ravel()]
+                own = one_ring(piece.patch.signature).vertex_count
+                sums += [piece.patch.matrix.sum(axis=1), piece.patch.children.sum(axis=2).ravel()]
             assert piece.stencils.shape == (own, count)
             np.testing.assert_allclose(np.concatenate(sums), 1, rtol=0, atol=ROUNDING)
 
@@ -80,7 +79,7 @@ def test_a_piece_has_at_most_one_extraordinary_point_at_its_origin_and_all_of_th
         found = Counter()
         for piece in pieces(signature):
             if piece.patch is not None:
-                fan, *others = piece.patch.structure.signature.fans
+                fan, *others = piece.patch.signature.fans
                 assert set(fan.ahead) == {4}
                 assert fan.face_count != 4
                 assert others == [REGULAR_FAN] * 3
@@ -97,7 +96,7 @@ def test_a_piece_has_at_most_one_extraordinary_point_at_its_origin_and_all_of_th
 @pytest.mark.parametrize("valence", [2, *VALENCES])
 def test_isolated_extraordinary_vertex_needs_no_refinement(valence, corner):
     (piece,) = pieces(isolated(valence, corner))
-    assert piece.patch.structure.signature == isolated(valence)
+    assert piece.patch.signature == isolated(valence)
     np.testing.assert_array_equal(piece.domain(SQUARE.corners[corner]), [0, 0])
     # A permutation, which turns the one-ring.
     order = rotation_order(isolated(valence, corner), corner)
@@ -107,11 +106,11 @@ def test_isolated_extraordinary_vertex_needs_no_refinement(valence, corner):
 
 @pytest.mark.parametrize("valence", VALENCES)
 def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
-    structure = irregular_structure(SCHEME, isolated(valence))
+    patch = irregular_patch(SCHEME, isolated(valence))
     old = 2 * valence + 8
-    assert structure.matrix.shape == (old, old)
-    assert structure.children.shape == (3, 16, old)
-    new = np.unique(np.vstack([structure.matrix, *structure.children]), axis=0)
+    assert patch.matrix.shape == (old, old)
+    assert patch.children.shape == (3, 16, old)
+    new = np.unique(np.vstack([patch.matrix, *patch.children]), axis=0)
     assert len(new) == 2 * valence + 17
     if valence == 5:
         assert (old, len(new)) == (18, 27)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.eigenbasis import Eigenbasis, eigenbasis
 from mitsuba_subdivision.evaluation.normals import limit_frame
-from mitsuba_subdivision.evaluation.patch_tree import irregular_structure, regular_signature
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, regular_signature
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from mitsuba_subdivision.mesh.signature import Fan, Signature
 from mitsuba_subdivision.schemes import scheme_named
@@ -33,9 +33,9 @@ CASES = {
 def test_the_frame_does_not_depend_on_the_signs_of_eigenvectors(scheme, faces, rule):
     """They are up to rounding, and differ between libraries."""
     scheme = scheme_named(scheme)
-    structure = irregular_structure(scheme, signature_at_corner(scheme, faces, rule))
-    basis = eigenbasis(structure.matrix)
-    expected = limit_frame(scheme, structure.signature, basis) @ basis.inverse
+    patch = irregular_patch(scheme, signature_at_corner(scheme, faces, rule))
+    basis = eigenbasis(patch.matrix)
+    expected = limit_frame(scheme, patch.signature, basis) @ basis.inverse
     for which in ([1], [2], [1, 2], [1, 2, 3], [3]):
         sign = np.ones(len(basis.eigenvalues))
         sign[which] = -1
@@ -43,5 +43,5 @@ def test_the_frame_does_not_depend_on_the_signs_of_eigenvectors(scheme, faces, r
         turned = Eigenbasis(
             basis.vectors * sign, basis.inverse * sign[:, None], basis.eigenvalues, basis.moduli, blocks
         )
-        found = limit_frame(scheme, structure.signature, turned) @ turned.inverse
+        found = limit_frame(scheme, patch.signature, turned) @ turned.inverse
         np.testing.assert_allclose(found, expected, rtol=0, atol=EIGENVECTOR)

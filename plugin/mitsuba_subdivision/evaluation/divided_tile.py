@@ -106,13 +106,12 @@ class DividedTile:
         """
         if self._source is None:
             return np.empty((4, 0), dtype=np.int64)
-        structure = self._source.structure if isinstance(self._source, IrregularPatch) else self._source
-        t = one_ring(structure.signature.smoothed).topology
+        t = one_ring(self._source.signature.smoothed).topology
         a, b, c, d = t.face_vertices[t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4]
         vertices = np.stack([a, c, b, d])
-        if isinstance(self._source, IrregularPatch) and self._source.structure.slots is not None:
+        if isinstance(self._source, IrregularPatch):
             number = np.full(t.vertex_count, -1)
-            number[self._source.structure.slots] = np.arange(len(self._source.structure.slots))
+            number[self._source.slots] = np.arange(len(self._source.slots))
             vertices = number[vertices]
         return vertices[:, (vertices >= 0).all(axis=0)]
 

@@ -42,9 +42,10 @@ FLOAT32_SIZE = 2.0**-24
 
 
 @dataclass(frozen=True, eq=False)
-class IrregularStructure:
-    """Subdivision matrices of a one-ring with an extraordinary point at (0, 0), computed by running the rules."""
+class IrregularPatch:
+    """A patch whose corner (0, 0) is extraordinary, with the subdivision matrices that running the rules gives."""
 
+    scheme: Scheme
     signature: Signature  # Signature of the one-ring and of child 0
     # (K,) int64: the vertices of the one-ring that are control points: all, except at a dart, where one of two equal
     # vertices is left out
@@ -54,33 +55,24 @@ class IrregularStructure:
     # lattice
     children: FloatArray
 
-
-@dataclass(frozen=True, eq=False)
-class IrregularPatch:
-    """A patch whose corner (0, 0) is extraordinary."""
-
-    scheme: Scheme
-    structure: IrregularStructure  # A and ``P_k Ā``
-
     @cached_property
     def basis(self) -> Eigenbasis:
         """Eigenbasis of A, oriented so that the characteristic map preserves the orientation of the parameters.
 
         Raises SchemeError if the rules do not contract the one-ring to a point.
         """
-        structure = self.structure
         try:
-            basis = eigenbasis(structure.matrix)
+            basis = eigenbasis(self.matrix)
         except EigenbasisError as error:
-            ring = f"a {structure.signature.kind} with fans {structure.signature.fans}"
+            ring = f"a {self.signature.kind} with fans {self.signature.fans}"
             raise SchemeError(f"{self.scheme.name}: subdivision matrix of {ring}: {error}") from error
-        jacobian = characteristic_jacobian(self.scheme, structure.children, basis.vectors)
+        jacobian = characteristic_jacobian(self.scheme, self.children, basis.vectors)
         return basis.turned_over() if jacobian < 0 else basis
 
     @cached_property
     def eigen_children(self) -> FloatArray:
         """``(3, R, K)`` float64, ``P_k Ā V``: control points of the regular children of each eigenvector."""
-        return self.structure.children @ self.basis.vectors
+        return self.children @ self.basis.vectors
 
     @cached_property
     def limit_frame(self) -> FloatArray:
@@ -88,7 +80,7 @@ class IrregularPatch:
 
         Their cross product is along the normal.
         """
-        return limit_frame(self.scheme, self.structure.signature, self.basis)
+        return limit_frame(self.scheme, self.signature, self.basis)
 
     @cached_property
     def edge_tangents(self) -> FloatArray:
@@ -110,7 +102,7 @@ class IrregularPatch:
     @property
     def has_own_frame(self) -> bool:
         """Whether normals need a frame in place of the derivatives: on borders, creases, and at sharp vertices."""
-        is_inside = self.structure.signature.fans[0].is_inside
+        is_inside = self.signature.fans[0].is_inside
         return not is_inside or self.contracts_unevenly or self.basis.eigenvalues[2] < 0
 
     @property
@@ -138,17 +130,14 @@ class IrregularPatch:
         """
         if evaluator == "limit":
             return self._rows_at_point(len(uv), dtype, derivatives)
-        tables = self.structure.children if evaluator == "power" else self.eigen_children
+        tables = self.children if evaluator == "power" else self.eigen_children
         level, rows = child_rows(self.scheme, uv, tables.astype(dtype, copy=False), derivatives)
         at_point = self.scheme.domain.extent(uv) == 0
         # At levels beyond the resolution of their precision, the published forms and the derivative scale overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             if evaluator == "stabilized":
                 return self._stabilized(rows, level, at_point, derivatives)
-            if evaluator == "stam":
-                rows = stam_rows(rows, level, self.basis)
-            else:
-                rows = power_rows(rows, level, self.structure.matrix)
+            rows = stam_rows(rows, level, self.basis) if evaluator == "stam" else power_rows(rows, level, self.matrix)
         rows[:, at_point] = np.nan
         scale = np.ones((2, len(uv)), dtype=dtype)
         return SampleRows(rows, scale, np.where(at_point, AT_EXTRAORDINARY_POINT, level))
@@ -174,18 +163,6 @@ class IrregularPatch:
         rows[1:3] = self.edge_tangents[:, None, :]
         frame = np.repeat(self.limit_frame[:, None, :], count, axis=1).astype(dtype) if self.has_own_frame else None
         return SampleRows(rows, np.ones((2, count), dtype=dtype), np.full(count, AT_EXTRAORDINARY_POINT), frame)
-
-
-@lru_cache(maxsize=1024)
-def irregular_patch(scheme: Scheme, structure: IrregularStructure) -> IrregularPatch:
-    """Return the patch of an irregular one-ring, with its eigenbasis.
-
-    Raises SchemeError if the rules do not contract the one-ring to a point.
-    """
-    patch = IrregularPatch(scheme, structure)
-    # The property raises if there is no eigenbasis.
-    _ = patch.basis
-    return patch
 
 
 @lru_cache(maxsize=4096)

@@ -10,14 +10,12 @@ A frame consists of two tangents whose cross product is along the normal. There 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import VertexRule
 from ..mesh.one_ring import OneRing, one_ring
-from ..mesh.signature import Fan, Signature
+from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .eigenbasis import Eigenbasis
@@ -90,47 +88,76 @@ def _are_rounding(
     return suspect
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """An extraordinary point: the first corner of an element whose one-ring is self-similar."""
-
-    fan: Fan
-    ring: OneRing  # Its first vertex is the point
-    basis: Eigenbasis
-    regular_border_faces: int  # `Scheme.regular_border_faces`: number of faces at each vertex of a regular border
-
-    def frame(self) -> FloatArray:
-        """Return the frame: ``(2, K)`` coefficients over the eigen-coordinates."""
-        if self.fan.is_inside or self.fan.rule == VertexRule.DART:
-            # Smooth inner vertices, and darts, where a crease ends.
-            return _smooth_frame(self)
-        if self.fan.is_closed:
-            return _tip_frame(self)
-        if self.fan.rule == VertexRule.CORNER:
-            # At a wide corner the surface is the tip of a cone.
-            is_narrow = self.fan.face_count < self.regular_border_faces
-            return _narrow_corner_frame(self) if is_narrow else _tip_frame(self)
-        return _lone_face_frame(self) if self.fan.face_count == 1 else _border_frame(self)
-
-    @property
-    def edges(self) -> FloatArray:
-        """Edge vectors at the point, counter-clockwise, over the eigen-coordinates.
-
-        Control points are ``C = V ĉ``, so the difference of two control points is a difference of rows of V.
-        """
-        return self.basis.vectors[self.ring.edge_neighbours()] - self.basis.vectors[0]
-
-    @property
-    def along_border(self) -> FloatArray:
-        """Vector from the last to the first neighbour on the border, over the eigen-coordinates."""
-        first, *_, last = self.ring.edge_neighbours()
-        return self.basis.vectors[first] - self.basis.vectors[last]
-
-
 def limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> FloatArray:
-    """Return the frame at the extraordinary point: ``(2, K)`` coefficients over the eigen-coordinates."""
-    border_faces = scheme.regular_border_faces
-    return _Point(signature.fans[0], one_ring(signature), basis, border_faces).frame()
+    """Return the frame at the extraordinary point: ``(2, K)`` coefficients over the eigen-coordinates.
+
+    At a smooth inner vertex, and at a dart, where a crease ends, these are the tangents ``ĉ_2`` and ``ĉ_3`` of equation
+    (13); zero where the third eigenvalue is negative, as at a dart of valence 2: the second tangent changes sign at
+    every level, so the normal has no limit.
+    """
+    fan, ring, border_faces = signature.fans[0], one_ring(signature), scheme.regular_border_faces
+    if fan.is_inside or fan.rule == VertexRule.DART:
+        frame = limit_rows(len(basis.eigenvalues))[1:]
+        return frame if basis.eigenvalues[2] > 0 else np.zeros_like(frame)
+    # Control points are ``C = V ĉ``, so the edge vectors at the point are differences of rows of V.
+    first, *_, last = neighbours = ring.edge_neighbours()
+    edges = basis.vectors[neighbours] - basis.vectors[0]
+    if fan.is_closed:
+        return _tip_weights(len(edges), 2 * np.pi / fan.face_count) @ edges
+    if fan.rule == VertexRule.CORNER:
+        if fan.face_count < border_faces:
+            # The two edges span the tangent plane.
+            return edges[[0, -1]]
+        # At a wide corner the surface is the tip of a cone.
+        return _tip_weights(len(edges), min(2 * np.pi / fan.face_count, np.pi / border_faces)) @ edges
+    inward = _across_lone_face(ring, basis) if fan.face_count == 1 else _inward(basis, neighbours[1])
+    return np.stack([basis.vectors[first] - basis.vectors[last], inward])
+
+
+def _tip_weights(edge_count: int, turn: float) -> FloatArray:
+    """Return the cosine and the sine of the angle of each edge at the tip of a cone: ``(2, edge_count)``.
+
+    The surface has no normal there. Sums of the edge vectors with these weights give the same normal to all faces on
+    one side. The first and the last edge would not: they are opposite where two creases meet, and equal where a crease
+    ends. Angles between edges are taken as equal. Inside they add up to a full turn. In a corner each is that of a
+    regular border, or less, so that their sum is at most a full turn.
+    """
+    angles = turn * np.arange(edge_count)
+    weights = np.stack([np.cos(angles), np.sin(angles)])
+    # Where two edges are opposite, the rounding error of sin(pi) would give a tangent.
+    weights[np.abs(weights) < ROUNDED] = 0
+    return weights
+
+
+def _inward(basis: Eigenbasis, inner: int) -> FloatArray:
+    """Return the eigenvector of the largest eigenvalue that leads inward from a border; ``inner`` is a vertex inside.
+
+    The border curve depends on border vertices only, so the weights of inner vertices are zero in its eigenvectors.
+    With very many faces on one side the surface has no tangent plane, because inner modes contract no faster than the
+    border. This eigenvector then gives the limit along the border.
+    """
+    weights = np.abs(basis.inverse[1:, inner]) / np.abs(basis.inverse[1:]).max(axis=1)
+    mode = 1 + int(np.argmax(weights > INSIDE))
+    inward = np.zeros(len(basis.eigenvalues))
+    inward[mode] = np.sign(basis.inverse[mode, inner])
+    return inward
+
+
+def _across_lone_face(ring: OneRing, basis: Eigenbasis) -> FloatArray:
+    """Return the direction across a face that is alone at a vertex on a border.
+
+    The face contracts by 1/4 across its corner. For quadrilaterals this eigenvalue has a Jordan block. The powers of
+    the block tend to the image of its nilpotent part.
+    """
+    inward = np.zeros(len(basis.eigenvalues))
+    inward[2] = 1
+    for block_slice, block in basis.blocks:
+        if block_slice.start <= 2 < block_slice.stop:
+            nilpotent = block - basis.eigenvalues[2] * np.eye(len(block))
+            inward[block_slice] = nilpotent[np.argmax(np.abs(nilpotent).sum(axis=1))]
+    # Orient towards the other vertices of the face, which is the first of the ring.
+    face_vertices = ring.topology.face_vertices[1 : ring.topology.face_sizes[0]]
+    return inward * np.sign(inward @ basis.inverse[:, face_vertices].sum(axis=1))
 
 
 def uneven_frame(
@@ -160,72 +187,3 @@ def uneven_frame(
             times_powers(across[None], level, basis, basis.moduli[2])[0],
         ]
     )
-
-
-def _smooth_frame(point: _Point) -> FloatArray:
-    """Return the tangents ``ĉ_2`` and ``ĉ_3`` of equation (13).
-
-    Zero where the third eigenvalue is negative, as at a dart of valence 2: the second tangent changes sign at every
-    level, so the normal has no limit.
-    """
-    frame = limit_rows(len(point.basis.eigenvalues))[1:]
-    return frame if point.basis.eigenvalues[2] > 0 else np.zeros_like(frame)
-
-
-def _tip_frame(point: _Point) -> FloatArray:
-    """Return the sums of all edge vectors at the point, times the cosine and the sine of their angle.
-
-    The surface is the tip of a cone and has no normal. This frame gives the same normal to all faces on one side. The
-    first and the last edge would not: they are opposite where two creases meet, and equal where a crease ends. Angles
-    between edges are taken as equal. Inside they add up to a full turn. In a corner each is that of a regular border,
-    or less, so that their sum is at most a full turn.
-    """
-    turn = 2 * np.pi / point.fan.face_count
-    if not point.fan.is_closed:
-        turn = min(turn, np.pi / point.regular_border_faces)
-    angles = turn * np.arange(len(point.edges))
-    weights = np.stack([np.cos(angles), np.sin(angles)])
-    # Where two edges are opposite, the rounding error of sin(pi) would give a tangent.
-    weights[np.abs(weights) < ROUNDED] = 0
-    return weights @ point.edges
-
-
-def _narrow_corner_frame(point: _Point) -> FloatArray:
-    """Return the first and the last edge vector of the corner, which span its tangent plane."""
-    return point.edges[[0, -1]]
-
-
-def _border_frame(point: _Point) -> FloatArray:
-    """Return the tangent along the border, and the eigenvector of the largest eigenvalue that leads inward.
-
-    The border curve depends on border vertices only, so the weights of inner vertices are zero in its eigenvectors.
-    With very many faces on one side the surface has no tangent plane, because inner modes contract no faster than the
-    border. This frame is then the limit along the border.
-    """
-    basis = point.basis
-    _, inner, *_ = point.ring.edge_neighbours()
-    weights = np.abs(basis.inverse[1:, inner]) / np.abs(basis.inverse[1:]).max(axis=1)
-    mode = 1 + int(np.argmax(weights > INSIDE))
-    inward = np.zeros(len(basis.eigenvalues))
-    inward[mode] = np.sign(basis.inverse[mode, inner])
-    return np.stack([point.along_border, inward])
-
-
-def _lone_face_frame(point: _Point) -> FloatArray:
-    """Return the tangent along the border, and the direction across the face.
-
-    A lone face contracts by 1/4 across its corner. For quadrilaterals this eigenvalue has a Jordan block. The powers of
-    the block tend to the image of its nilpotent part.
-    """
-    basis = point.basis
-    inward = np.zeros(len(basis.eigenvalues))
-    inward[2] = 1
-    for block_slice, block in basis.blocks:
-        if block_slice.start <= 2 < block_slice.stop:
-            nilpotent = block - basis.eigenvalues[2] * np.eye(len(block))
-            inward[block_slice] = nilpotent[np.argmax(np.abs(nilpotent).sum(axis=1))]
-    # Orient towards the other vertices of the face, which is the first of the ring.
-    topology = point.ring.topology
-    face_vertices = topology.face_vertices[1 : topology.face_sizes[0]]
-    inward *= np.sign(inward @ basis.inverse[:, face_vertices].sum(axis=1))
-    return np.stack([point.along_border, inward])

@@ -27,8 +27,8 @@ from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Fan, Signature
 from ..schemes.domain import IDENTITY, AffineMap, FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from .irregular_patch import IrregularPatch, IrregularStructure, irregular_patch
-from .refined_rings import RefinedRing, refined_ring, ring_pattern
+from .irregular_patch import IrregularPatch
+from .refined_rings import child_domains, child_signature, child_stencils
 
 # Maximum number of refinements until an element without semi-sharp features consists of pieces. A scheme that needs
 # more is refused: its rules keep making new extraordinary points. The schemes of this package need one or two.
@@ -89,7 +89,7 @@ class PatchTree:
 
         Raises SchemeError if the scheme divides domains differently.
         """
-        domains = ring_pattern(self.scheme, self.signature.smoothed).domains
+        domains = child_domains(self.scheme, self.signature)
         expected = (IDENTITY,) if len(domains) == 1 else self.scheme.domain.children
         if len(domains) != len(expected) or not all(a.is_same(b) for a, b in zip(domains, expected, strict=True)):
             raise SchemeError(
@@ -101,12 +101,12 @@ class PatchTree:
     def child(self, number: int) -> tuple[PatchTree, FloatArray]:
         """Return a child and its stencils over the element's control points: ``(K_child, K)`` float64."""
         if number not in self._stencils:
-            self._stencils[number] = self._ring.stencils(number)
+            self._stencils[number] = child_stencils(self.scheme, self.signature, number)
         return self.child_element(number), self._stencils[number]
 
     def child_element(self, number: int) -> PatchTree:
         if number not in self._children:
-            self._children[number] = patch_tree(self.scheme, self._ring.signature(number))
+            self._children[number] = patch_tree(self.scheme, child_signature(self.scheme, self.signature, number))
         return self._children[number]
 
     @property
@@ -118,10 +118,6 @@ class PatchTree:
     def child_elements(self) -> list[PatchTree]:
         """All children; empty for a piece."""
         return [] if self.piece is not None else [self.child_element(number) for number in range(len(self.domains))]
-
-    @cached_property
-    def _ring(self) -> RefinedRing:
-        return refined_ring(self.scheme, self.signature)
 
     @cached_property
     def regular_count(self) -> int:
@@ -286,12 +282,11 @@ def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
     if lattice is not None:
         return Piece(IDENTITY, lattice, None)
     for corner in range(rotation_count(scheme, signature)):
-        structure = irregular_structure(scheme, signature.rotated(corner))
-        if structure is not None:
+        patch = irregular_patch(scheme, signature.rotated(corner))
+        if patch is not None:
             order = rotation_order(signature, corner)
             domain = scheme.domain.rotation(corner).inverse()
-            patch = irregular_patch(scheme, structure)
-            return Piece(domain, np.eye(len(order))[order[structure.slots]], patch)
+            return Piece(domain, np.eye(len(order))[order[patch.slots]], patch)
     return None
 
 
@@ -338,34 +333,32 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=1024)
-def irregular_structure(scheme: Scheme, signature: Signature) -> IrregularStructure | None:
-    """Return the subdivision matrices of a self-similar one-ring, or None if it is not self-similar.
+def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | None:
+    """Return the patch of a self-similar one-ring, or None if it is not self-similar.
 
     In a self-similar one-ring child 0 has the same signature as the element, and the other children are regular.
     """
+    count = len(scheme.domain.children)
     # The other corners of the element are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
         return None
-    if len(ring_pattern(scheme, signature.smoothed).domains) != len(scheme.domain.children):
+    if len(child_domains(scheme, signature)) != count or child_signature(scheme, signature, 0) != signature:
         return None
-    ring = refined_ring(scheme, signature)
-    if ring.signature(0) != signature:
-        return None
-    matrix, regular_stencils = ring.stencils(0), []
-    for number in range(1, len(scheme.domain.children)):
-        lattice = lattice_stencils(scheme, ring.signature(number))
+    matrix, regular_stencils = child_stencils(scheme, signature, 0), []
+    for number in range(1, count):
+        lattice = lattice_stencils(scheme, child_signature(scheme, signature, number))
         if lattice is None:
             return None
-        regular_stencils.append(lattice @ ring.stencils(number))
+        regular_stencils.append(lattice @ child_stencils(scheme, signature, number))
     children = np.stack(regular_stencils)
     slots = np.arange(len(matrix))
     if (merged := _merged_slots(signature)) is not None:
         kept, dropped = merged
         slots = np.delete(slots, dropped)
-        for stencils in (matrix, children):
-            stencils[..., kept] += stencils[..., dropped]
+        for weights in (matrix, children):
+            weights[..., kept] += weights[..., dropped]
         matrix, children = matrix[np.ix_(slots, slots)], children[..., slots]
-    return IrregularStructure(signature, slots, matrix, children)
+    return IrregularPatch(scheme, signature, slots, matrix, children)
 
 
 def _merged_slots(signature: Signature) -> tuple[int, int] | None:

@@ -1,7 +1,10 @@
-"""One refinement of one-rings.
+"""One refinement of one-rings: the children of an element.
 
 An element usually has four children, which are copies of its domain. An element that does not fit the domain, such as a
 corner of a pentagon under Catmull-Clark, has one child that does.
+
+Semi-sharp features change the weights of refined vertices, but not the refined connectivity. So connectivity is
+computed once for all one-rings that differ in semi-sharp features only.
 """
 
 from __future__ import annotations
@@ -20,105 +23,72 @@ from ..mesh.signature import (
     with_sharpness,
 )
 from ..schemes.domain import AffineMap, FloatArray
-from ..schemes.scheme import Scheme, SchemeError
+from ..schemes.scheme import Refinement, Scheme, SchemeError
 
 # Tolerance when comparing the sum of a stencil's weights with 1.
 ROW_SUM = 1e-12
 
 
-class RingPattern:
-    """The refinement of a one-ring without its semi-sharp features.
+# The limit is that of `patch_tree`.
+@lru_cache(maxsize=8192)
+def refined_ring(scheme: Scheme, signature: Signature) -> Refinement:
+    """Refine the one-ring of a signature."""
+    refined = scheme.refine(one_ring(signature).topology)
+    if not signature.is_semi_sharp:
+        return refined
+    smooth, topology = refined_ring(scheme, signature.smoothed).topology, refined.topology
+    return Refinement(smooth.with_rules(topology.rules, topology.semi_sharpness), refined.stencils)
 
-    Semi-sharp features change the weights of refined vertices, but not the refined connectivity. So the children are
-    computed once for all one-rings that differ in semi-sharp features only.
 
-    Attributes
-    ----------
-    smooth : Signature
-        Signature without semi-sharp features.
-    refinement : Refinement
-        Refinement of this one-ring.
-    half_edges : list of int
-        Half-edge of each child in the refined mesh.
-    domains : tuple of AffineMap
-        Maps from the element's parameters to those of each child.
+@lru_cache(maxsize=1024)
+def _children(scheme: Scheme, smooth: Signature) -> list[tuple[AffineMap, int]]:
+    """Return the domain and the half-edge in the refined mesh of each child."""
+    return scheme.children(one_ring(smooth).topology, refined_ring(scheme, smooth).topology, 0)
+
+
+def child_domains(scheme: Scheme, signature: Signature) -> tuple[AffineMap, ...]:
+    """Return the maps from an element's parameters to those of each child."""
+    return tuple(domain for domain, _ in _children(scheme, signature.smoothed))
+
+
+@lru_cache(maxsize=4096)
+def _smooth_child(scheme: Scheme, smooth: Signature, number: int) -> tuple[Signature, IndexArray, IndexArray]:
+    """Return signature, control points and half-edges of a child in the refined one-ring.
+
+    The half-edges are those of the fans at its corners, fan by fan; in each fan the clockwise ones come first.
     """
-
-    def __init__(self, scheme: Scheme, smooth: Signature) -> None:
-        self.scheme, self.smooth = scheme, smooth
-        topology = one_ring(smooth).topology
-        self.refinement = scheme.refine(topology)
-        children = scheme.children(topology, self.refinement.topology, 0)
-        self.domains = tuple(domain for domain, _ in children)
-        self.half_edges = [half_edge for _, half_edge in children]
-        self._children: dict[int, tuple[Signature, IndexArray, IndexArray]] = {}
-
-    def child(self, number: int) -> tuple[Signature, IndexArray, IndexArray]:
-        """Return signature, control points and half-edges of a child in the refined one-ring.
-
-        Returns
-        -------
-        signature : Signature
-            Signature without semi-sharp features.
-        vertices : (K_child,) int32
-        around : (n,) int32
-            Half-edges of the fans at its corners, fan by fan; in each fan the clockwise ones come first.
-        """
-        if number not in self._children:
-            topology, kind = self.refinement.topology, self.scheme.element
-            fans = fan_half_edges(topology, self.half_edges[number], kind)
-            signature = smooth_signature(topology, fans, kind)
-            vertices = one_ring(signature).gather(topology, np.array(self.half_edges[number : number + 1]))[0]
-            self._children[number] = signature, vertices, half_edges_around(fans)
-        return self._children[number]
+    topology, half_edge = refined_ring(scheme, smooth).topology, _children(scheme, smooth)[number][1]
+    fans = fan_half_edges(topology, half_edge, scheme.element)
+    signature = smooth_signature(topology, fans, scheme.element)
+    return signature, one_ring(signature).gather(topology, np.array([half_edge]))[0], half_edges_around(fans)
 
 
-@lru_cache(maxsize=1024)
-def ring_pattern(scheme: Scheme, smooth: Signature) -> RingPattern:
-    """Return the refinement of a one-ring whose signature without semi-sharp features is ``smooth``."""
-    return RingPattern(scheme, smooth)
+def child_signature(scheme: Scheme, signature: Signature, number: int) -> Signature:
+    """Return the signature of a child."""
+    smooth, _, around = _smooth_child(scheme, signature.smoothed, number)
+    return with_sharpness(smooth, refined_ring(scheme, signature).topology, around)
 
 
-class RefinedRing:
-    """A one-ring refined once, and the children of its element."""
+def child_stencils(scheme: Scheme, signature: Signature, number: int) -> FloatArray:
+    """Return ``(K_child, K)`` stencils of a child's control points over those of the element.
 
-    def __init__(self, scheme: Scheme, signature: Signature) -> None:
-        self._pattern = ring_pattern(scheme, signature.smoothed)
-        self._topology, self._stencils = self._pattern.refinement.topology, self._pattern.refinement.stencils
-        if signature.is_semi_sharp:
-            refined, self._stencils = scheme.refine(one_ring(signature).topology)
-            # Reuse the connectivity, which does not depend on semi-sharp features.
-            self._topology = self._topology.with_rules(refined.rules, refined.semi_sharpness)
-
-    def signature(self, number: int) -> Signature:
-        """Return the signature of a child."""
-        smooth, _, around = self._pattern.child(number)
-        return with_sharpness(smooth, self._topology, around)
-
-    def stencils(self, number: int) -> FloatArray:
-        """Return ``(K_child, K)`` stencils of a child's control points over those of the element.
-
-        Raises SchemeError if the weights of a control point do not sum to one.
-        """
-        stencils = self._stencils.dense(self._pattern.child(number)[1])
-        error = np.abs(stencils.sum(axis=1) - 1)
-        # `not <=` also refuses NaN.
-        if not error.max() <= ROW_SUM:
-            smooth = self._pattern.smooth
-            raise SchemeError(
-                f"{self._pattern.scheme.name}: a refined vertex near a {smooth.kind} with fans {smooth.fans} has "
-                f"weights that sum to {stencils[np.argmax(error)].sum():.12g}; expected 1"
-            )
-        return stencils
-
-
-@lru_cache(maxsize=1024)
-def refined_ring(scheme: Scheme, signature: Signature) -> RefinedRing:
-    """Return the refined one-ring of a signature."""
-    return RefinedRing(scheme, signature)
+    Raises SchemeError if the weights of a control point do not sum to one.
+    """
+    smooth = signature.smoothed
+    stencils = refined_ring(scheme, signature).stencils.dense(_smooth_child(scheme, smooth, number)[1])
+    error = np.abs(stencils.sum(axis=1) - 1)
+    # `not <=` also refuses NaN.
+    if not error.max() <= ROW_SUM:
+        raise SchemeError(
+            f"{scheme.name}: a refined vertex near a {smooth.kind} with fans {smooth.fans} has "
+            f"weights that sum to {stencils[np.argmax(error)].sum():.12g}; expected 1"
+        )
+    return stencils
 
 
 def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
-    """Return domain, signature and stencils of all children of an element, see `RingPattern` and `RefinedRing`."""
-    ring, domains = refined_ring(scheme, signature), ring_pattern(scheme, signature.smoothed).domains
-    return [(domain, ring.signature(number), ring.stencils(number)) for number, domain in enumerate(domains)]
+    """Return domain, signature and stencils of all children of an element."""
+    return [
+        (domain, child_signature(scheme, signature, number), child_stencils(scheme, signature, number))
+        for number, domain in enumerate(child_domains(scheme, signature))
+    ]

@@ -11,9 +11,8 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
-from .irregular_patch import irregular_patch
 from .located_samples import LocatedSamples
-from .patch_tree import irregular_structure, isolated_signature, lattice_stencils, patch_tree, regular_signature
+from .patch_tree import irregular_patch, isolated_signature, lattice_stencils, patch_tree, regular_signature
 from .refined_rings import refined_children
 
 # Valences, and numbers of corners, with which a scheme is tested if it supports them.
@@ -51,9 +50,10 @@ def check_scheme(scheme: Scheme) -> None:
         for _, _, stencils in refined_children(scheme, signature):
             _check_signs(scheme, stencils)
         LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(1, int), inside, np.zeros(1, int))
-        structure = irregular_structure(scheme, signature)
-        if structure is not None:
-            irregular_patch(scheme, structure)
+        patch = irregular_patch(scheme, signature)
+        if patch is not None:
+            # Raises an error if there is no eigenbasis.
+            _ = patch.basis
     if scheme.has_phantom_points and scheme.has_local_borders:
         _check_local_borders(scheme)
 

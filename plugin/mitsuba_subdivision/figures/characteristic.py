@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..cage.structure import edges_of
 from ..evaluation.element import element_stencils
-from ..evaluation.irregular_patch import IrregularPatch, irregular_patch, level_domains, level_rows
-from ..evaluation.patch_tree import irregular_structure, isolated_signature, patch_tree
+from ..evaluation.irregular_patch import IrregularPatch, level_domains, level_rows
+from ..evaluation.patch_tree import irregular_patch, isolated_signature, patch_tree
 from ..evaluation.polynomials import regular_bernstein
 from ..evaluation.tree_arrays import PIECE_LEVELS
 from ..mesh.connectivity import Topology
@@ -45,7 +45,10 @@ LINE = "#2d3a45"
 
 def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
     """The patch with one extraordinary point, at its parameters (0, 0), and regular faces and vertices around it."""
-    return irregular_patch(scheme, irregular_structure(scheme, isolated_signature(scheme, valence)))
+    patch = irregular_patch(scheme, isolated_signature(scheme, valence))
+    if patch is None:
+        raise ValueError(f"valence {valence} is regular; expected an extraordinary one")
+    return patch
 
 
 class CharacteristicMap:
@@ -66,7 +69,7 @@ class CharacteristicMap:
 
     def __call__(self, uv: NDArray[np.floating]) -> NDArray[np.float64]:
         """Map parameters ``(s, 2)`` to points ``(s, 2)``."""
-        stencils = element_stencils(self.patch.scheme, self.patch.structure.signature, uv)
+        stencils = element_stencils(self.patch.scheme, self.patch.signature, uv)
         return (stencils[0] @ self.control_points).astype(np.float64, copy=False)
 
     def sector(self, points: NDArray[np.float64], index: int) -> NDArray[np.float64]:
@@ -140,8 +143,8 @@ def refinement_step(valence: int) -> tuple[CharacteristicMap, FloatArray, FloatA
     """
     patch = patch_of_valence(scheme_named("catmull_clark"), valence)
     characteristic = CharacteristicMap(patch, valence)
-    stencils = np.unique(np.concatenate([patch.structure.matrix, *patch.structure.children]).round(DECIMALS), axis=0)
-    ring = one_ring(patch.structure.signature).topology
+    stencils = np.unique(np.concatenate([patch.matrix, *patch.children]).round(DECIMALS), axis=0)
+    ring = one_ring(patch.signature).topology
     refinement = patch.scheme.refine(ring)
     # Refined points without such a stencil belong to neighbouring patches.
     distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)

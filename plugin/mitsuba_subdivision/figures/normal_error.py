@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
-from ..evaluation.patch_tree import irregular_structure
+from ..evaluation.patch_tree import irregular_patch
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
 from ..regression.tier_tests import normal_angle
@@ -103,13 +103,13 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
     # Vertex 0 is the first corner of face 0.
     signature = signature_at(cage.topology, 0, scheme.element)
     controls = one_ring(signature).gather(cage.topology, np.array([0]))[0]
-    structure = irregular_structure(scheme, signature)
-    if structure is None:
+    patch = irregular_patch(scheme, signature)
+    if patch is None:
         raise FigureError("vertex 0 is regular; expected an extraordinary vertex")
 
     with mpmath.workdps(DIGITS):
         # Rows are made to sum to one exactly: otherwise, rounding of the entries would add up over the levels.
-        tables = structure.matrix, *structure.children
+        tables = patch.matrix, *patch.children
         matrix, *children = (_rows_to(1, mpmath.matrix(table.tolist())) for table in tables)
         points = mpmath.matrix(cage.positions[controls].tolist())
         tangents = []
