@@ -6,7 +6,7 @@ the tracing time of Dr.Jit's functions of the same names.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 
@@ -95,41 +95,43 @@ class AffineMap:
     inverse: tuple[Sequence[Float], ...]  # Inverse of the linear map
 
     @classmethod
-    def of(
-        cls,
-        # Of Dr.Jit or NumPy. A missing inverse is computed, and is differentiable.
-        matrix: Matrix4,
-        inverse: Matrix4 | None = None,
-    ) -> AffineMap:
-        """The map of a 4x4 matrix, whose last row is ignored."""
+    def of(cls, matrix: Matrix4, inverse: Matrix4 | None = None) -> AffineMap:
+        """The map of a 4x4 matrix of Dr.Jit or NumPy, whose last row is ignored.
+
+        A missing inverse is computed, and is differentiable.
+        """
         rows = _rows(matrix)
         return cls(rows, [matrix[i, 3] for i in range(3)], _inverse(rows) if inverse is None else _rows(inverse))
 
     def point(self, point: Vector3) -> Vector3:
         """Map a point."""
         # Add the translation last: the coordinates of points far from the world's origin are then rounded once.
-        return like([x + y for x, y in zip(self.direction(point), self.translation, strict=True)], point)
+        return added(self.direction(point), self.translation)
 
     def direction(self, vector: Vector3) -> Vector3:
         """Map a vector without the translation."""
-        return like([dot(row, vector) for row in self.rows], vector)
+        return _product(self.rows, vector)
 
     def normal(self, normal: Vector3) -> Vector3:
         """Map a normal by the inverse transpose, without normalization. Reflections keep it on the outside."""
-        return like([dot(column, normal) for column in zip(*self.inverse, strict=True)], normal)
+        return _product(zip(*self.inverse, strict=True), normal)
 
     def inverse_point(self, point: Vector3) -> Vector3:
         """Map a point by the inverse."""
         # Subtract the translation first: both points may be far from the world's origin.
-        return self.inverse_direction(like([x - y for x, y in zip(point, self.translation, strict=True)], point))
+        return self.inverse_direction(added(point, self.translation, -1))
 
     def inverse_direction(self, vector: Vector3) -> Vector3:
         """Map a vector by the inverse, without the translation."""
-        return like([dot(row, vector) for row in self.inverse], vector)
+        return _product(self.inverse, vector)
 
 
 def _rows(matrix: Matrix4) -> tuple[Sequence[Float], ...]:
-    return tuple([matrix[i, k] for k in range(3)] for i in range(3))
+    return tuple([matrix[i, 0], matrix[i, 1], matrix[i, 2]] for i in range(3))
+
+
+def _product(rows: Iterable[Sequence[Float]], vector: Vector3) -> Vector3:
+    return like([dot(row, vector) for row in rows], vector)
 
 
 def _inverse(rows: tuple[Sequence[Float], ...]) -> tuple[Sequence[Float], ...]:
