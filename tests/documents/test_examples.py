@@ -144,11 +144,11 @@ def folder(tmp_path, monkeypatch):
     Plots have few pixels: most of the time to draw one goes into packing them.
     """
     from matplotlib.figure import Figure
-    from mitsuba_subdivision.schemes import scheme_table
+    from mitsuba_subdivision.schemes import scheme
 
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
-    monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
+    monkeypatch.setattr(scheme, "_SCHEMES", dict(scheme._SCHEMES))
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -64,9 +64,9 @@ class Bilinear(Scheme):
 @pytest.fixture
 def known(monkeypatch):
     """Forget registered schemes after the test."""
-    from mitsuba_subdivision.schemes import scheme_table
+    from mitsuba_subdivision.schemes import scheme
 
-    monkeypatch.setattr(scheme_table, "_SCHEMES", dict(scheme_table._SCHEMES))
+    monkeypatch.setattr(scheme, "_SCHEMES", dict(scheme._SCHEMES))
 
 
 @pytest.mark.usefixtures("known")

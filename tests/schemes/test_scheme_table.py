@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.schemes import SchemeError, scheme_named
-from mitsuba_subdivision.schemes.scheme_table import with_rules
+from mitsuba_subdivision.schemes.scheme import with_rules
 
 pytestmark = pytest.mark.core
 

@@ -12,7 +12,7 @@ from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_tree import patch_trees
 from mitsuba_subdivision.schemes import CatmullClark
-from mitsuba_subdivision.schemes.stencil_table import StencilTable
+from mitsuba_subdivision.schemes.scheme import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation import Criterion, Measure
 from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to

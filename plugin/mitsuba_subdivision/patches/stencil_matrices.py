@@ -13,7 +13,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..progress import counted
 from ..schemes.domain import FloatArray
-from ..schemes.stencil_table import StencilTable
+from ..schemes.scheme import StencilTable
 from .patch_table import PatchTable, RefinedPatches
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..cage.control_cage import ControlCage
 from ..cage.errors import warn
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules
-from ..schemes.scheme_table import require_scheme
+from ..schemes.scheme import require_scheme
 
 
 def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:

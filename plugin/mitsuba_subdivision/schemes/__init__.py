@@ -5,9 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..deferred import deferred
-from .scheme import PhantomPoint, Refinement, Scheme, SchemeError, Unsupported
-from .scheme_table import SCHEME_CLASSES, register_scheme, scheme_named, with_rules
-from .stencil_table import StencilTable
+from .scheme import (
+    SCHEME_CLASSES,
+    PhantomPoint,
+    Refinement,
+    Scheme,
+    SchemeError,
+    StencilTable,
+    Unsupported,
+    register_scheme,
+    scheme_named,
+    with_rules,
+)
 
 if TYPE_CHECKING:
     from .catmull_clark import CatmullClark

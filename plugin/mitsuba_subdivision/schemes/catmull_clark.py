@@ -8,10 +8,9 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
-from .crease_masks import crease_masks
+from .crease_masks import crease_masks, kept_rules, kept_sharpness
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import PhantomPoint, Refinement, Scheme, TriangleRule, kept_rules, kept_sharpness, tensor_basis
-from .stencil_table import StencilTable
+from .scheme import PhantomPoint, Refinement, Scheme, StencilTable, TriangleRule, tensor_basis
 
 
 class CatmullClark(Scheme):
@@ -71,7 +70,7 @@ class CatmullClark(Scheme):
         size = t.face_sizes[t.face].astype(float)
         masks = crease_masks(t)
         valence = np.maximum(t.vertex_face_count, 1).astype(float)
-        own_weight = masks.smooth * (valence - 2) / valence + masks.own
+        vertex_weight = masks.smooth * (valence - 2) / valence + masks.at_vertex
 
         # Weight of each of the two face points in an edge point, and of each end.
         face_weight = np.where((size == 3) & (self.triangle_rule == "smooth"), 0.47, 0.25)
@@ -92,7 +91,7 @@ class CatmullClark(Scheme):
             (vertex_of_edge[is_border], end[is_border], end_weight[is_border]),
             (vertex_of_edge[edge_corner], member[in_edge_point], (face_weight / size)[edge_corner]),
             # In (Q + 2 R + (n - 3) S) / n, R contains S / 2, so the weight of S without Q is (n - 2) / n.
-            (np.arange(n_v), np.arange(n_v), own_weight),
+            (np.arange(n_v), np.arange(n_v), vertex_weight),
             (origin[is_smooth], end[is_smooth], (masks.smooth / valence**2)[origin[is_smooth]]),
             (
                 origin[vertex_corner],

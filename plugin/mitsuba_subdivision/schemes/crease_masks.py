@@ -1,4 +1,4 @@
-"""Masks at borders, creases, corners and semi-sharp features, shared by Catmull-Clark and Loop.
+"""Masks at borders, creases, corners and semi-sharp features, and their refinement, for Catmull-Clark and Loop.
 
 A mask is the set of weights of coarse vertices for a refined vertex. The mask of a vertex depends on its number of
 sharp edges; a border edge is sharp.
@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology, VertexRule
+from ..mesh.sharpness import CreaseMethod, SemiSharpness
 from .domain import FloatArray
 
 # Weight of each of the two neighbours in the crease mask.
@@ -39,7 +40,7 @@ class CreaseMasks:
     """Masks of all vertices and edges: the scheme's smooth masks times a factor, plus further weights."""
 
     smooth: FloatArray  # (n_v,) float64: factor of the scheme's smooth mask in the mask of each vertex
-    own: FloatArray  # (n_v,) float64: further weight of the vertex itself
+    at_vertex: FloatArray  # (n_v,) float64: further weight of the vertex itself
     # (m,) int64 and (m,) float64: further weights of neighbours: of vertex ``columns`` in the mask of vertex ``rows``
     rows: IntArray
     columns: IntArray
@@ -116,14 +117,45 @@ def _blended(
     shares: list[tuple[tuple[IntArray, FloatArray], FloatArray]], centre: IntArray, far: IntArray, midpoint: FloatArray
 ) -> CreaseMasks:
     """Blend the masks before and after a refinement with their weights at each vertex, which sum to one."""
-    smooth, own = np.zeros((2, len(shares[0][1])))
+    smooth, at_vertex = np.zeros((2, len(shares[0][1])))
     rows, columns, weights = [], [], []
     for (sharp_count, along), share in shares:
         smooth += share * (sharp_count < 2)
         # The vertex's weight beside the smooth mask (none), in the crease mask and in the corner mask.
-        own += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]
+        at_vertex += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]
         creased = np.flatnonzero((along > 0) & (sharp_count == 2)[centre] & (share > 0)[centre])
         rows.append(centre[creased])
         columns.append(far[creased])
         weights.append(CREASE_NEIGHBOUR * along[creased] * share[centre[creased]])
-    return CreaseMasks(smooth, own, np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), midpoint)
+    return CreaseMasks(
+        smooth, at_vertex, np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), midpoint
+    )
+
+
+def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
+    """Return the vertex rules after a refinement that keeps the vertices and appends new ones."""
+    if topology.rules is None:
+        return None
+    return np.concatenate([topology.rules, np.zeros(new_count, dtype=np.int8)])
+
+
+def kept_sharpness(
+    topology: Topology,
+    # (n_h',) int: `Topology.face_vertices` of the refined mesh. The faces at coarse corners come first, each listed
+    # from the coarse vertex on.
+    face_vertices: NDArray[np.integer],
+    # Index of the last edge in each of these faces. The first and the last edge are halves of coarse edges.
+    last: int,
+    new_count: int,  # Number of appended vertices
+    method: CreaseMethod,
+) -> SemiSharpness | None:
+    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner."""
+    semi, t = topology.semi_sharpness, topology
+    if semi is None:
+        return None
+    edges = np.zeros(len(face_vertices))
+    corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
+    corners[:, 0] = semi.edges_refined
+    ahead = t.turn(np.arange(t.half_edge_count))
+    corners[:, last] = np.where(ahead < 0, 0, semi.edges_refined[ahead])
+    return semi.refined(face_vertices, edges, new_count, method)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cached_property, lru_cache, reduce
 from typing import Any, NamedTuple
 
@@ -44,7 +45,7 @@ class AffineMap(NamedTuple):
 IDENTITY = AffineMap(np.eye(2), np.zeros(2))
 
 
-class ParameterDomain:
+class ParameterDomain(ABC):
     """A parameter domain with a corner at (0, 0), which splits into four copies of half the size, its children.
 
     There are two, `SQUARE` and `TRIANGLE`. Arguments ``u`` and ``v`` may be NumPy or Dr.Jit arrays.
@@ -57,8 +58,8 @@ class ParameterDomain:
         Maps from the parameters of the domain to those of each child. Child 0 contains the corner (0, 0).
     """
 
-    def __init__(self, name: str, corners: FloatArray, children: tuple[AffineMap, ...]) -> None:
-        self.name, self.corners, self.children = name, corners, children
+    def __init__(self, name: str, area: float, corners: FloatArray, children: tuple[AffineMap, ...]) -> None:
+        self.name, self.area, self.corners, self.children = name, area, corners, children
 
     @property
     def corner_count(self) -> int:
@@ -86,49 +87,45 @@ class ParameterDomain:
         """Return ``(s,)`` depth of parameters: positive inside the domain, zero on its edges, negative outside."""
         return reduce(np.minimum, self.edge_distances(uv[..., 0], uv[..., 1]))
 
-    @property
-    def area(self) -> float:
-        raise NotImplementedError
-
+    @abstractmethod
     def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
         """Return signed distances of parameters from each edge along `edge_normals`, positive inside."""
-        raise NotImplementedError
 
+    @abstractmethod
     def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
         """Return the weights of corners in linear interpolation: bilinear weights, or barycentric coordinates."""
-        raise NotImplementedError
 
+    @abstractmethod
     def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """Return the derivatives of `corner_weights` by u, and by v."""
-        raise NotImplementedError
 
     def indices(self, degree: int) -> IntArray:
         """Return ``(n, 2)`` indices along u and v of the grid with ``degree`` intervals along each edge, u fastest."""
         v, u = np.indices((degree + 1, degree + 1)).reshape(2, -1)
         return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
+    @abstractmethod
     def extent(self, uv: ArrayLike) -> FloatArray:
         """Return ``(s,)`` size of the smallest copy of the domain, scaled about (0, 0), that contains ``uv``.
 
         The size of the domain is 1.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         """Return the first of `children` that contains parameters ``(2, s)``, and the child's parameters ``(2, s)``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def clamped(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, 2)`` parameters clamped to the domain, to the nearest point or close to it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def from_square(self, uv: FloatArray) -> FloatArray:
         """Map ``(s, 2)`` random numbers that are uniform in the unit square to ones that are uniform in the domain."""
-        raise NotImplementedError
 
+    @abstractmethod
     def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
         """Return points ``(g, 2)`` and weights ``(g,)`` of Gauss quadrature, ``order`` points along each parameter."""
-        raise NotImplementedError
 
 
 @lru_cache(maxsize=32)
@@ -138,10 +135,6 @@ def _gauss(order: int) -> tuple[FloatArray, FloatArray]:
 
 
 class _Square(ParameterDomain):
-    @property
-    def area(self) -> float:
-        return 1.0
-
     def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
         return v, 1 - u, 1 - v, u
 
@@ -175,10 +168,6 @@ class _Square(ParameterDomain):
 
 
 class _Triangle(ParameterDomain):
-    @property
-    def area(self) -> float:
-        return 0.5
-
     def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
         return v, 1 - (u + v), u
 
@@ -221,6 +210,7 @@ def _halved(sign: float, offset: tuple[float, float]) -> AffineMap:
 
 SQUARE: ParameterDomain = _Square(
     "square",
+    1.0,
     np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=float),
     (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (-1, -1)), _halved(1, (0, -1))),
 )
@@ -228,6 +218,7 @@ SQUARE: ParameterDomain = _Square(
 # The middle child is rotated by half a turn: its parameters run backwards.
 TRIANGLE: ParameterDomain = _Triangle(
     "triangle",
+    0.5,
     np.array([(0, 0), (1, 0), (0, 1)], dtype=float),
     (_halved(1, (0, 0)), _halved(1, (-1, 0)), _halved(1, (0, -1)), _halved(-1, (1, 1))),
 )

@@ -8,8 +8,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import Topology
 from ..mesh.signature import ElementKind
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
-from .scheme import Refinement, Scheme, Unsupported, low_valence, tensor_basis
-from .stencil_table import StencilTable
+from .scheme import Refinement, Scheme, StencilTable, Unsupported, tensor_basis
 
 
 class DooSabin(Scheme):
@@ -34,7 +33,11 @@ class DooSabin(Scheme):
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
         """Return vertices of a valence below 3, which would become faces with two corners."""
-        return low_valence(topology, 3)
+        t = topology
+        low = np.flatnonzero(~t.is_border_vertex & (t.vertex_face_count > 0) & (t.vertex_face_count < 3))
+        if not len(low):
+            return None
+        return Unsupported("vertex", low, f"has valence {t.vertex_face_count[low[0]]}", "valence 3 or more")
 
     def refine(self, topology: Topology) -> Refinement:
         """Create one face for every face, inner edge and inner vertex, in this order.

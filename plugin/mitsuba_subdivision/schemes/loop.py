@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
-from .crease_masks import crease_masks
+from .crease_masks import crease_masks, kept_rules, kept_sharpness
 from .domain import TRIANGLE, AffineMap, FloatArray
-from .scheme import PhantomPoint, Refinement, Scheme, Unsupported, kept_rules, kept_sharpness
-from .stencil_table import StencilTable
+from .scheme import PhantomPoint, Refinement, Scheme, StencilTable, Unsupported
 
 # The three kinds of basis functions of the quartic box spline over a triangle, times 12, as coefficients of monomials
 # in the triangle's barycentric coordinates (x, y, z) [Stam 1998b, appendix A]: for the control point at the corner x =
@@ -120,7 +119,7 @@ class Loop(Scheme):
             (edge_point, origin, end_weight),
             (edge_point[is_border], end[is_border], end_weight[is_border]),
             (edge_point[is_smooth_edge], t.face_vertices[t.prev[is_smooth_edge]], opposite_weight[is_smooth_edge]),
-            (np.arange(n_v), np.arange(n_v), masks.smooth - valence * beta + masks.own),
+            (np.arange(n_v), np.arange(n_v), masks.smooth - valence * beta + masks.at_vertex),
             (origin[is_smooth_vertex], end[is_smooth_vertex], beta[origin[is_smooth_vertex]]),
             (masks.rows, masks.columns, masks.weights),
         )

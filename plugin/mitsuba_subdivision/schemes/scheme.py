@@ -1,18 +1,28 @@
-"""Base class of subdivision schemes, and functions that the rules of several schemes share."""
+"""Base class of subdivision schemes, refinements as tables of stencils, and the registry of schemes by name."""
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
-from typing import Literal, NamedTuple
+from copy import copy
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import CreaseMethod, SemiSharpness
+from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .domain import AffineMap, FloatArray, ParameterDomain
-from .stencil_table import StencilTable
+
+if TYPE_CHECKING:
+    # Importing SciPy's sparse arrays takes 0.1 s and 20 MB, and local meshes do not need them.
+    from scipy import sparse
+
+# Module and class of each built-in scheme. A scheme is created at its first use.
+SCHEME_CLASSES = {"catmull_clark": "CatmullClark", "doo_sabin": "DooSabin", "loop": "Loop"}
+_SCHEMES: dict[str, Scheme] = {}
 
 # How Catmull-Clark refines triangles.
 TriangleRule = Literal["catmull_clark", "smooth"]
@@ -20,6 +30,69 @@ TriangleRule = Literal["catmull_clark", "smooth"]
 
 class SchemeError(ValueError):
     """A scheme cannot be used: it is unknown or invalid, or its rules do not support a cage."""
+
+
+class StencilTable:
+    """Stencils of refined vertices, as a sparse table of weights.
+
+    Parameters
+    ----------
+    row_count, column_count : int
+        Number of vertices after the refinement, and before it.
+    rows, columns : (n,) int
+        For each entry, the refined vertex and the coarse vertex. Entries with the same row and column add up.
+    weights : (n,) float64
+        Weight of each entry. The weights of a row sum to one.
+    """
+
+    def __init__(
+        self, row_count: int, column_count: int, rows: IntArray, columns: IntArray, weights: FloatArray
+    ) -> None:
+        self.row_count, self.column_count = row_count, column_count
+        self.rows, self.columns, self.weights = rows, columns, weights
+
+    @classmethod
+    def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:
+        """Create a table from several (rows, columns, weights). Entries with the same row and column add up."""
+        # int32 halves the memory, as faces with n corners have n² entries, and saves a conversion in `matrix`.
+        is_short = max(row_count, column_count) <= np.iinfo(np.int32).max
+        index_type = np.int32 if is_short else np.int64
+        rows: IntArray = np.concatenate([rows for rows, _, _ in entries], dtype=index_type, casting="same_kind")
+        columns: IntArray = np.concatenate(
+            [columns for _, columns, _ in entries], dtype=index_type, casting="same_kind"
+        )
+        weights = np.concatenate([np.broadcast_to(weights, rows.shape) for rows, _, weights in entries])
+        return cls(row_count, column_count, rows, columns, weights)
+
+    @classmethod
+    def from_matrix(cls, matrix: sparse.coo_array | sparse.csc_array | sparse.csr_array) -> StencilTable:
+        """Create a table from the rows of a sparse array."""
+        entries = matrix.tocoo()
+        row_count, column_count = entries.shape
+        return cls(row_count, column_count, entries.row, entries.col, entries.data)
+
+    @cached_property
+    def matrix(self) -> sparse.csr_array:
+        """``(row_count, column_count)`` sparse array with a stencil in each row."""
+        from scipy import sparse
+
+        shape = self.row_count, self.column_count
+        is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
+        rows, columns = (
+            indices.astype(np.int32, copy=False) if is_short else indices for indices in (self.rows, self.columns)
+        )
+        return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
+
+    def dense(self, rows: IntArray) -> FloatArray:
+        """Return the stencils of the refined vertices ``rows``, ``(len(rows), column_count)``."""
+        new_row = np.full(self.row_count, -1)
+        new_row[rows] = np.arange(len(rows))
+        # A row that occurs several times in ``rows`` is summed at its last index, and copied to the others.
+        entry_row = new_row[self.rows]
+        is_kept = entry_row >= 0
+        flat = entry_row[is_kept] * self.column_count + self.columns[is_kept]
+        sums = np.bincount(flat, self.weights[is_kept], minlength=len(rows) * self.column_count).astype(np.float64)
+        return sums.reshape(-1, self.column_count)[new_row[rows]]
 
 
 class Refinement(NamedTuple):
@@ -185,44 +258,6 @@ class Scheme(ABC):
         """
 
 
-def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
-    """Return the vertex rules after a refinement that keeps the vertices and appends new ones."""
-    if topology.rules is None:
-        return None
-    return np.concatenate([topology.rules, np.zeros(new_count, dtype=np.int8)])
-
-
-def kept_sharpness(
-    topology: Topology,
-    # (n_h',) int: `Topology.face_vertices` of the refined mesh. The faces at coarse corners come first, each listed
-    # from the coarse vertex on.
-    face_vertices: NDArray[np.integer],
-    # Index of the last edge in each of these faces. The first and the last edge are halves of coarse edges.
-    last: int,
-    new_count: int,  # Number of appended vertices
-    method: CreaseMethod,
-) -> SemiSharpness | None:
-    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner."""
-    semi, t = topology.semi_sharpness, topology
-    if semi is None:
-        return None
-    edges = np.zeros(len(face_vertices))
-    corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
-    corners[:, 0] = semi.edges_refined
-    ahead = t.turn(np.arange(t.half_edge_count))
-    corners[:, last] = np.where(ahead < 0, 0, semi.edges_refined[ahead])
-    return semi.refined(face_vertices, edges, new_count, method)
-
-
-def low_valence(topology: Topology, least: int) -> Unsupported | None:
-    """Return inner vertices of a valence below the least that a scheme supports, as `Scheme.unsupported`."""
-    inside = ~topology.is_border_vertex & (topology.vertex_face_count > 0)
-    low = np.flatnonzero(inside & (topology.vertex_face_count < least))
-    if not len(low):
-        return None
-    return Unsupported("vertex", low, f"has valence {topology.vertex_face_count[low[0]]}", f"valence {least} or more")
-
-
 def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
     """Multiply the values and derivatives ``(derivatives + 1, s, r)`` of one-dimensional bases along u and v.
 
@@ -236,3 +271,73 @@ def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
     for product, (a, b) in zip(products, orders, strict=True):
         np.multiply(v[b][:, None], u[a], out=product)
     return np.ascontiguousarray(products.reshape(len(orders), -1, count[0]).swapaxes(1, 2))
+
+
+def scheme_named(name: str) -> Scheme:
+    """Return the scheme of a name.
+
+    Raises
+    ------
+    SchemeError
+        If the name is unknown; the message lists the known names.
+    """
+    if name not in _SCHEMES:
+        if name not in SCHEME_CLASSES:
+            raise SchemeError(
+                f'unknown scheme "{name}"; known schemes: {", ".join(sorted({*SCHEME_CLASSES, *_SCHEMES}))}'
+            )
+        _SCHEMES[name] = getattr(importlib.import_module(f".{name}", __package__), SCHEME_CLASSES[name])()
+    return _SCHEMES[name]
+
+
+@lru_cache(maxsize=256)
+def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
+    """Return the scheme with the rules of a cage: a copy, or the scheme itself if it has these rules.
+
+    Raises
+    ------
+    SchemeError
+        If the scheme does not support the rules. Only Catmull-Clark has another rule for triangles.
+    """
+    changed = {
+        name: rule
+        for name, rule, default in (
+            ("crease_method", crease_method, "uniform"),
+            ("triangle_rule", triangle_rule, "catmull_clark"),
+        )
+        if rule != (getattr(scheme, name) or default)
+    }
+    for name, rule in changed.items():
+        if getattr(scheme, name) is None:
+            raise SchemeError(f'the scheme {scheme.name} has no {name} "{rule}"')
+    if not changed:
+        return scheme
+    scheme = copy(scheme)
+    vars(scheme).update(changed)
+    return scheme
+
+
+def register_scheme(scheme: Scheme) -> None:
+    """Register a scheme under its name, for `LimitSurface` and scenes. Replaces a scheme of the same name.
+
+    Parameters
+    ----------
+    scheme : Scheme
+        Its methods must always return the same results, as derived data is cached. `check_scheme` tests its rules.
+
+    Raises
+    ------
+    SchemeError
+        If it is not a `Scheme`, or has no name.
+    """
+    require_scheme(scheme)
+    _SCHEMES[scheme.name] = scheme
+
+
+def require_scheme(scheme: object) -> None:
+    """Raise SchemeError unless an object is a scheme with a name."""
+    if not isinstance(scheme, Scheme):
+        label = f"the class {scheme.__name__}" if isinstance(scheme, type) else repr(scheme)
+        raise SchemeError(f"scheme {label}; expected a scheme's name, or an object of a class derived from Scheme")
+    if not isinstance(getattr(scheme, "name", None), str) or not scheme.name:
+        raise SchemeError(f"{type(scheme).__name__} has no name; expected a string of one or more characters")
