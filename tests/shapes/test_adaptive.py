@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface, pixel_error_for, upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes.tessellation_parameters import ViewingSensor
+from mitsuba_subdivision.shapes.tessellation_parameters import sensor_in_world
 from mitsuba_subdivision.tessellation import Criterion, Measure
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
@@ -66,7 +66,7 @@ def test_the_smallest_pixels_are_those_in_the_corners_of_the_film(size, fov):
 
     corners = [(point(x, y), point(x + (1 if x == 0 else -1), y)) for x in (0, size[0]) for y in (0, size[1])]
     smallest = [np.linalg.norm(at - beside) / np.linalg.norm(at) for at, beside in corners]
-    np.testing.assert_allclose(smallest, ViewingSensor(to_world, fov, size).in_world().pixel, rtol=PIXEL)
+    np.testing.assert_allclose(smallest, sensor_in_world(to_world, fov, *size).pixel, rtol=PIXEL)
 
 
 FILM = {"film_width": 64, "film_height": 48}

@@ -5,6 +5,7 @@ The plugin's page and the table in ``plugin/guide/parameters.md`` are generated 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,20 +19,198 @@ from ..tessellation import HIGHEST_RATE
 if TYPE_CHECKING:
     import mitsuba as mi
 
-# Flags of a parameter that `traverse` exposes, as Mitsuba's documentation names them.
-EXPOSED = ("exposed",)
-DIFFERENTIABLE = ("exposed", "differentiable")
-DISCONTINUOUS = ("exposed", "differentiable", "discontinuous")
-READ_ONLY = ("exposed", "readonly")
-
 SHADINGS = ("vertex", "exact", "auto")
 
-# Python types of Mitsuba's checked types, and their names in messages.
-_TYPES: dict[str, tuple[type | tuple[type, ...], str]] = {
-    "string": (str, "a string"),
-    "float": ((float, int), "a number"),
-    "int": (int, "an integer"),
-    "bool": (bool, "true or false"),
+# Parameters of a scene: name, type, default and flag, and a description with literals between double backticks. The
+# type is one of Mitsuba's documentation, several are joined by " or ". A name may contain ``NAME``, a placeholder for
+# an attribute's name. A default that is no single value is described. A parameter without a flag is read when the shape
+# is loaded only.
+_PARAMETERS = f"""
+filename : string
+    Control cage: an OBJ, PLY or USD file. Polygons are not triangulated. Creases, corners, holes and subdivision rules
+    are read from OpenSubdiv's tags and USD's attributes. Relative paths are resolved as for Mitsuba's other shapes.
+    Give either ``filename``, or ``positions``, ``face_sizes`` and ``face_vertices``.
+positions : tensor
+    Control cage in memory: vertices, ``(n, 3)``.
+face_sizes : tensor
+    Number of vertices of each face, integers.
+face_vertices : tensor
+    Vertices of all faces, one face after the other, counter-clockwise seen from outside; 0-based integers.
+cage_name : string
+    Name of a cage in memory, for messages. Suppresses warnings about the cage, which its creator has issued. (Default:
+    ``control cage``, with warnings)
+creases : tensor
+    Sharp edges, ``(n, 3)``: two vertices and a sharpness. A sharpness of 10 or more is infinite; below, the edge is
+    semi-sharp.
+corners : tensor
+    Sharp vertices, ``(n, 2)``: the vertex and its sharpness, as for edges.
+holes : tensor
+    Faces that shape the surface but are not part of it, 0-based integers.
+texcoords : tensor
+    Texture coordinates, ``(n, 2)``: one row for each vertex, subdivided as positions are, or the rows that
+    ``texcoord_indices`` refers to.
+texcoord_indices : tensor
+    Row of ``texcoords`` at each face corner, 0-based integers in the order of ``face_vertices``. An edge whose two
+    faces refer to different rows is a seam.
+vertex_NAME : tensor
+    Attribute, ``(n, 1)`` or ``(n, 3)``: one row for each vertex, subdivided as positions are.
+varying_NAME : tensor
+    Attribute with one row for each vertex, interpolated linearly over each face.
+face_varying_NAME : tensor
+    Attribute with a row for each face corner, or the rows that ``face_varying_NAME_indices`` refers to, subdivided with
+    seams as texture coordinates are.
+face_varying_NAME_indices : tensor
+    Row of ``face_varying_NAME`` at each face corner, 0-based integers. (Default: one row after the other)
+prim : string
+    Which mesh of a USD file: the path of a mesh or of a prim with one mesh below it, or ``*``, which joins all meshes
+    into one cage. (Default: the only mesh)
+time : float
+    Time code of a USD file. (Default: values that do not depend on time, or the first ones)
+material : string
+    Show only the faces of this material, one that ``usemtl`` names in an OBJ file, or ``material_0`` and so on of a PLY
+    file. Shapes of the same file and parameters, one for each material, meet without cracks. (Default: all faces)
+shown_faces : tensor
+    Show only these faces, 0-based integers. Unlike holes, the others are evaluated: shapes that differ in this
+    parameter only meet without cracks. (Default: all faces)
+scheme : string
+    Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by
+    ``mitsuba_subdivision.register_scheme``. (Default: the file's, or ``catmull_clark``)
+boundary : string
+    Boundary of the surface of an open cage. ``edge_and_corner``: smooth curves that end at the vertices of one face
+    only. ``edge_only``: smooth curves everywhere. ``none``: the surface omits the faces that touch the boundary.
+    (Default: the file's, or ``{RULES["boundary"][0]}``)
+crease_method : string
+    Semi-sharp creases whose edges differ in sharpness. ``uniform``: the sharpness of each edge decreases on its own.
+    ``chaikin``: the edges' sharpness is blended along the crease.
+    (Default: the file's, or ``{RULES["crease_method"][0]}``)
+triangle_rule : string
+    Weights of triangles under Catmull-Clark: ``catmull_clark``, or ``smooth``, which reduces ripples.
+    (Default: the file's, or ``{RULES["triangle_rule"][0]}``)
+face_varying : string
+    Seams, boundaries and corners at which face-varying data are interpolated linearly: ``none``, ``corners_only``,
+    ``corners_plus1``, ``corners_plus2``, ``boundaries`` or ``all``, as in OpenSubdiv.
+    (Default: the file's, or ``{RULES["face_varying"][0]}``)
+strict : bool = false
+    Reject control cages that are not oriented manifolds. Otherwise, a warning is issued, edges of more than two faces
+    are infinitely sharp, vertices at which separate fans of faces meet are corners, and faces wound against their
+    neighbours are reversed.
+tessellation_rate : int = 8
+    Segments along each edge of the control cage, 1 to {HIGHEST_RATE}.
+tessellation : string = uniform
+    ``uniform``, or ``adaptive``: as few triangles as the limit allows, which is one of ``chord_error``, ``pixel_error``
+    and ``max_edge``.
+chord_error : float; exposed
+    Adaptive tessellation: largest distance of the triangles from the surface, in world units.
+pixel_error : float; exposed
+    Adaptive tessellation: the same distance in pixels of the sensor given below.
+max_edge : float; exposed
+    Adaptive tessellation: largest length of the triangles' edges, in world units.
+max_rate : int = 64
+    Adaptive tessellation: most segments along an edge of the control cage, 1 to {HIGHEST_RATE}; rounded down to a power
+    of two. Around extraordinary vertices, rings get as small as the limit needs, with at most half as many segments
+    along each.
+outline : string = none
+    Adaptive tessellation: with ``sensor``, the limit holds for triangles that the sensor may see edge-on; others may
+    have up to 8 times the error. For exact shading.
+sensor_to_world : transform
+    Camera-to-world transformation of the sensor for ``pixel_error`` and ``outline``.
+    ``mitsuba_subdivision.pixel_error_for(sensor)`` returns this parameter and the next three.
+sensor_fov : float
+    Its field of view along the film's width, in degrees; 0 for an orthographic sensor.
+film_width : int
+    Width of its film in pixels.
+film_height : int
+    Height of its film in pixels.
+shading : string = vertex
+    ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: position, normal,
+    tangents, their derivatives, texture coordinates and attributes of the limit surface at every hit. ``auto``:
+    ``exact`` in JIT variants where it works and without ``face_normals``, else ``vertex``.
+displacement : texture or string
+    Heights that displace the surface along its normals: a scalar texture over the texture coordinates, or the mesh
+    attribute ``vertex_NAME`` of a cage's attribute with one number per value. (Default: none)
+displacement_scale : float; discontinuous
+    Factor of the heights. (Default: 1)
+evaluator : string = stabilized
+    ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which fails at extraordinary
+    vertices; for comparison.
+sample_offset : float = 0
+    Sample extraordinary vertices at u = v = this value instead of at the vertex itself, where Stam's form has no value;
+    below 1.
+to_world : transform; discontinuous
+    Linear object-to-world transformation. Reflections keep the outside of the surface. (Default: none, i.e. object
+    space = world space)
+flip_normals : bool = false
+    Invert the surface, i.e. flip its normal vectors.
+face_normals : bool = false
+    Shade the triangles flat, without the surface's normals.
+silhouette_sampling_weight : float = 1; exposed
+    Weight of the shape when integrators sample silhouettes, as for Mitsuba's other shapes.
+"""
+
+# Parameters that only `traverse` exposes.
+_STATE = """
+control_points : float[]; discontinuous
+    Vertices of the control cage, flat x, y, z, in object space.
+cage_texcoords : float[]; discontinuous
+    Texture coordinates of the control cage, flat. Updates move those of the tessellation, and a surface that a texture
+    displaces.
+cage_NAME : float[]; differentiable
+    Values of an attribute of the control cage, flat, in the order in which they were given; discontinuous if they
+    displace the surface.
+patch_count : int; readonly
+    Number of patches of the surface.
+vertex_positions : float[]; discontinuous
+    Points of the tessellation in world space. Updates of the control points overwrite assigned values.
+vertex_normals : float[]; discontinuous
+    Normals of the tessellation, likewise; none with ``face_normals`` or exact shading.
+vertex_texcoords : float[]; differentiable
+    Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite assigned
+    values.
+vertex_NAME : float[]; differentiable
+    Mesh attribute: an attribute's values at the tessellation's vertices. Updates of ``cage_NAME`` overwrite them.
+face_element : float[]; differentiable
+    Mesh attribute: 0-based face of the control cage (vertex for Doo-Sabin) that each triangle belongs to.
+faces : int[]; exposed
+    Vertices of the tessellation's triangles.
+"""
+
+# Flags of parameters that `traverse` exposes, as Mitsuba's documentation names them, by the flags in the table.
+_FLAGS: dict[str, tuple[str, ...]] = {
+    "": (),
+    "exposed": ("exposed",),
+    "readonly": ("exposed", "readonly"),
+    "differentiable": ("exposed", "differentiable"),
+    "discontinuous": ("exposed", "differentiable", "discontinuous"),
+}
+# Python types of Mitsuba's checked types, their names in messages, and how a default is read from the table.
+_TYPES: dict[str, tuple[type | tuple[type, ...], str, Callable[[str], Any]]] = {
+    "string": (str, "a string", str),
+    "float": ((float, int), "a number", float),
+    "int": (int, "an integer", int),
+    "bool": (bool, "true or false", lambda text: text == "true"),
+}
+# Values that a string may have. The cage checks its rules, which may also come from a file.
+_CHOICES = {
+    "tessellation": ("uniform", "adaptive"),
+    "outline": ("none", "sensor"),
+    "shading": SHADINGS,
+    "evaluator": ("stabilized", "stam"),
+}
+# Predicates for numbers of the right type, and descriptions of the numbers that they accept.
+_RATE = (lambda rate: 1 <= rate <= HIGHEST_RATE, f"1 to {HIGHEST_RATE} segments per edge")
+_LIMIT = (lambda limit: 0 < limit < inf, "a number above 0")
+_FILM_SIZE = (lambda size: size >= 1, "1 or more pixels")
+_NUMBERS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "tessellation_rate": _RATE,
+    "max_rate": _RATE,
+    "chord_error": _LIMIT,
+    "pixel_error": _LIMIT,
+    "max_edge": _LIMIT,
+    "sensor_fov": (lambda fov: 0 <= fov < 180, "0, for an orthographic sensor, or degrees below 180"),
+    "film_width": _FILM_SIZE,
+    "film_height": _FILM_SIZE,
+    "displacement_scale": (lambda scale: -inf < scale < inf, "a finite number"),
+    "sample_offset": (lambda offset: 0 <= offset < 1, "at least 0 and below 1"),
 }
 
 _PAGE = """\
@@ -92,30 +271,24 @@ to world space; and ``shading_cage_NAME``, the values that hits interpolate.
 class Parameter:
     """A row of the shape's parameter table."""
 
-    name: str  # May contain ``NAME``, a placeholder for an attribute's name
-    # Type as in Mitsuba's documentation: "string", "float", "int", "bool", "tensor", "transform", "texture" or
-    # "float[]"; several are joined by " or "
+    name: str
     type: str
-    description: str  # With literals between double backticks, without a full stop at the end
-    default: Any = None  # None if there is no default
-    default_text: str = ""  # Description of a default that is not a single value
-    choices: tuple[str, ...] = ()  # Values that a string may have; empty for any
-    accepts: Callable[[Any], bool] | None = None  # Predicate for values of the right type
-    expected: str = ""  # Description of accepted values, for messages
-    flags: tuple[str, ...] = ()  # Empty if the parameter is read at load time only
+    description: str  # Without a full stop at the end
+    default: Any  # None if there is no default
+    default_text: str  # Description of the default; empty if there is none
+    flags: tuple[str, ...]
+    choices: tuple[str, ...]  # Values that a string may have; empty for any
+    accepts: Callable[[Any], bool] | None  # Predicate for values of the right type
+    expected: str  # Description of accepted values, for messages
 
     @property
     def text(self) -> str:
         """Description and default, in one table cell as in Mitsuba's documentation."""
-        default = self.default_text
-        if not default and self.default is not None:
-            value = str(self.default).lower() if isinstance(self.default, bool) else self.default
-            default = f"``{value}``" if isinstance(value, str) else f"{value:g}"
-        return f"{self.description}. (Default: {default})" if default else self.description
+        return f"{self.description}. (Default: {self.default_text})" if self.default_text else self.description
 
     def checked(self, value: Any) -> Any:
         """Return ``value``. Raises ValueError if its type is wrong, or it is not allowed."""
-        kind, expected = _TYPES[self.type]
+        kind, expected, _ = _TYPES[self.type]
         # In Python, bool is a subclass of int.
         if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):
             raise ValueError(f'parameter "{self.name}" is {value!r}; expected {expected}')
@@ -126,313 +299,31 @@ class Parameter:
         return value
 
 
-def _rate(name: str, description: str, default: int) -> Parameter:
+def _parameter(entry: str) -> Parameter:
+    """Read an entry of a table."""
+    head, *lines = entry.splitlines()
+    head, _, flag = head.partition("; ")
+    head, _, stated = head.partition(" = ")
+    name, kind = head.split(" : ")
+    description, _, default_text = " ".join(map(str.strip, lines)).partition(" (Default: ")
+    if stated:
+        default_text = stated if kind in ("int", "float") else f"``{stated}``"
     return Parameter(
         name,
-        "int",
-        description,
-        default,
-        accepts=lambda rate: 1 <= rate <= HIGHEST_RATE,
-        expected=f"1 to {HIGHEST_RATE} segments per edge",
+        kind,
+        description.removesuffix("."),
+        _TYPES[kind][2](stated) if stated else None,
+        default_text.removesuffix(")"),
+        _FLAGS[flag],
+        _CHOICES.get(name, ()),
+        *_NUMBERS.get(name, (None, "")),
     )
 
 
-def _limit(name: str, description: str) -> Parameter:
-    return Parameter(
-        name,
-        "float",
-        f"Adaptive tessellation: {description}",
-        accepts=lambda limit: 0 < limit < inf,
-        expected="a number above 0",
-        flags=EXPOSED,
-    )
-
-
-def _film_size(name: str, side: str) -> Parameter:
-    return Parameter(
-        name, "int", f"{side} of its film in pixels", accepts=lambda size: size >= 1, expected="1 or more pixels"
-    )
-
-
-def _rule(name: str, description: str) -> Parameter:
-    # Not checked here: the cage checks its rules, which may also come from a file.
-    return Parameter(name, "string", description, default_text=f"the file's, or ``{RULES[name][0]}``")
-
-
-PARAMETERS = (
-    Parameter(
-        "filename",
-        "string",
-        "Control cage: an OBJ, PLY or USD file. Polygons are not triangulated. Creases, corners, holes and "
-        "subdivision rules are read from OpenSubdiv's tags and USD's attributes. Relative paths are resolved as for "
-        "Mitsuba's other shapes. Give either ``filename``, or ``positions``, ``face_sizes`` and ``face_vertices``",
-    ),
-    Parameter("positions", "tensor", "Control cage in memory: vertices, ``(n, 3)``"),
-    Parameter("face_sizes", "tensor", "Number of vertices of each face, integers"),
-    Parameter(
-        "face_vertices",
-        "tensor",
-        "Vertices of all faces, one face after the other, counter-clockwise seen from outside; 0-based integers",
-    ),
-    Parameter(
-        "cage_name",
-        "string",
-        "Name of a cage in memory, for messages. Suppresses warnings about the cage, which its creator has issued",
-        default_text="``control cage``, with warnings",
-    ),
-    Parameter(
-        "creases",
-        "tensor",
-        "Sharp edges, ``(n, 3)``: two vertices and a sharpness. A sharpness of 10 or more is infinite; below, the edge "
-        "is semi-sharp",
-    ),
-    Parameter("corners", "tensor", "Sharp vertices, ``(n, 2)``: the vertex and its sharpness, as for edges"),
-    Parameter("holes", "tensor", "Faces that shape the surface but are not part of it, 0-based integers"),
-    Parameter(
-        "texcoords",
-        "tensor",
-        "Texture coordinates, ``(n, 2)``: one row for each vertex, subdivided as positions are, or the rows that "
-        "``texcoord_indices`` refers to",
-    ),
-    Parameter(
-        "texcoord_indices",
-        "tensor",
-        "Row of ``texcoords`` at each face corner, 0-based integers in the order of ``face_vertices``. An edge whose "
-        "two faces refer to different rows is a seam",
-    ),
-    Parameter(
-        "vertex_NAME",
-        "tensor",
-        "Attribute, ``(n, 1)`` or ``(n, 3)``: one row for each vertex, subdivided as positions are",
-    ),
-    Parameter("varying_NAME", "tensor", "Attribute with one row for each vertex, interpolated linearly over each face"),
-    Parameter(
-        "face_varying_NAME",
-        "tensor",
-        "Attribute with a row for each face corner, or the rows that ``face_varying_NAME_indices`` refers to, "
-        "subdivided with seams as texture coordinates are",
-    ),
-    Parameter(
-        "face_varying_NAME_indices",
-        "tensor",
-        "Row of ``face_varying_NAME`` at each face corner, 0-based integers",
-        default_text="one row after the other",
-    ),
-    Parameter(
-        "prim",
-        "string",
-        "Which mesh of a USD file: the path of a mesh or of a prim with one mesh below it, or ``*``, which joins all "
-        "meshes into one cage",
-        default_text="the only mesh",
-    ),
-    Parameter(
-        "time", "float", "Time code of a USD file", default_text="values that do not depend on time, or the first ones"
-    ),
-    Parameter(
-        "material",
-        "string",
-        "Show only the faces of this material, one that ``usemtl`` names in an OBJ file, or ``material_0`` and so on "
-        "of a PLY file. Shapes of the same file and parameters, one for each material, meet without cracks",
-        default_text="all faces",
-    ),
-    Parameter(
-        "shown_faces",
-        "tensor",
-        "Show only these faces, 0-based integers. Unlike holes, the others are evaluated: shapes that differ in this "
-        "parameter only meet without cracks",
-        default_text="all faces",
-    ),
-    Parameter(
-        "scheme",
-        "string",
-        "Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by "
-        "``mitsuba_subdivision.register_scheme``",
-        default_text="the file's, or ``catmull_clark``",
-    ),
-    _rule(
-        "boundary",
-        "Boundary of the surface of an open cage. ``edge_and_corner``: smooth curves that end at the vertices of one "
-        "face only. ``edge_only``: smooth curves everywhere. ``none``: the surface omits the faces that touch the "
-        "boundary",
-    ),
-    _rule(
-        "crease_method",
-        "Semi-sharp creases whose edges differ in sharpness. ``uniform``: the sharpness of each edge decreases on its "
-        "own. ``chaikin``: the edges' sharpness is blended along the crease",
-    ),
-    _rule(
-        "triangle_rule",
-        "Weights of triangles under Catmull-Clark: ``catmull_clark``, or ``smooth``, which reduces ripples",
-    ),
-    _rule(
-        "face_varying",
-        "Seams, boundaries and corners at which face-varying data are interpolated linearly: ``none``, "
-        "``corners_only``, ``corners_plus1``, ``corners_plus2``, ``boundaries`` or ``all``, as in OpenSubdiv",
-    ),
-    Parameter(
-        "strict",
-        "bool",
-        "Reject control cages that are not oriented manifolds. Otherwise, a warning is issued, edges of more than two "
-        "faces are infinitely sharp, vertices at which separate fans of faces meet are corners, and faces wound "
-        "against their neighbours are reversed",
-        False,
-    ),
-    _rate("tessellation_rate", f"Segments along each edge of the control cage, 1 to {HIGHEST_RATE}", 8),
-    Parameter(
-        "tessellation",
-        "string",
-        "``uniform``, or ``adaptive``: as few triangles as the limit allows, which is one of ``chord_error``, "
-        "``pixel_error`` and ``max_edge``",
-        "uniform",
-        choices=("uniform", "adaptive"),
-    ),
-    _limit("chord_error", "largest distance of the triangles from the surface, in world units"),
-    _limit("pixel_error", "the same distance in pixels of the sensor given below"),
-    _limit("max_edge", "largest length of the triangles' edges, in world units"),
-    _rate(
-        "max_rate",
-        f"Adaptive tessellation: most segments along an edge of the control cage, 1 to {HIGHEST_RATE}; rounded down to "
-        "a power of two. Around extraordinary vertices, rings get as small as the limit needs, with at most half as "
-        "many segments along each",
-        64,
-    ),
-    Parameter(
-        "outline",
-        "string",
-        "Adaptive tessellation: with ``sensor``, the limit holds for triangles that the sensor may see edge-on; others "
-        "may have up to 8 times the error. For exact shading",
-        "none",
-        choices=("none", "sensor"),
-    ),
-    Parameter(
-        "sensor_to_world",
-        "transform",
-        "Camera-to-world transformation of the sensor for ``pixel_error`` and ``outline``. "
-        "``mitsuba_subdivision.pixel_error_for(sensor)`` returns this parameter and the next three",
-    ),
-    Parameter(
-        "sensor_fov",
-        "float",
-        "Its field of view along the film's width, in degrees; 0 for an orthographic sensor",
-        accepts=lambda fov: 0 <= fov < 180,
-        expected="0, for an orthographic sensor, or degrees below 180",
-    ),
-    _film_size("film_width", "Width"),
-    _film_size("film_height", "Height"),
-    Parameter(
-        "shading",
-        "string",
-        "``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: position, normal, "
-        "tangents, their derivatives, texture coordinates and attributes of the limit surface at every hit. ``auto``: "
-        "``exact`` in JIT variants where it works and without ``face_normals``, else ``vertex``",
-        "vertex",
-        choices=SHADINGS,
-    ),
-    Parameter(
-        "displacement",
-        "texture or string",
-        "Heights that displace the surface along its normals: a scalar texture over the texture coordinates, or the "
-        "mesh attribute ``vertex_NAME`` of a cage's attribute with one number per value",
-        default_text="none",
-    ),
-    Parameter(
-        "displacement_scale",
-        "float",
-        "Factor of the heights",
-        default_text="1",
-        accepts=lambda scale: -inf < scale < inf,
-        expected="a finite number",
-        flags=DISCONTINUOUS,
-    ),
-    Parameter(
-        "evaluator",
-        "string",
-        "``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which fails at "
-        "extraordinary vertices; for comparison",
-        "stabilized",
-        choices=("stabilized", "stam"),
-    ),
-    Parameter(
-        "sample_offset",
-        "float",
-        "Sample extraordinary vertices at u = v = this value instead of at the vertex itself, where Stam's form has no "
-        "value; below 1",
-        0.0,
-        accepts=lambda offset: 0 <= offset < 1,
-        expected="at least 0 and below 1",
-    ),
-    Parameter(
-        "to_world",
-        "transform",
-        "Linear object-to-world transformation. Reflections keep the outside of the surface",
-        default_text="none, i.e. object space = world space",
-        flags=DISCONTINUOUS,
-    ),
-    Parameter("flip_normals", "bool", "Invert the surface, i.e. flip its normal vectors", False),
-    Parameter("face_normals", "bool", "Shade the triangles flat, without the surface's normals", False),
-    Parameter(
-        "silhouette_sampling_weight",
-        "float",
-        "Weight of the shape when integrators sample silhouettes, as for Mitsuba's other shapes",
-        1.0,
-        flags=EXPOSED,
-    ),
+PARAMETERS, STATE_PARAMETERS = (
+    tuple(map(_parameter, re.split(r"\n(?=\S)", table.strip()))) for table in (_PARAMETERS, _STATE)
 )
 PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
-
-# Parameters that only `traverse` exposes.
-STATE_PARAMETERS = (
-    Parameter(
-        "control_points", "float[]", "Vertices of the control cage, flat x, y, z, in object space", flags=DISCONTINUOUS
-    ),
-    Parameter(
-        "cage_texcoords",
-        "float[]",
-        "Texture coordinates of the control cage, flat. Updates move those of the tessellation, and a surface that a "
-        "texture displaces",
-        flags=DISCONTINUOUS,
-    ),
-    Parameter(
-        "cage_NAME",
-        "float[]",
-        "Values of an attribute of the control cage, flat, in the order in which they were given; discontinuous if "
-        "they displace the surface",
-        flags=DIFFERENTIABLE,
-    ),
-    Parameter("patch_count", "int", "Number of patches of the surface", flags=READ_ONLY),
-    Parameter(
-        "vertex_positions",
-        "float[]",
-        "Points of the tessellation in world space. Updates of the control points overwrite assigned values",
-        flags=DISCONTINUOUS,
-    ),
-    Parameter(
-        "vertex_normals",
-        "float[]",
-        "Normals of the tessellation, likewise; none with ``face_normals`` or exact shading",
-        flags=DISCONTINUOUS,
-    ),
-    Parameter(
-        "vertex_texcoords",
-        "float[]",
-        "Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite "
-        "assigned values",
-        flags=DIFFERENTIABLE,
-    ),
-    Parameter(
-        "vertex_NAME",
-        "float[]",
-        "Mesh attribute: an attribute's values at the tessellation's vertices. Updates of ``cage_NAME`` overwrite them",
-        flags=DIFFERENTIABLE,
-    ),
-    Parameter(
-        "face_element",
-        "float[]",
-        "Mesh attribute: 0-based face of the control cage (vertex for Doo-Sabin) that each triangle belongs to",
-        flags=DIFFERENTIABLE,
-    ),
-    Parameter("faces", "int[]", "Vertices of the tessellation's triangles", flags=EXPOSED),
-)
 
 
 def value_of(props: mi.Properties, name: str) -> Any:

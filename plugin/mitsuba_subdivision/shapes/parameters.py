@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time as clock
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import mitsuba as mi
@@ -27,9 +27,6 @@ from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
 from .tessellation_parameters import Tessellation, read_tessellation
-
-if TYPE_CHECKING:
-    from ..cage import ControlCage
 
 TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
@@ -76,9 +73,9 @@ def read_parameters(props: mi.Properties) -> Parameters:
     from ..schemes import scheme_named
 
     _reject_unknown(props)
-    scheme_name = value_of(props, "scheme")
+    name = value_of(props, "scheme")
     with errors_about("scheme"):
-        scheme = None if scheme_name is None else scheme_named(scheme_name)
+        scheme = None if name is None else scheme_named(name)
     tessellation = read_tessellation(props)
     shading, evaluator, offset = (value_of(props, name) for name in ("shading", "evaluator", "sample_offset"))
     if evaluator == "stam" and offset == 0:
@@ -110,12 +107,12 @@ def read_parameters(props: mi.Properties) -> Parameters:
 
 def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | None:
     """Mask of the faces to show; None for all."""
-    selections = [name for name in ("material", "shown_faces") if name in props]
-    if not selections:
+    names = [name for name in ("material", "shown_faces") if name in props]
+    if not names:
         return None
-    if len(selections) > 1:
+    if len(names) > 1:
         raise ValueError('parameters "material" and "shown_faces" contradict each other; expected only one of them')
-    cage, (name,) = surface.cage, selections
+    cage, (name,) = surface.cage, names
     if surface.scheme.element != "face":
         raise ValueError(
             f'parameter "{name}" chooses faces; expected none for the scheme "{surface.scheme.name}", whose surface '
@@ -124,8 +121,8 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
     if name == "material":
         material = value_of(props, name)
         if material not in cage.materials:
-            names = ", ".join(f'"{each}"' for each in cage.materials)
-            expected = f"one of {names} in {cage.source.name}" if names else f"a cage with some, not {cage.source.name}"
+            known = ", ".join(f'"{known}"' for known in cage.materials)
+            expected = f"one of {known} in {cage.source.name}" if known else f"a cage with some, not {cage.source.name}"
             raise ValueError(f'parameter "material" is "{material}"; expected {expected}')
         faces = cage.materials[material]
     else:
@@ -222,15 +219,12 @@ def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarr
 
 def cage_of_file(path: str, **options: Any) -> ControlCage:
     """Call `ControlCage.from_file`, or reuse a living shape's cage if the file is unchanged. Warns for each shape."""
-    file_format = FORMATS.get(os.path.splitext(path)[1].lower())
-    if file_format is None or file_format.refers_to_files:
+    file_format, status = FORMATS.get(os.path.splitext(path)[1].lower()), os.stat(path)
+    is_settled = abs(clock.time_ns() - status.st_mtime_ns) >= SETTLED
+    if file_format is None or file_format.refers_to_files or not is_settled:
         return ControlCage.from_file(path, **options)
-    status = os.stat(path)
-    if abs(clock.time_ns() - status.st_mtime_ns) < SETTLED:
-        return ControlCage.from_file(path, **options)
-    file_state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-    key = path, *file_state, *sorted(options.items())
-    return _shared(key, lambda: ControlCage.from_file(path, **options))
+    state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    return _shared((path, *state, *sorted(options.items())), lambda: ControlCage.from_file(path, **options))
 
 
 def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
@@ -243,35 +237,36 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
         return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))
     with without_warnings():
         # Equal cages with different names are shared, under the name of the first one.
-        key = "named", _digest(arguments)
-        return _shared(key, lambda: ControlCage.from_arrays(**arguments, source=CageSource(name)))
+        source = CageSource(name)
+        return _shared(("named", _digest(arguments)), lambda: ControlCage.from_arrays(**arguments, source=source))
 
 
 def _digest(value: Any) -> Hashable:
     """Cache key of an argument, without references to arrays."""
+    if isinstance(value, Attribute):
+        value = vars(value)
     if isinstance(value, Mapping):
         return tuple((name, _digest(item)) for name, item in value.items())
-    if isinstance(value, Attribute):
-        return _digest({field.name: getattr(value, field.name) for field in fields(value)})
     if isinstance(value, np.ndarray):
         return value.shape, str(value.dtype), blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
     return value
 
 
 def _shared(key: Hashable, make: Callable[[], ControlCage]) -> ControlCage:
-    is_new = False
+    """Cage of a key, which may be shared. Warns as when the cage was made."""
+    noted: list[str] | None = None
 
     def made() -> ControlCage:
-        nonlocal is_new
-        is_new = True
+        nonlocal noted
         with noting_warnings() as noted:
             cage = make()
         _WARNINGS[cage] = noted
         return cage
 
     cage = _CAGES.get(key, made)
-    for message in () if is_new else _WARNINGS[cage]:
-        warn(message)
+    if noted is None:
+        for message in _WARNINGS[cage]:
+            warn(message)
     return cage
 
 

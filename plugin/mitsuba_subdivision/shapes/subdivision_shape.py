@@ -22,7 +22,6 @@ from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
 from .registration import on_shallow_stack
-from .tessellation_parameters import LIMITS, AdaptiveTessellation
 from .vertices import Triangles, require_control_points, vertices_of
 
 if TYPE_CHECKING:
@@ -32,8 +31,6 @@ if TYPE_CHECKING:
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
-# Parameters whose update selects new triangles.
-_CHOOSING = set(LIMITS)
 
 
 def make_subdivision(
@@ -60,9 +57,9 @@ def make_subdivision(
             parameters = read_parameters(props)
             surface, is_exact = parameters.surface, _is_exact(parameters, variant)
             self._parameters, self._tessellation = parameters, parameters.tessellation
-            if isinstance(self._tessellation, AdaptiveTessellation):
-                error = self._tessellation.error
-                self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
+            # The parameter of an adaptive tessellation's limit.
+            error = self._tessellation.error
+            self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
             # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths.
             self._evaluated: dict[str, int] = {}
             self._lengths: dict[str, int] = {}
@@ -191,7 +188,7 @@ def make_subdivision(
             for part in (self._cage, self._exact, self._displacement):
                 if part is not None:
                     part.traverse(callback)
-            if isinstance(self._tessellation, AdaptiveTessellation):
+            if self._tessellation.limit is not None:
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
             callback.put("patch_count", self._triangles.patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
@@ -210,7 +207,7 @@ def make_subdivision(
                 with errors_about("displacement_scale"):
                     scale = self._displacement.checked_scale()
             tessellation = self._tessellation
-            if not _CHOOSING.isdisjoint(keys) and isinstance(tessellation, AdaptiveTessellation):
+            if tessellation.limit in keys:
                 self._require_unfrozen()
                 tessellation = tessellation.with_error(np.array(self._error).ravel())
             if "faces" in keys:
@@ -218,7 +215,7 @@ def make_subdivision(
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
             self._parameterization = None
-            if (_MOVING | _CHOOSING | self._cage.moving).isdisjoint(keys):
+            if (_MOVING | {tessellation.limit} | self._cage.moving).isdisjoint(keys):
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])

@@ -24,58 +24,14 @@ ADAPTIVE = (*LIMITS, "max_rate", *SENSOR, "outline")
 
 
 @dataclass(frozen=True, eq=False)
-class UniformTessellation:
-    """The same number of segments on every edge of the cage."""
+class Tessellation:
+    """The same number of segments on every edge of the cage, or as few triangles as an error limit allows."""
 
-    rate: int
-
-    def table(
-        self,
-        surface: LimitSurface,
-        _control_points: NDArray,
-        _to_world: NDArray,
-        _bound: DisplacementBound | None = None,
-    ) -> VertexTable:
-        """Prepare the tessellation, which does not depend on the control points."""
-        return surface.sampling(self.rate)
-
-    def lines(self) -> list[str]:
-        """Lines of `to_string` that describe the tessellation."""
-        return [f"tessellation_rate = {self.rate}"]
-
-
-@dataclass(frozen=True, eq=False)
-class ViewingSensor:
-    """The sensor described by the shape's parameters."""
-
-    to_world: NDArray[np.float64]  # (4, 4) float64: camera-to-world transformation
-    fov: float  # Field of view along the film's width, in degrees; 0 if the sensor is orthographic
-    film_size: tuple[int, int]  # (int, int): width and height in pixels
-
-    def in_world(self) -> Sensor:
-        """Convert to the sensor of error criteria."""
-        from ..tessellation import Sensor
-
-        eye, axis, (width, height) = self.to_world[:3, 3], self.to_world[:3, 2], self.film_size
-        if not self.fov:
-            # The film is two units wide in camera space.
-            sizes = np.linalg.norm(self.to_world[:3, :2], axis=0) * 2 / width
-            return Sensor(eye, float(sizes.min()), axis / np.linalg.norm(axis))
-        # Size of a pixel at depth one. At equal distance, pixels get smaller towards the corners of the film.
-        pixel = 2 * np.tan(np.radians(self.fov) / 2) / width
-        corner = np.hypot(width, height) / 2 * pixel
-        return Sensor(eye, float(pixel / np.hypot(1, corner)))
-
-
-@dataclass(frozen=True, eq=False)
-class AdaptiveTessellation:
-    """As few triangles as an error limit allows."""
-
-    limit: str  # One of `LIMITS`
-    error: float  # Value of the limit
-    max_rate: int  # Maximum number of segments along an edge of the cage
-    sensor: ViewingSensor | None
-    fits_outline: bool  # Whether the limit holds only where the sensor may see the surface edge-on
+    rate: int  # Number of segments along an edge of the cage; the largest one of an adaptive tessellation
+    limit: str | None = None  # One of `LIMITS`; None for the same number everywhere
+    error: float = 0.0  # Value of the limit
+    sensor: Any = None  # `tessellation.Sensor` of the limit and of outlines, if one is needed
+    fits_outline: bool = False  # Whether the limit holds only where the sensor may see the surface edge-on
 
     def table(
         self,
@@ -83,43 +39,43 @@ class AdaptiveTessellation:
         control_points: NDArray,  # (n, 3) float64 in object space
         to_world: NDArray,  # (4, 4) float64
         # In object space. With a displacement, the limit holds everywhere, as silhouettes are unknown.
-        bound: DisplacementBound | None = None,
+        bound: DisplacementBound | None,
     ) -> VertexTable:
-        """Prepare the tessellation."""
+        """Prepare the tessellation. A uniform one does not depend on the control points."""
+        if self.limit is None:
+            return surface.sampling(self.rate)
         from ..tessellation import Criterion, DisplacementBound, Measure
 
         if bound is not None:
             # The spectral norm is the largest factor by which the linear map scales a length.
             stretch, object_heights = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
             bound = DisplacementBound(lambda start, uv: stretch * object_heights(start, uv), stretch * bound.extent)
-        sensor = None if self.sensor is None else self.sensor.in_world()
         criterion = Criterion(
             Measure.EDGE if self.limit == "max_edge" else Measure.CHORD,
             self.error,
-            sensor if self.limit == "pixel_error" else None,
-            sensor if self.fits_outline and bound is None else None,
+            self.sensor if self.limit == "pixel_error" else None,
+            self.sensor if self.fits_outline and bound is None else None,
             bound,
         )
         world_points = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):
-            return surface.adaptive_sampling(criterion, self.max_rate, world_points)
+            return surface.adaptive_sampling(criterion, self.rate, world_points)
 
-    def with_error(self, error: NDArray[np.floating]) -> AdaptiveTessellation:
+    def with_error(self, error: NDArray[np.floating]) -> Tessellation:
         """Return the tessellation with another value of the limit, an array of one number.
 
         Raises ValueError if the array has another size, or the number is not above 0.
         """
         if error.shape != (1,):
             raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
-        return replace(self, error=PARAMETER_OF_NAME[self.limit].checked(float(error[0])))
+        return replace(self, error=PARAMETER_OF_NAME[str(self.limit)].checked(float(error[0])))
 
     def lines(self) -> list[str]:
         """Lines of `to_string` that describe the tessellation."""
-        lines = ["tessellation = adaptive", f"{self.limit} = {self.error:.6g}", f"max_rate = {self.max_rate}"]
+        if self.limit is None:
+            return [f"tessellation_rate = {self.rate}"]
+        lines = ["tessellation = adaptive", f"{self.limit} = {self.error:.6g}", f"max_rate = {self.rate}"]
         return [*lines, "outline = sensor"] if self.fits_outline else lines
-
-
-Tessellation = UniformTessellation | AdaptiveTessellation
 
 
 def read_tessellation(props: mi.Properties) -> Tessellation:
@@ -131,7 +87,7 @@ def read_tessellation(props: mi.Properties) -> Tessellation:
         adaptive_only = [name for name in ADAPTIVE if name in props]
         if adaptive_only:
             raise ValueError(f'parameter "{adaptive_only[0]}" needs "tessellation" = "adaptive"')
-        return UniformTessellation(value_of(props, "tessellation_rate"))
+        return Tessellation(value_of(props, "tessellation_rate"))
     if "tessellation_rate" in props:
         raise ValueError(
             'parameter "tessellation_rate" needs "tessellation" = "uniform"; expected "max_rate", the highest rate of '
@@ -145,15 +101,15 @@ def read_tessellation(props: mi.Properties) -> Tessellation:
         )
     (limit,) = limits
     error, fits_outline = float(value_of(props, limit)), value_of(props, "outline") == "sensor"
-    sensor = _sensor(props, limit == "pixel_error" or fits_outline, "outline" if fits_outline else limit)
-    return AdaptiveTessellation(limit, error, value_of(props, "max_rate"), sensor, fits_outline)
+    needed_by = "outline" if fits_outline else "pixel_error" if limit == "pixel_error" else None
+    return Tessellation(value_of(props, "max_rate"), limit, error, _sensor(props, needed_by), fits_outline)
 
 
-def _sensor(props: mi.Properties, is_needed: bool, needed_by: str) -> ViewingSensor | None:
-    sensor_parameters = [name for name in SENSOR if name in props]
-    if not is_needed:
-        if sensor_parameters:
-            raise ValueError(f'parameter "{sensor_parameters[0]}" needs "pixel_error", or "outline" = "sensor"')
+def _sensor(props: mi.Properties, needed_by: str | None) -> Sensor | None:
+    given = [name for name in SENSOR if name in props]
+    if needed_by is None:
+        if given:
+            raise ValueError(f'parameter "{given[0]}" needs "pixel_error", or "outline" = "sensor"')
         return None
     missing = [name for name in SENSOR if name not in props]
     if missing:
@@ -163,7 +119,28 @@ def _sensor(props: mi.Properties, is_needed: bool, needed_by: str) -> ViewingSen
         )
     to_world = checked_matrix(props["sensor_to_world"], "sensor_to_world")
     fov, width, height = (value_of(props, name) for name in SENSOR[1:])
-    return ViewingSensor(to_world, float(fov), (width, height))
+    return sensor_in_world(to_world, fov, width, height)
+
+
+def sensor_in_world(
+    to_world: NDArray[np.float64],  # (4, 4) float64: camera-to-world transformation
+    fov: float,  # Field of view along the film's width, in degrees; 0 if the sensor is orthographic
+    # Size of the film in pixels
+    width: int,
+    height: int,
+) -> Sensor:
+    """Make the sensor of error criteria."""
+    from ..tessellation import Sensor
+
+    eye, axis = to_world[:3, 3], to_world[:3, 2]
+    if not fov:
+        # The film is two units wide in camera space.
+        sizes = np.linalg.norm(to_world[:3, :2], axis=0) * 2 / width
+        return Sensor(eye, float(sizes.min()), axis / np.linalg.norm(axis))
+    # Size of a pixel at depth one. At equal distance, pixels get smaller towards the corners of the film.
+    pixel = 2 * np.tan(np.radians(fov) / 2) / width
+    corner = np.hypot(width, height) / 2 * pixel
+    return Sensor(eye, float(pixel / np.hypot(1, corner)))
 
 
 def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outline: bool = False) -> dict[str, Any]:
@@ -192,13 +169,11 @@ def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outli
     import mitsuba as mi
 
     kind = getattr(sensor, "class_name", lambda: type(sensor).__name__)()
-    options = {
-        "tessellation": "adaptive",
-        **(
-            {} if pixel_error is None else {"pixel_error": PARAMETER_OF_NAME["pixel_error"].checked(float(pixel_error))}
-        ),
-        **({"outline": "sensor"} if outline else {}),
-    }
+    options: dict[str, Any] = {"tessellation": "adaptive"}
+    if pixel_error is not None:
+        options["pixel_error"] = PARAMETER_OF_NAME["pixel_error"].checked(float(pixel_error))
+    if outline:
+        options["outline"] = "sensor"
     parameters = mi.traverse(sensor) if isinstance(sensor, mi.Sensor) else {}
     if "x_fov" in parameters:
         fov = float(np.ravel(np.array(parameters["x_fov"]))[0])
