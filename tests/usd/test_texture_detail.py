@@ -55,6 +55,15 @@ def test_texels_follow_from_pixels(side, uv_side):
     assert found == {"a.png": pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit() * side / uv_side, rel=ROUNDED)}
 
 
+def test_the_corner_at_which_a_face_begins_does_not_matter():
+    """Every edge has its own density of texels, the one from the last corner to the first, too."""
+    texcoords, shape, needed = Attribute(np.array([[0, 0], [1, 0], [0.8, 0.5], [0, 0.3]]), "vertex"), square(), []
+    for turn in range(4):
+        cage = replace(shape.cage, face_vertices=np.roll(np.arange(4), turn), texcoords=texcoords)
+        needed.append(needed_for(replace(shape, cage=cage), inputs={"base_color": texture()})["a.png"])
+    assert needed == pytest.approx([needed[0]] * 4, rel=ROUNDED)
+
+
 def test_the_copy_that_is_largest_in_the_picture_decides():
     near = np.eye(4)
     near[2, 3] = -DISTANCE / 2
