@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from .cage import ControlCage
 from .cage.contents import RULES
 from .mesh.connectivity import IntArray, Topology, VertexRule
-from .mesh.seams import seams
+from .mesh.cuts import seams
 from .surface import LimitSurface
 
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
@@ -122,7 +122,7 @@ def _edge_count(cage: ControlCage) -> int:
     t, found = cage.topology, cage.non_manifold
     if found is None:
         return t.edge_count
-    sides = found.edge[found.is_edge & ~found.is_own_edge]
+    sides = found.edge[found.is_edge & ~found.has_one_face]
     return t.edge_count - len(sides) + len(np.unique(sides))
 
 

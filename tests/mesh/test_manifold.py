@@ -342,7 +342,7 @@ def test_what_is_no_manifold_is_so_by_definition(np_rng, monkeypatch):
         if found is None:
             continue
         assert set(np.flatnonzero(found.is_edge)) == expected.edges, faces
-        assert set(np.flatnonzero(found.is_own_edge)) == expected.own_edges, faces
+        assert set(np.flatnonzero(found.has_one_face)) == expected.own_edges, faces
         assert set(np.flatnonzero(found.is_vertex)) == expected.vertices, faces
         assert set(np.flatnonzero(found.is_crease)) == expected.creases, faces
         assert set(found.closed_fans) == expected.closed_fans, faces

@@ -57,7 +57,7 @@ class CageStructure:
     @cached_property
     def is_boundary(self) -> NDArray[np.bool_]:
         is_border, non_manifold = self.topology.twin < 0, self.non_manifold
-        return is_border if non_manifold is None else is_border & ~non_manifold.is_edge | non_manifold.is_own_edge
+        return is_border if non_manifold is None else is_border & ~non_manifold.is_edge | non_manifold.has_one_face
 
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:

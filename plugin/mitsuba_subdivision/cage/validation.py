@@ -171,7 +171,7 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
 
 def _description(t: Topology, non_manifold: NonManifold, source: CageSource) -> str:
     """Return the warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
-    half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.is_own_edge)
+    half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.has_one_face)
     # One half-edge of each edge.
     crowded = half_edges[np.unique(non_manifold.edge[half_edges], return_index=True)[1]]
     ends = np.stack([t.face_vertices[crowded], t.face_vertices[t.next[crowded]]], axis=1)
@@ -311,6 +311,9 @@ def validated_tags(
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
+    if not len(edges) and not len(vertices):
+        # Most cages. Takes no memory.
+        return Sharpness(np.broadcast_to(0.0, topology.half_edge_count), np.broadcast_to(0.0, topology.vertex_count))
     starts, ends = edges[:, :2].astype(np.int64).T
     half_edge, vertex = _half_edges_between(topology, starts, ends), vertices[:, 0].astype(np.int64)
 
@@ -366,7 +369,6 @@ def _sharpness(
 ) -> NDArray[np.float64]:
     """Return a read-only array of values, clamped to `INFINITE`, at ``indices`` and at twins of these; else zero."""
     if not len(indices):
-        # Takes no memory, as in most cages nothing is sharp.
         return np.broadcast_to(0.0, count)
     sharpness = np.zeros(count)
     sharpness[indices] = np.minimum(values, INFINITE)

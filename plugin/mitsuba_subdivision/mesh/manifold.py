@@ -35,7 +35,7 @@ class NonManifold:
     is_edge: NDArray[np.bool_]
     # (n_h,) bool: whether the edge of each half-edge is non-manifold, but belongs to one face only. This includes edges
     # that join a vertex to itself, and the second occurrence of an edge in a face.
-    is_own_edge: NDArray[np.bool_]
+    has_one_face: NDArray[np.bool_]
     edge: NDArray[np.int32]  # (n_h,) int32: edge of each half-edge, equal for all between the same two vertices
     is_vertex: NDArray[np.bool_]  # (n_v,) bool: whether each vertex is non-manifold
     # (n_v,) bool: whether each vertex is on a crease of two non-manifold edges; other non-manifold vertices are corners
@@ -148,7 +148,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
     is_non_manifold[t.edge[is_loop | is_second | runs_with_twin(t) | (sides[t.edge] > 2)]] = True
     edges = is_non_manifold[t.edge]
     face_count = sides - np.bincount(t.edge[is_second], minlength=t.edge_count)
-    is_own_edge = edges & (is_loop | is_second | (face_count[t.edge] == 1))
+    has_one_face = edges & (is_loop | is_second | (face_count[t.edge] == 1))
 
     separate = t
     if edges.any():
@@ -169,12 +169,12 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
 
     edge_count = edges_at(t.edge_half_edge)
     creases = vertices & (edges_at(t.edge_half_edge[is_non_manifold]) == 2) & (t.vertex_face_count > edge_count)
-    creases &= edges_at(np.flatnonzero(is_own_edge | (separate.twin < 0) & ~edges)) == 0
+    creases &= edges_at(np.flatnonzero(has_one_face | (separate.twin < 0) & ~edges)) == 0
     begins = np.flatnonzero(edges)
     returns_to_edge = t.edge[begins] == t.edge[t.prev[fan[begins]]]
     # Where some fans do not run along the crease, OpenSubdiv applies the crease mask; here the vertex is a corner.
     creases[start[begins[returns_to_edge]]] = creases[start[closed]] = False
-    return separate, NonManifold(edges, is_own_edge, t.edge, vertices, creases, closed)
+    return separate, NonManifold(edges, has_one_face, t.edge, vertices, creases, closed)
 
 
 def turning_order(topology: Topology) -> IntArray | None:

@@ -16,7 +16,7 @@ from ..evaluation.equations import Evaluator
 from ..evaluation.located_samples import LocatedSamples
 from ..evaluation.patch_tree import patch_tree
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.seams import seams, value_mesh
+from ..mesh.cuts import seams, value_mesh
 from ..mesh.shared import Content, Shared
 from ..progress import counted
 from ..schemes import Scheme, SchemeError

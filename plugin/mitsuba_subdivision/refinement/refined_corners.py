@@ -13,7 +13,7 @@ from ..cage.contents import RULES, Attribute
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, shortened
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.seams import seams, value_mesh
+from ..mesh.cuts import seams, value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 

@@ -117,7 +117,7 @@ def _layout(
     grid, surface_vertex = table.grid, None
     seams = [layout.seam for layout in layouts if layout.seam is not None]
     if seams:
-        from ..mesh.seams import cut_along_seams
+        from ..mesh.cuts import cut_along_seams
 
         cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
         grid = grid.cut(PatchTable(cut.topology, patches.scheme, patches.is_hole).elements)
