@@ -15,10 +15,18 @@ from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
-from mitsuba_subdivision.studio.camera import FIELD_OF_VIEW, MARGIN, NEAREST, VIEWS, framed, outermost
-from mitsuba_subdivision.studio.model import CageWire, up_axis_of
+from mitsuba_subdivision.studio.model import Model, up_axis_of
 from mitsuba_subdivision.studio.saving import save_scene
-from mitsuba_subdivision.studio.studio_entries import sampler
+from mitsuba_subdivision.studio.studio_entries import (
+    FIELD_OF_VIEW,
+    MARGIN,
+    NEAREST,
+    VIEWS,
+    camera_axes,
+    framed,
+    outermost,
+    sampler,
+)
 
 llvm, scalar = (pytest.mark.usefixtures(f"variant_{name}") for name in ("llvm_ad_rgb", "scalar_rgb"))
 CAGES = Path(msub.example_file("human.xml")).parent / "cages"
@@ -27,9 +35,9 @@ ROUNDING = 1e-9
 SMALL = {"size": (24, 18), "spp": 16, "rate": 2}
 
 
-def in_picture(points, camera, size):
+def in_picture(points, origin, axes, size):
     """Places of points, from -1 to 1 in each direction of the picture, by the definition of a perspective camera."""
-    x, y, z = ((points - camera.origin) @ camera.axes).T
+    x, y, z = ((points - origin) @ axes).T
     assert (z > 0).all()
     half = np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size)
     return np.stack([x, y], axis=1) / (z[:, None] * half)
@@ -47,19 +55,19 @@ def in_picture(points, camera, size):
 def test_all_points_are_in_the_picture_and_as_large_as_fits(seed, azimuth, elevation, size, scale):
     rng = np.random.default_rng(seed)
     points = scale * (rng.normal(size=(40, 3)) * rng.uniform(0.01, 3, 3) + rng.normal(size=3))
-    camera = framed(points, azimuth, elevation, size)
-    places = in_picture(points, camera, size)
+    axes, (origin, _) = camera_axes(azimuth, elevation), framed(points, azimuth, elevation, size)
+    places = in_picture(points, origin, axes, size)
     reach = np.abs(places).max(axis=0)
     assert (reach <= 1 - 2 * MARGIN + ROUNDING).all()
-    depth = (points - camera.origin) @ camera.axes[:, 2]
+    depth = (points - origin) @ axes[:, 2]
     assert depth.min() >= np.ptp(depth) * (NEAREST - ROUNDING)
     if depth.min() > np.ptp(depth) * (NEAREST + ROUNDING):
         assert reach.max() >= 1 - 2 * MARGIN - ROUNDING
         tight = reach.argmax()
         np.testing.assert_allclose(places[:, tight].max(), -places[:, tight].min(), rtol=1e-6)
     # The few outermost points ask for the same camera.
-    again = framed(outermost(points, "z", (azimuth, elevation), size), azimuth, elevation, size)
-    np.testing.assert_allclose(again.origin, camera.origin, atol=1e-9 * scale)
+    again, _ = framed(outermost(points, "z", (azimuth, elevation), size), azimuth, elevation, size)
+    np.testing.assert_allclose(again, origin, atol=1e-9 * scale)
 
 
 @pytest.mark.parametrize("up", ["y", "z"])
@@ -214,24 +222,25 @@ def test_what_no_file_can_hold_is_refused_before_anything_is_written(tmp_path, m
 
 def test_rods_and_balls_lie_around_edges_and_vertices():
     cage = named_cages.cube()
-    wire = CageWire(cage, 2.0)
-    drawn = msub.LimitSurface(wire.cage).tessellate(4)
+    model = Model(cage)
+    radius, wire = model.wire_radius, model.wire_cage
+    drawn = msub.LimitSurface(wire).tessellate(4)
     p, n = drawn.positions, drawn.normals
     from_vertex = np.linalg.norm(p[:, None] - cage.positions, axis=2).min(axis=1)
-    is_rod = from_vertex > 2.3 * wire.radius
+    is_rod = from_vertex > 2.3 * radius
     assert is_rod.sum() > 100
-    assert from_vertex[~is_rod].min() > 0.9 * wire.radius
+    assert from_vertex[~is_rod].min() > 0.9 * radius
     start, end = cage.positions[cage.edges[:, 0]], cage.positions[cage.edges[:, 1]]
     along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
     away = p[is_rod, None] - start
     away -= (away * along).sum(axis=2, keepdims=True) * along
     distance = np.linalg.norm(away, axis=2)
     nearest = distance.argmin(axis=1)
-    np.testing.assert_allclose(distance.min(axis=1), wire.radius, rtol=0.04)
+    np.testing.assert_allclose(distance.min(axis=1), radius, rtol=0.04)
     # Outward.
     assert (away[np.arange(len(away)), nearest] * n[is_rod]).sum(axis=1).min() > 0
     shift = np.array([1.0, 2, 3])
-    np.testing.assert_allclose(wire.positions(cage.positions + shift), wire.cage.positions + shift, atol=1e-12)
+    np.testing.assert_allclose(model.wire_points(cage.positions + shift), wire.positions + shift, atol=1e-12)
 
 
 @scalar

@@ -1,9 +1,8 @@
-"""A neutral studio around a model: camera, lights and backdrop, turntables, and the command ``render``."""
+"""A neutral studio around a model: camera, lights and backdrop, turntables, frames, and scenes saved as XML."""
 
 from ..regression.scene import LoadedScene
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .cage_scenes import studio_scene
-from .camera import DEFAULT_VIEW, View
 from .denoising import render_denoised
 from .model import frame_table
 from .picture import (
@@ -17,7 +16,17 @@ from .picture import (
     triangles_for,
 )
 from .polygon_mesh import PolygonMesh, box_corners, points_at, with_meshes
-from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, LIGHTS, Look, sampler, studio, variant_in_use
+from .studio_entries import (
+    DEFAULT_SIZE,
+    DEFAULT_SPP,
+    DEFAULT_VIEW,
+    LIGHTS,
+    Look,
+    View,
+    sampler,
+    studio,
+    variant_in_use,
+)
 
 __all__ = [
     "DEFAULT_SIZE",

@@ -22,9 +22,8 @@ from ..cage import CageError, CageWarning
 from ..device_arrays import upload
 from ..regression.scene import LoadedScene, load_scene
 from ..variants import SceneNode
-from .camera import outermost, studio_axes, turned
 from .polygon_mesh import points_at, with_meshes
-from .studio_entries import RIG
+from .studio_entries import RIG, outermost, studio_axes, turned
 
 PATTERN = re.compile(r"%(0\d+)?d")
 

@@ -23,11 +23,10 @@ from ..regression.scene import LoadedScene
 from ..shapes.cage_attributes import mesh_name
 from ..variants import SceneNode
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
-from .camera import DEFAULT_VIEW, View
 from .model import Model
 from .obj_materials import material_bsdf, material_emitter
 from .picture import shading_for
-from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, Look, studio, variant_in_use
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, studio, variant_in_use
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
@@ -101,7 +100,7 @@ class CageScenes:
         """Points ``(n, 3)`` in the world that the camera must see: the limit surface, and the cage if it is drawn."""
         model, positions = contents
         points = model.points if positions is model.cage.positions else model.limit_points(positions)
-        return np.concatenate([points, model.wire.positions(positions)]) if self._look.cage else points
+        return np.concatenate([points, model.wire_points(positions)]) if self._look.cage else points
 
     def has_studio(self, contents: PosedModel) -> bool:  # noqa: ARG002 - as all sources have it
         """Whether the camera or the lights are those of the studio, which depend on the points: of a cage they are."""
@@ -154,7 +153,7 @@ class CageScenes:
             surfaces = [name for name in scene if re.fullmatch(r"surface(_\d+)?", name)]
             moved = {f"{name}.control_points": positions for name in surfaces}
             if self._look.cage:
-                moved["cage.control_points"] = model.wire.positions(positions)
+                moved["cage.control_points"] = model.wire_points(positions)
             set_parameters(loaded.scene, moved)
             yield loaded
 
@@ -194,7 +193,7 @@ class CageScenes:
         if not look.cage:
             return surfaces
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}}
-        wire = {"type": "subdivision", **model.wire.cage.as_properties(mi), "tessellation_rate": WIRE_RATE}
+        wire = {"type": "subdivision", **model.wire_cage.as_properties(mi), "tessellation_rate": WIRE_RATE}
         return {**surfaces, "cage": {**wire, "bsdf": bsdf}}
 
 

@@ -108,9 +108,35 @@ class Model:
         return self.limit_points(self.cage.positions)
 
     @cached_property
-    def wire(self) -> CageWire:
-        """The drawn cage."""
-        return CageWire(self.cage, float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2))
+    def wire_radius(self) -> float:
+        """Radius of the rods of the drawn cage."""
+        radius = float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2)
+        lengths = np.linalg.norm(np.diff(self.cage.positions[self.cage.edges], axis=1)[:, 0], axis=1)
+        return min(ROD * radius, ROD_PER_EDGE * float(np.median(lengths)))
+
+    @property
+    def wire_cage(self) -> ControlCage:
+        """The cage whose limit surface is rods along the edges and balls around the vertices of the cage."""
+        tube = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+        cube = named_cages.cube().face_vertices.reshape(6, 4)
+        count = len(self.cage.edges)
+        first = 8 * np.arange(count + len(np.unique(self.cage.edges)))[:, None, None]
+        faces = np.concatenate([(first[:count] + tube).reshape(-1, 4), (first[count:] + cube).reshape(-1, 4)])
+        return ControlCage(self.wire_points(self.cage.positions), faces, source=CageSource("cage wire"))
+
+    def wire_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
+        ends, radius = control_points[self.cage.edges], self.wire_radius
+        along = _unit(ends[:, 1] - ends[:, 0])
+        # The axis that is furthest from the edge.
+        axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+        side = _unit(np.cross(along, axis))
+        across = np.stack([side, np.cross(along, side)], axis=1)
+        ring = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) @ across * (radius / _TUBE_LIMIT)
+        tubes = ends[:, :, None] + ring[:, None]
+        corners = named_cages.cube().positions * (BALL * radius / _CUBE_LIMIT / np.sqrt(3))
+        balls = control_points[np.unique(self.cage.edges), None] + corners
+        return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
 
     def as_shape(
         self,
@@ -145,40 +171,6 @@ def up_axis_of(path: Path) -> str:
     from ..files.usd_stage import stage_up_axis
 
     return stage_up_axis(path)
-
-
-class CageWire:
-    """Rods and balls that follow the control points of a cage."""
-
-    def __init__(self, cage: ControlCage, model_radius: float) -> None:
-        self._edges, self._vertices = cage.edges, np.unique(cage.edges)
-        lengths = np.linalg.norm(np.diff(cage.positions[cage.edges], axis=1)[:, 0], axis=1)
-        self.radius = min(ROD * model_radius, ROD_PER_EDGE * float(np.median(lengths)))
-        self._positions = cage.positions
-
-    @cached_property
-    def cage(self) -> ControlCage:
-        """The cage whose limit surface is the rods and balls."""
-        tube = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
-        cube = named_cages.cube().face_vertices.reshape(6, 4)
-        count = len(self._edges)
-        first = 8 * np.arange(count + len(self._vertices))[:, None, None]
-        faces = np.concatenate([(first[:count] + tube).reshape(-1, 4), (first[count:] + cube).reshape(-1, 4)])
-        return ControlCage(self.positions(self._positions), faces, source=CageSource("cage wire"))
-
-    def positions(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
-        ends = control_points[self._edges]
-        along = _unit(ends[:, 1] - ends[:, 0])
-        # The axis that is furthest from the edge.
-        axis = np.eye(3)[np.abs(along).argmin(axis=1)]
-        side = _unit(np.cross(along, axis))
-        across = np.stack([side, np.cross(along, side)], axis=1)
-        ring = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) @ across * (self.radius / _TUBE_LIMIT)
-        tubes = ends[:, :, None] + ring[:, None]
-        corners = named_cages.cube().positions * (BALL * self.radius / _CUBE_LIMIT / np.sqrt(3))
-        balls = control_points[self._vertices, None] + corners
-        return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

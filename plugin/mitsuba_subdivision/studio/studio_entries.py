@@ -1,8 +1,9 @@
-"""The studio: camera, three soft lights and a seamless backdrop, sized for a model, as entries of a Mitsuba scene."""
+"""The studio: a camera that frames a model, soft lights and a seamless backdrop, as entries of a Mitsuba scene."""
 
 from __future__ import annotations
 
 import numbers
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isqrt
 
@@ -13,12 +14,26 @@ from numpy.typing import ArrayLike, NDArray
 from ..cage import ControlCage
 from ..cage.errors import CageSource, in_digits, warn
 from ..variants import SceneNode
-from .camera import DEFAULT_VIEW, FIELD_OF_VIEW, Camera, View, angles_of, framed, studio_axes, turned
 from .polygon_mesh import box_corners
 
-DEFAULT_SIZE = (640, 480)
-DEFAULT_SPP = 64
-LARGEST_SIDE = 1 << 14
+# Azimuth and elevation in degrees. Azimuth 0 is the model's front, 90 its own left, which is +x.
+VIEWS = {
+    "front": (0.0, 0.0),
+    "side": (90.0, 0.0),
+    "back": (180.0, 0.0),
+    "top": (0.0, 90.0),
+    "three-quarter": (35.0, 18.0),
+}
+DEFAULT_VIEW = "three-quarter"
+UP_AXES = ("y", "z")
+View = str | Sequence[float]
+# Field of view of the picture's longer side, in degrees: that of long lenses for products and portraits.
+FIELD_OF_VIEW = 28.0
+# Part of the picture that stays empty on each side.
+MARGIN = 0.08
+# Least distance of the nearest point, in depths of the model: the furthest point then looks a fifth as large.
+NEAREST = 0.25
+DEFAULT_SIZE, DEFAULT_SPP, LARGEST_SIDE = (640, 480), 64, 1 << 14
 # Sizes of models that Mitsuba renders alike, as measured: lengths are squared in single precision.
 SIZES = (1e-9, 5e8)
 # Of boxes: points beyond are infinite in single precision.
@@ -39,6 +54,24 @@ BACKDROP_COLOUR = (0.30, 0.305, 0.315)
 BEND, WALL = 1.6, 7.0
 # Distance of the floor below the model, in radii: a flat model must not coincide with the floor.
 GAP = 0.003
+
+
+@dataclass(frozen=True)
+class Look:
+    """Display options of a model or a stage."""
+
+    view: View = DEFAULT_VIEW  # str or (azimuth, elevation): from where the studio's camera looks
+    # (width, height) or None: of the film, in pixels. None for 640 by 480, or what a stage's render settings or its
+    # camera ask for.
+    size: tuple[int, int] | None = None
+    spp: int = DEFAULT_SPP  # Samples per pixel
+    up: str | None = None  # Axis of a cage that points up; None for that of its file
+    rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
+    shading: str = "vertex"  # Of a cage
+    checker: bool = False  # Whether texture coordinates of a cage are shown as a checkerboard
+    cage: bool = False  # Whether the control cage is drawn over its surface
+    # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
+    texture_size: int | None = None
 
 
 def studio(
@@ -66,7 +99,10 @@ def studio(
     variant_in_use()
     prefix = "" if name is None else f"{name}: "
     box = _checked_bounds(bounds, prefix)
-    _check_film(size, spp)
+    if len(size) != 2 or not all(isinstance(side, numbers.Integral) and 1 <= side <= LARGEST_SIDE for side in size):
+        raise ValueError(f"size {size!r}; expected width and height, 1 to {LARGEST_SIDE} pixels")
+    if not isinstance(spp, numbers.Integral) or spp < 1:
+        raise ValueError(f"spp {spp!r}; expected 1 or more samples per pixel")
     azimuth, elevation = angles_of(view)
     axes = studio_axes(up)
     in_world = box_corners(box) if points is None else np.asarray(points, dtype=np.float64).reshape(-1, 3)
@@ -77,24 +113,35 @@ def studio(
             f"{prefix}a model {in_digits(2 * radius)} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which "
             "Mitsuba's single precision loses light and surfaces"
         )
-    camera = framed(in_world @ axes, azimuth, elevation, size)
+    origin, distance = framed(in_world @ axes, azimuth, elevation, size)
+    right, up_in_picture, forward = (axes @ camera_axes(azimuth, elevation)).T
     from_below = elevation < 0
     scene: SceneNode = {
         "integrator": {"type": "path", "max_depth": 6},
-        "sensor": _sensor(camera, axes, radius, size, spp),
+        "sensor": {
+            "type": "perspective",
+            "fov": FIELD_OF_VIEW,
+            "fov_axis": "larger",
+            "near_clip": 1e-3 * distance,
+            "far_clip": 100 * (distance + radius),
+            # Mitsuba's cameras have x to the left.
+            "to_world": _transform(np.stack([-right, up_in_picture, forward], axis=1), axes @ origin),
+            "film": {"type": "hdrfilm", "width": int(size[0]), "height": int(size[1]), "component_format": "float32"},
+            "sampler": sampler(int(spp)),
+        },
     }
     rig = axes @ turned(azimuth) @ np.diag([1.0, 1.0, -1.0 if from_below else 1.0])
-    for name, (position, half_sides, radiance, weight) in LIGHTS.items():
-        origin = axes @ middle + radius * rig @ np.array(position)
-        placed = mi.ScalarTransform4f().look_at(origin.tolist(), (axes @ middle).tolist(), axes[:, 2].tolist())
+    for light, (position, half_sides, radiance, weight) in LIGHTS.items():
+        place = axes @ middle + radius * rig @ np.array(position)
+        placed = mi.ScalarTransform4f().look_at(place.tolist(), (axes @ middle).tolist(), axes[:, 2].tolist())
         scale = mi.ScalarTransform4f().scale([radius * half_sides[0], radius * half_sides[1], 1.0])
         emitter = {"type": "area", "radiance": _rgb(radiance), "sampling_weight": weight}
-        scene[name] = {"type": "rectangle", "to_world": placed @ scale, "emitter": emitter}
+        scene[light] = {"type": "rectangle", "to_world": placed @ scale, "emitter": emitter}
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}
     if not from_below:
         # The camera stands on the floor and sees neither its sides nor the top of the wall, however far away it is.
-        extent = camera.distance + WALL * radius
-        sweep = backdrop(1.5 * extent, BEND * radius, WALL * radius, 2 * WALL * radius + extent, 2 * extent)
+        extent = distance + WALL * radius
+        sweep = _backdrop(1.5 * extent, BEND * radius, WALL * radius, 2 * WALL * radius + extent, 2 * extent)
         scene["ground"] = {
             "type": "subdivision",
             **sweep.as_properties(mi),
@@ -104,12 +151,92 @@ def studio(
     return scene
 
 
-def sampler(
-    # Samples of a pixel at least. They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with
-    # a warning.
-    spp: int,
-) -> SceneNode:
-    """Well-spread samples, as for ``mi.load_dict``."""
+def framed(
+    points: NDArray[np.float64],  # (n, 3) float64: in the studio's axes
+    # Where the camera is, seen from the points, in degrees
+    azimuth: float,
+    elevation: float,
+    size: tuple[int, int],  # (width, height)
+) -> tuple[NDArray[np.float64], float]:
+    """Place a camera so that points just fit into its image, centred, but for `MARGIN`.
+
+    Points that are deeper than they are wide are smaller than that, as the camera keeps away from them.
+    Returns its place in the studio's axes, and its distance from the middle of the points, along the view.
+    """
+    axes = camera_axes(azimuth, elevation)
+    in_camera = points @ axes
+    z = in_camera[:, 2]
+    nearest, middle = [], []
+    for along, slope in zip(in_camera.T[:2], _slopes(size), strict=True):
+        above, below = (along - slope * z).max(), (-along - slope * z).max()
+        nearest.append(-(above + below) / (2 * slope))
+        middle.append((above - below) / 2)
+    # A nearer camera would distort models that are long along the view, and could lie inside a thin tip.
+    depth = min(*nearest, z.min() - NEAREST * (z.max() - z.min()))
+    return axes @ np.array([*middle, depth]), float((z.min() + z.max()) / 2 - depth)
+
+
+def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
+    """The few of points in the world that determine the camera of `framed`, and the bounds of all points."""
+    x, y = _slopes(size)
+    # Away from each side of what the camera sees, then along its view and along the axes.
+    towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
+    directions = np.concatenate([towards @ camera_axes(*angles_of(view)).T, np.eye(3), -np.eye(3)])
+    return points[np.unique((points @ studio_axes(up) @ directions.T).argmax(axis=0))]
+
+
+def _slopes(size: tuple[int, int]) -> NDArray[np.float64]:
+    """Half extents of what points may fill per unit of depth, horizontally and vertically."""
+    return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * MARGIN)
+
+
+def camera_axes(azimuth: float, elevation: float) -> NDArray[np.float64]:
+    """Columns right, up and forward ``(3, 3)``, in the studio's axes."""
+    a, e = np.radians([azimuth, elevation])
+    right = np.array([np.cos(a), np.sin(a), 0.0])
+    forward = np.array([-np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), -np.sin(e)])
+    return np.stack([right, np.cross(right, forward), forward], axis=1)
+
+
+def angles_of(view: View) -> tuple[float, float]:
+    """Azimuth and elevation in degrees of a view, which is a name in `VIEWS`, or two angles.
+
+    Raises ValueError if there is no such view, or the elevation is not between -90 and 90.
+    """
+    if isinstance(view, str):
+        if view not in VIEWS:
+            raise ValueError(f'view "{view}"; expected one of {", ".join(VIEWS)}, or azimuth and elevation')
+        return VIEWS[view]
+    if len(view) != 2 or not all(isinstance(angle, numbers.Real) and np.isfinite(angle) for angle in view):
+        raise ValueError(f"view {view!r}; expected one of {', '.join(VIEWS)}, or azimuth and elevation in degrees")
+    azimuth, elevation = map(float, view)
+    if not -90 <= elevation <= 90:
+        raise ValueError(f"elevation {in_digits(elevation)}; expected -90 to 90 degrees")
+    return azimuth, elevation
+
+
+def studio_axes(up: str) -> NDArray[np.float64]:
+    """Directions of the studio in the world: columns right, back and up ``(3, 3)``, of a viewer before the front.
+
+    A model's front is that of modelling programs: -y where z is up, +z where y is up.
+    Raises ValueError if the axis is neither y nor z.
+    """
+    if up not in UP_AXES:
+        raise ValueError(f'up axis "{up}"; expected {" or ".join(UP_AXES)}')
+    return np.eye(3) if up == "z" else np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+def turned(azimuth: float) -> NDArray[np.float64]:
+    """Rotation ``(3, 3)`` about the studio's up axis, by degrees, counter-clockwise seen from above."""
+    c, s = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
+def sampler(spp: int) -> SceneNode:
+    """Well-spread samples of a pixel, at least so many, as for ``mi.load_dict``.
+
+    They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a warning.
+    """
     rows = isqrt(spp)
     return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
 
@@ -120,21 +247,6 @@ def variant_in_use() -> str:
     if variant is None:
         raise ValueError('no variant of Mitsuba is set; expected one, such as by mi.set_variant("llvm_ad_rgb")')
     return variant
-
-
-def _sensor(camera: Camera, axes: NDArray[np.float64], radius: float, size: tuple[int, int], spp: int) -> SceneNode:
-    right, up, forward = (axes @ camera.axes).T
-    return {
-        "type": "perspective",
-        "fov": FIELD_OF_VIEW,
-        "fov_axis": "larger",
-        "near_clip": 1e-3 * camera.distance,
-        "far_clip": 100 * (camera.distance + radius),
-        # Mitsuba's cameras have x to the left.
-        "to_world": _transform(np.stack([-right, up, forward], axis=1), axes @ camera.origin),
-        "film": {"type": "hdrfilm", "width": int(size[0]), "height": int(size[1]), "component_format": "float32"},
-        "sampler": sampler(int(spp)),
-    }
 
 
 def _transform(linear: NDArray[np.float64], origin: NDArray[np.float64]) -> mi.ScalarTransform4f:
@@ -153,21 +265,12 @@ def _checked_bounds(bounds: ArrayLike, prefix: str) -> NDArray[np.float64]:
         raise ValueError(f"{prefix}bounds of shape {box.shape}; expected (2, 3), all finite")
     size = box[1] - box[0]
     if not size.min() >= 0 or not 0 < size.max() < LARGEST_BOX:
-        raise ValueError(
-            f"{prefix}bounds from {in_digits(box[0])} to {in_digits(box[1])}; expected a box with a size, below "
-            f"{LARGEST_BOX:g}"
-        )
+        extent = f"{in_digits(box[0])} to {in_digits(box[1])}"
+        raise ValueError(f"{prefix}bounds from {extent}; expected a box with a size, below {LARGEST_BOX:g}")
     return box
 
 
-def _check_film(size: tuple[int, int], spp: int) -> None:
-    if len(size) != 2 or not all(isinstance(side, numbers.Integral) and 1 <= side <= LARGEST_SIDE for side in size):
-        raise ValueError(f"size {size!r}; expected width and height, 1 to {LARGEST_SIDE} pixels")
-    if not isinstance(spp, numbers.Integral) or spp < 1:
-        raise ValueError(f"spp {spp!r}; expected 1 or more samples per pixel")
-
-
-def backdrop(
+def _backdrop(
     front: float,  # How far the floor reaches towards -y; more than `wall - 2 * bend`
     # Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height `wall - bend`
     bend: float,
@@ -184,21 +287,3 @@ def backdrop(
     left = np.arange(len(profile) - 1)
     right = left + len(profile)
     return ControlCage(positions, np.stack([left, right, right + 1, left + 1], axis=1), source=CageSource("backdrop"))
-
-
-@dataclass(frozen=True)
-class Look:
-    """Display options of a model or a stage."""
-
-    view: View = DEFAULT_VIEW  # str or (azimuth, elevation): from where the studio's camera looks
-    # (width, height) or None: of the film, in pixels. None for 640 by 480, or what a stage's render settings or its
-    # camera ask for.
-    size: tuple[int, int] | None = None
-    spp: int = DEFAULT_SPP  # Samples per pixel
-    up: str | None = None  # Axis of a cage that points up; None for that of its file
-    rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
-    shading: str = "vertex"  # Of a cage
-    checker: bool = False  # Whether texture coordinates of a cage are shown as a checkerboard
-    cage: bool = False  # Whether the control cage is drawn over its surface
-    # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
-    texture_size: int | None = None
