@@ -219,7 +219,7 @@ def bitmap(path):
     with whole_file(path) as beside:
         mi.util.convert_to_bitmap(pixels, uint8_srgb=False).write(str(beside))
 writers = {"a.exr": lambda path: write_exr(path, pixels), "b.exr": bitmap, "b.hdr": bitmap,
-    "c.png": lambda path: draw_picture(FigureOptions(folder, formats=("png",)), "c", pixels, {})}
+    "c.png": lambda path: draw_picture(FigureOptions(folder, formats=("png",)), "c", pixels)}
 writers |= {f"d.{s}": triangles.save for s in ("obj", "ply", "usda", "usdc")}
 writers |= {f"e.{s}": cage.save for s in ("obj", "ply", "usda", "usdc")}
 # As on a full disk: what goes beyond is not written.

@@ -16,7 +16,7 @@ from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, label
 from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
 from mitsuba_subdivision.figures.normal_error import offset_cage
-from mitsuba_subdivision.figures.output import write_plot
+from mitsuba_subdivision.figures.output import write_figure
 from mitsuba_subdivision.figures.own_cage import around_vertices, frame
 from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
 from mitsuba_subdivision.figures.staging import project, visible
@@ -49,7 +49,7 @@ def coarse(monkeypatch):
 
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
-    monkeypatch.setitem(write_plot.__kwdefaults__, "layouts", 1)
+    monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     constants = {
         "creases": {"RATE": 3},
         "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
@@ -359,10 +359,10 @@ def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path, answering):
     answers = {"p": points, "n": normals, "corners": quad, "version": np.array([3, 4, 1], dtype=np.int32)}
     # The last three words are both files and the level.
     said = f'while [ $# -gt 3 ]; do echo "$1"; shift; done > {tmp_path}/words; echo "$3" >> {tmp_path}/words'
-    mesh = peers.blender_mesh(answering("blender", said, **answers), cube(), 5)
-    assert np.array_equal(mesh.positions, points.reshape(4, 3))
-    assert np.array_equal(mesh.normals, normals.reshape(4, 3))
-    assert (mesh.quads.tolist(), mesh.version) == ([[0, 1, 2, 3]], "3.4")
+    found = peers.blender_mesh(answering("blender", said, **answers), cube(), 5)
+    assert np.array_equal(found[0], points.reshape(4, 3))
+    assert np.array_equal(found[1], normals.reshape(4, 3))
+    assert (found[2].tolist(), found[3]) == ([[0, 1, 2, 3]], "3.4")
     words = (tmp_path / "words").read_text().split()
     assert "--background" in words
     assert words[-3:] == [str(peers.BLENDER_SCRIPT), "--", "5"]
@@ -375,12 +375,12 @@ def test_blender_has_the_cage_on_its_limit_surface():
     if peers.blender() is None:
         pytest.skip("no program blender")
     level = 4
-    mesh = peers.blender_mesh(peers.blender(), cube(), level)
+    positions, normals, quads, _ = peers.blender_mesh(peers.blender(), cube(), level)
     exact = LimitSurface(cube()).tessellate(2**level)
-    distance, nearest = cKDTree(exact.positions).query(mesh.positions)
-    assert len(mesh.quads) == 6 * 4**level
+    distance, nearest = cKDTree(exact.positions).query(positions)
+    assert len(quads) == 6 * 4**level
     # Each has a point of its own; Blender approximates near the corners (measured: 6e-3 of the half edge).
-    assert len(np.unique(nearest)) == len(mesh.positions)
+    assert len(np.unique(nearest)) == len(positions)
     assert distance.max() < 0.01
-    cosine = (mesh.normals * exact.normals[nearest]).sum(axis=1)
+    cosine = (normals * exact.normals[nearest]).sum(axis=1)
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5

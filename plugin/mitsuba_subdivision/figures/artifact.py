@@ -18,7 +18,7 @@ from ..regression.tier_tests import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
-from .output import FigureError, FigureOptions, panels, scientific, show, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, scientific, show, write_figure
 from .own_cage import around_vertices, frame
 from .staging import in_8_bits, load_stage, project, render, staged
 from .subdivision import edge_curves
@@ -84,24 +84,18 @@ RULES = (
 )
 
 
-@dataclass(frozen=True)
-class VertexNormal:
-    """The sample at an extraordinary point: level n (None at the point itself), offset |c1|, error in degrees."""
+def vertex_normal(row: Row, rule: NormalRule) -> tuple[int | None, float, float]:
+    """Sample of float32 at an extraordinary point, against float64 at the same parameters.
 
-    level: int | None
-    offset: float
-    error: float
-
-
-def vertex_normal(row: Row, rule: NormalRule) -> VertexNormal:
-    """Error of the normal at the extraordinary point in float32 against float64 at the same parameters."""
+    Returns its level n, None at the point itself; the offset |c1|; and the error of its normal in degrees.
+    """
     surface = row.surface()
     uv = np.full((1, 2), rule.sample_offset(row))
     single = surface.evaluate(0, uv, evaluator=rule.evaluator, dtype=np.float32)
     double = surface.evaluate(0, uv)
     level = None if single.level[0] == AT_EXTRAORDINARY_POINT else int(single.level[0])
     limit = surface.evaluate(0, np.zeros((1, 2))).p[0]
-    return VertexNormal(level, float(np.linalg.norm(limit)), float(normal_angle(single.n[0], double.n[0])))
+    return level, float(np.linalg.norm(limit)), float(normal_angle(single.n[0], double.n[0]))
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -117,19 +111,18 @@ def draw(options: FigureOptions) -> list[Path]:
     rendered, records = [], []
     for row, row_axes in zip(rows, axes, strict=True):
         for rule, axis in zip(RULES, row_axes, strict=True):
-            vertex = vertex_normal(row, rule)
-            location, error = _caption(row, rule, vertex)
-            options.report(f"valence {row.valence}, {rule.title}: {location}; {error}")
-            rendered.append(_draw_panel(axis, row, rule, options, f"{location}\n{error}"))
-            records.append({"valence": row.valence, "rule": rule.title, **vars(vertex)})
-        row_axes[0].set_ylabel(f"valence {row.valence}, |c₁| = {vertex.offset:.1f}")
+            level, offset, error = vertex_normal(row, rule)
+            location, caption = _caption(rule.sample_offset(row), level, error)
+            options.report(f"valence {row.valence}, {rule.title}: {location}; {caption}")
+            rendered.append(_draw_panel(axis, row, rule, options, f"{location}\n{caption}"))
+            record = {"valence": row.valence, "rule": rule.title, "level": level, "offset": offset, "error": error}
+            records.append(record)
+        row_axes[0].set_ylabel(f"valence {row.valence}, |c₁| = {offset:.1f}")
     for axis, rule in zip(axes[0], RULES, strict=True):
         axis.set_title(rule.title)
     name = options.name_for_scheme("artifact")
-    written = write_plot(options, name, figure)
-    strips = [np.concatenate(rendered[i : i + len(RULES)], axis=1) for i in range(0, len(rendered), len(RULES))]
-    metadata = {"pictures": records, "spp": options.spp, "variant": mi.variant()}
-    return written + write_pixels(options, name, np.concatenate(strips), metadata)
+    variant = mi.variant()
+    return write_figure(options, name, figure, rendered, per_row=len(RULES), pictures=records, variant=variant)
 
 
 def _own_rows(path: Path, scheme: str) -> list[Row]:
@@ -146,15 +139,12 @@ def _own_rows(path: Path, scheme: str) -> list[Row]:
     return rows
 
 
-def _caption(row: Row, rule: NormalRule, vertex: VertexNormal) -> tuple[str, str]:
+def _caption(sample_offset: float, level: int | None, error: float) -> tuple[str, str]:
     """Label with the sample location of the vertex and the error of its normal."""
-    location = "u = v = 0"
-    if vertex.level is not None:
-        location = f"u = v = {scientific(rule.sample_offset(row))}, n = {vertex.level}"
-    if vertex.error >= 0.1:
-        return location, f"error {vertex.error:.1f}°"
-    is_negligible = vertex.error < NEGLIGIBLE
-    return location, f"error {'below ' * is_negligible}{scientific(max(vertex.error, NEGLIGIBLE))}°"
+    location = "u = v = 0" if level is None else f"u = v = {scientific(sample_offset)}, n = {level}"
+    if error >= 0.1:
+        return location, f"error {error:.1f}°"
+    return location, f"error {'below ' * (error < NEGLIGIBLE)}{scientific(max(error, NEGLIGIBLE))}°"
 
 
 def _draw_panel(axis: Axes, row: Row, rule: NormalRule, options: FigureOptions, caption: str) -> NDArray[np.float32]:

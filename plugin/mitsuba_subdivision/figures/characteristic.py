@@ -21,7 +21,7 @@ from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature
 from ..schemes import Scheme, scheme_named
 from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
-from .output import FigureOptions, hide_frame, panels, write_plot
+from .output import FigureOptions, hide_frame, panels, write_figure
 
 # Points along each side of a polygon, which the map bends.
 SIDE_POINTS = 24
@@ -132,7 +132,7 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     bar.set_ticks(range(LEVELS))
     bar.ax.tick_params(length=0)
     bar.set_label("level $n$")
-    return write_plot(options, options.name_for_scheme("domains"), figure)
+    return write_figure(options, options.name_for_scheme("domains"), figure)
 
 
 def refinement_step(valence: int) -> tuple[CharacteristicMap, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -182,7 +182,7 @@ def draw_refinement(options: FigureOptions) -> list[Path]:
     after.plot(*new.T, "o", mfc="white", mec="black", mew=0.6, markersize=3, zorder=5)
     before.set(title=f"a patch of valence {VALENCE}", xlabel=f"$K$ = {len(old)} control points")
     after.set(title="one refinement", xlabel=f"$M$ = {len(new)} new control points")
-    return write_plot(options, "refinement", figure)
+    return write_figure(options, "refinement", figure)
 
 
 def draw_tree(options: FigureOptions) -> list[Path]:
@@ -239,7 +239,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
         title="coefficients of all leaves =\nmatrix × control points",
         xlabel=f"$K$ = {count} control points\n{len(leaves)} leaves, {size} coefficients each",
     )
-    return write_plot(options, "tree", figure)
+    return write_figure(options, "tree", figure)
 
 
 def _in_the_plane(topology: Topology) -> FloatArray:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..examples import example_file
 from ..variants import SceneNode
-from .output import FigureError, FigureOptions, panels, rows_of, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, write_figure
 from .own_cage import fitted, read
 from .staging import edge_rods, load_stage, make_mesh, paint, render_panels, staged
 
@@ -54,10 +54,9 @@ def draw(options: FigureOptions) -> list[Path]:
         shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": RATE}
         scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
     figure, axes = panels(options, *rows_of(options, len(scenes)))
-    pixels = render_panels(options, axes, scenes.items())
+    rendered = render_panels(options, axes, scenes.items())
     _draw_legend(axes[0, 0], cage)
-    metadata = {"pictures": [CAGE_TITLE, *TITLES], "spp": options.spp}
-    return write_plot(options, "creases", figure) + write_pixels(options, "creases", pixels, metadata)
+    return write_figure(options, "creases", figure, rendered, pictures=[CAGE_TITLE, *TITLES])
 
 
 def _tagged(cage: ControlCage, name: str) -> ControlCage:

@@ -16,7 +16,7 @@ from ..cage.named_cages import extraordinary
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
-from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_plot
+from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_figure
 from .own_cage import around_vertices, frame
 from .staging import grid_points
 
@@ -106,7 +106,7 @@ def draw(options: FigureOptions) -> list[Path]:
     bar.set_label("curvature")
     axes[2, 0].set_ylabel("largest curvature")
     figure.legend(*plot.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return write_plot(options, "curvature", figure)
+    return write_figure(options, "curvature", figure)
 
 
 def _draw_disc(axis: Axes, grids: Iterable[tuple[NDArray[np.floating], ...]], norm: Any) -> Any:

@@ -27,7 +27,7 @@ from ..schemes.domain import FloatArray
 from ..shapes.moving_vertices import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode
-from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_pixels, write_plot
+from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_figure
 from .staging import camera_matrix, edge_rods, in_8_bits, load_stage, make_mesh, project, render, staged
 
 # Of all fits: steps, pictures, their pixels, samples, and samples of the pictures that are fitted to.
@@ -133,10 +133,9 @@ def draw(options: FigureOptions) -> list[Path]:
     _plot_courses(losses, distances, shape, courses)
     _plot_sharpness(course_of_sharpness, boxes[0][1], sharpness)
     figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
-    written = write_plot(options, "fit", figure)
     titles = [title.replace("\n", ", ") for title, _ in (*of_balls, *of_boxes)]
-    pixels = np.concatenate([pixels for _, pixels in (*of_balls, *of_boxes)], axis=1)
-    return written + write_pixels(options, "fit", pixels, {"pictures": titles, "spp": options.spp})
+    rendered = [pixels for _, pixels in (*of_balls, *of_boxes)]
+    return write_figure(options, "fit", figure, rendered, pictures=titles)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from ..regression.tier_tests import normal_angle
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_plot
+from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_figure
 from .own_cage import around_vertices, frame
 
 VALENCES = (3, 5)
@@ -54,7 +54,7 @@ def draw(options: FigureOptions) -> list[Path]:
         axis.set_xlabel("level $n$")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3 if options.width > BETWEEN else 2)
-    return write_plot(options, "normal_error", figure)
+    return write_figure(options, "normal_error", figure)
 
 
 def _draw_panel(axis: Axes, cage: ControlCage) -> None:

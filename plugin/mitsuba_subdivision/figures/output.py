@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,11 +73,6 @@ class FigureOptions:
     # Is called with a line of text for each step
     report: Callable[[str], Any] = lambda line: sys.stderr.write(f"{line}\n")
 
-    def paths(self, name: str, *formats: str) -> list[Path]:
-        """Files to write, in the requested formats."""
-        self.output.mkdir(parents=True, exist_ok=True)
-        return [self.output / f"{name}.{suffix}" for suffix in formats if suffix in self.formats]
-
     def name_for_scheme(self, name: str) -> str:
         """Name of the files of a figure that shows one scheme of several."""
         return name if self.scheme == type(self).scheme else f"{name}_{self.scheme}"
@@ -108,14 +103,17 @@ def rows_of(options: FigureOptions, count: int) -> tuple[int, int]:
     return (1, count) if options.width >= BETWEEN else (2, (count + 1) // 2)
 
 
-def write_plot(
+def write_figure(
     options: FigureOptions,
     name: str,
     figure: Figure,
+    rendered: Sequence[NDArray[np.floating]] = (),  # Linear pixels of pictures of one height, whose R, G and B are kept
     *,
+    per_row: int | None = None,  # Pictures side by side; by default, all
     layouts: int = LAYOUTS,  # How often the height of the figure is set to that of its contents
+    **metadata: Any,  # Of the pixels, besides their samples
 ) -> list[Path]:
-    """Write a figure as PNG and as PDF, if these formats are wanted, and close it.
+    """Write a figure as PNG and as PDF, and its pictures as OpenEXR, if these formats are wanted, and close it.
 
     The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
     Returns the files written, each of which appears whole or not at all.
@@ -129,8 +127,17 @@ def write_plot(
         figure.set_size_inches(figure.get_figwidth(), figure.get_tightbbox().height + 2 * PAD)
     figure.draw_without_rendering()
     dpi = options.resolution / (figure.axes[0].get_window_extent().width / figure.dpi)
-    paths = options.paths(name, "png", "pdf")
+    options.output.mkdir(parents=True, exist_ok=True)
+    formats = ("png", "pdf", "exr") if rendered else ("png", "pdf")
+    paths = [options.output / f"{name}.{suffix}" for suffix in formats if suffix in options.formats]
     for path in paths:
+        if path.suffix == ".exr":
+            from ..regression.image import write_exr
+
+            count = per_row or len(rendered)
+            rows = [np.concatenate(rendered[i : i + count], axis=1) for i in range(0, len(rendered), count)]
+            write_exr(path, np.concatenate(rows)[..., :3], {**metadata, "spp": options.spp})
+            continue
         more: dict[str, Any] = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
         if path.suffix == ".pdf":
             for image in figure.findobj(AxesImage):
@@ -138,18 +145,6 @@ def write_plot(
         with whole_file(path) as beside:
             figure.savefig(beside, dpi=dpi, **more)
     close(figure)
-    return paths
-
-
-def write_pixels(
-    options: FigureOptions, name: str, pixels: NDArray[np.floating], metadata: dict[str, Any]
-) -> list[Path]:
-    """Write linear RGB pixels as OpenEXR, if that format is wanted; returns the file written, if any."""
-    from ..regression.image import write_exr
-
-    paths = options.paths(name, "exr")
-    for path in paths:
-        write_exr(path, pixels, metadata)
     return paths
 
 

@@ -11,7 +11,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -78,30 +77,23 @@ def _records_of(cage: ControlCage) -> dict[str, NDArray]:
     return {"values": cage.positions, "sizes": sizes, "corners": corners}
 
 
-@dataclass(frozen=True, eq=False)
-class BlenderMesh:
-    """A cage after Blender's subdivision modifier."""
-
-    # (n, 3): of the vertices, in float32: points of the limit surface, and normals for smooth shading
-    positions: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    quads: NDArray[np.int32]  # (m, 4): vertices of each face
-    version: str  # Of Blender, two numbers
-
-
 def blender_mesh(
     program: Path,  # As `blender` returns it
     cage: ControlCage,  # Without tags; Catmull-Clark's
     level: int,  # Edges of quads become `2 ** level` segments
-) -> BlenderMesh:
-    """Subdivide a cage in Blender, by default options but for the level. Raises FigureError if Blender fails."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], str]:
+    """Subdivide a cage in Blender, by default options but for the level. Raises FigureError if Blender fails.
+
+    Returns points of the limit surface and normals for smooth shading, in float32, of vertices ``(n, 3)``; the vertices
+    of each face ``(m, 4)``; and Blender's version, two numbers.
+    """
     # Several threads race for the last bits of points that faces share.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]
     found = _answers(program, options, _records_of(cage), [str(level)])
     version = ".".join(map(str, found["version"][:2]))
     points, normals = (found[name].reshape(-1, 3) for name in ("p", "n"))
-    return BlenderMesh(points, normals, found["corners"].reshape(-1, 4), version)
+    return points, normals, found["corners"].reshape(-1, 4), version
 
 
 def _answers(program: Path, before: list[str], records: dict[str, NDArray], after: list[str]) -> dict[str, NDArray]:

@@ -16,7 +16,7 @@ from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
 from ..tessellation import HIGHEST_RATE
 from ..variants import SceneNode
-from .output import FigureOptions, panels, write_pixels, write_plot
+from .output import FigureOptions, panels, write_figure
 from .staging import draw_picture, load_stage, picture_size, render, render_panels, staged
 
 SCHEMES = {"catmull_clark": "Catmull-Clark", "doo_sabin": "Doo-Sabin", "loop": "Loop"}
@@ -48,7 +48,7 @@ def draw_hero(options: FigureOptions) -> list[Path]:
     scene = load_stage("human", width=width, height=height)
     options.report("mannequin")
     pixels = render(scene, options, "mannequin")[..., :3]
-    return draw_picture(options, "hero", pixels, {"spp": options.spp, "cage": "human.obj, (c) 2010 Tobias Rittig"})
+    return draw_picture(options, "hero", pixels, cage="human.obj, (c) 2010 Tobias Rittig")
 
 
 def draw_schemes(options: FigureOptions) -> list[Path]:
@@ -67,9 +67,9 @@ def _draw_row(options: FigureOptions, name: str, cases: Mapping[str, Mapping[str
     """Render the scene of a figure with parameters for each panel, given by titles as in `render_panels`."""
     figure, axes = panels(options, 1, len(cases))
     scenes = ((title, load_stage(name, **case, resolution=options.resolution)) for title, case in cases.items())
-    pixels = render_panels(options, axes, scenes)
-    metadata = {key: [case[key] for case in cases.values()] for key in next(iter(cases.values()))}
-    return write_plot(options, name, figure) + write_pixels(options, name, pixels, {**metadata, "spp": options.spp})
+    rendered = render_panels(options, axes, scenes)
+    metadata: dict[str, Any] = {key: [case[key] for case in cases.values()] for key in next(iter(cases.values()))}
+    return write_figure(options, name, figure, rendered, **metadata)
 
 
 def draw_displacement(options: FigureOptions) -> list[Path]:
@@ -99,8 +99,7 @@ def draw_displacement(options: FigureOptions) -> list[Path]:
         stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
         rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])
     pixels = np.concatenate(rendered, axis=1)
-    metadata = {"spp": options.spp, "pixel_error": PIXEL_ERROR}
-    return draw_picture(options, "displacement", pixels, metadata, columns[1:-1])
+    return draw_picture(options, "displacement", pixels, columns[1:-1], pixel_error=PIXEL_ERROR)
 
 
 def quilt() -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from ..mitsuba_mesh import mitsuba_mesh
 from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded
 from ..variants import SceneNode
-from .output import FigureOptions, panels, show, write_pixels, write_plot
+from .output import FigureOptions, panels, show, write_figure
 
 # Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
 PART_SAMPLES = 1 << 26
@@ -92,11 +92,7 @@ def picture_size(options: FigureOptions) -> tuple[int, int]:
 
 
 def draw_picture(
-    options: FigureOptions,
-    name: str,
-    pixels: NDArray[np.float32],
-    metadata: dict[str, Any],
-    columns: Sequence[float] = (),
+    options: FigureOptions, name: str, pixels: NDArray[np.float32], columns: Sequence[float] = (), **metadata: Any
 ) -> list[Path]:
     """Write linear RGB pixels as a figure of one picture, with white lines at some of its columns."""
     figure, ((axis,),) = panels(options, 1, 1)
@@ -105,8 +101,7 @@ def draw_picture(
     figure.set_figheight(HEIGHT * figure.get_figwidth())
     for column in columns:
         axis.axvline(column - 0.5, color="white")
-    written = write_plot(replace(options, resolution=pixels.shape[1]), name, figure, layouts=0)
-    return written + write_pixels(options, name, pixels, metadata)
+    return write_figure(replace(options, resolution=pixels.shape[1]), name, figure, [pixels], layouts=0, **metadata)
 
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -166,15 +161,15 @@ def render_panels(
     axes: Any,
     # By titles of the panels; a second line of a title stands below the panel
     scenes: Iterable[tuple[str, mi.Scene]],
-) -> NDArray[np.float32]:
-    """Render a scene in each panel; returns the pictures side by side."""
+) -> list[NDArray[np.float32]]:
+    """Render a scene in each panel; returns the pictures."""
     rendered = []
     for (title, scene), axis in zip(scenes, axes.flat, strict=True):
         name, _, caption = title.partition("\n")
         options.report(title.replace("\n", ", "))
         rendered.append(render(scene, options, name)[..., :3])
         show(axis, in_8_bits(rendered[-1]), name, caption)
-    return np.concatenate(rendered, axis=1)
+    return rendered
 
 
 def project(sensor: mi.Sensor, points: NDArray[np.floating], resolution: int) -> NDArray[np.float64]:

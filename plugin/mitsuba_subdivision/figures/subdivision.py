@@ -15,7 +15,7 @@ from ..evaluation.patch_tree import lattice_stencils
 from ..examples import example_file
 from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
-from .output import FigureError, FigureOptions, panels, rows_of, show, write_pixels, write_plot
+from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
 from .own_cage import in_ball, read
 from .staging import load_stage, make_mesh, on_white, project, render, staged, visible, visible_runs
 
@@ -69,9 +69,7 @@ def draw(options: FigureOptions) -> list[Path]:
     _draw(axes[-1], scene, pixels, lines, points, 0.17, options.resolution)
     axes[-1].set(title="limit surface", xlabel=f"regular but for {counts.pop()} points")
     rendered.append(pixels)
-    written = write_plot(options, "subdivision", figure)
-    metadata = {"levels": LEVELS, "spp": options.spp}
-    return written + write_pixels(options, "subdivision", np.concatenate(rendered, axis=1)[..., :3], metadata)
+    return write_figure(options, "subdivision", figure, rendered, levels=LEVELS)
 
 
 def extraordinary_count(topology: Topology) -> int:

@@ -19,7 +19,7 @@ from ..cage.named_cages import cube
 from ..regression.scene import render_pixels
 from ..regression.tier_tests import normal_angle
 from ..surface import LimitSurface
-from .output import FigureOptions, hide_frame, panels, show, write_pixels, write_plot
+from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .own_cage import around_vertices, frame
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .staging import (
@@ -97,10 +97,8 @@ def draw(options: FigureOptions) -> list[Path]:
     for axis in (*axes[0], *axes[1, 1:]):
         for colour, line in (("white", 2), (RING, 1)):
             axis.plot(*corner, "o", markersize=5, mfc="none", mec=colour, mew=line)
-    written = write_plot(options, "zebra", figure)
-    strip = np.concatenate([pixels[name][..., :3] for name in shapes], axis=1)
-    metadata = {"pictures": titles, "level": LEVEL, "rate": 2**level, "stripes": STRIPES, "spp": options.spp}
-    return written + write_pixels(options, "zebra", strip, metadata)
+    metadata: dict[str, Any] = {"pictures": titles, "level": LEVEL, "rate": 2**level, "stripes": STRIPES}
+    return write_figure(options, "zebra", figure, list(pixels.values()), **metadata)
 
 
 def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
@@ -119,9 +117,9 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
     # Blender has no holes.
     if not len(cage.holes) and (program := blender()):
-        found = blender_mesh(program, cage, level)
-        shapes["blender"] = make_mesh(found.positions, split_quads(found.quads), MIRROR, normals=found.normals)
-        titles["blender"] = (f"Blender {found.version}", f"level {level},\naveraged normals")
+        points, normals, quads, version = blender_mesh(program, cage, level)
+        shapes["blender"] = make_mesh(points, split_quads(quads), MIRROR, normals=normals)
+        titles["blender"] = (f"Blender {version}", f"level {level},\naveraged normals")
     return shapes, titles
 
 

@@ -28,7 +28,7 @@ from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .normal_error import EQUATIONS, offset_cage
-from .output import FigureError, FigureOptions, label_powers, panels, scientific, write_pixels, write_plot
+from .output import FigureError, FigureOptions, label_powers, panels, scientific, write_figure
 from .own_cage import frame
 from .peers import osd_peer, osd_samples
 from .staging import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, project, render, staged
@@ -126,10 +126,9 @@ def draw(options: FigureOptions) -> list[Path]:
     colours = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
     colours.set_label("error of the normal in degrees; medians below panels")
     label_powers(colours.ax.yaxis)
-    written = write_plot(options, "zoom", figure)
-    strips = [np.concatenate(rendered[i :: len(rows)], axis=1) for i in range(len(rows))]
-    metadata = {"pictures": records, "offset": OFFSET, "spp": options.spp}
-    return written + write_pixels(options, "zoom", np.concatenate(strips), metadata)
+    strips = [pixels for i in range(len(rows)) for pixels in rendered[i :: len(rows)]]
+    count = len(MAGNIFICATIONS)
+    return write_figure(options, "zoom", figure, strips, per_row=count, pictures=records, offset=OFFSET)
 
 
 def parameter_extent(magnification: float) -> float:
