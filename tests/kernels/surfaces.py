@@ -3,6 +3,7 @@
 import warnings
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -61,12 +62,17 @@ SURFACES = {
     "doo_sabin face of 50": ("doo_sabin", lambda: extraordinary_face(50)),
     "doo_sabin sheet": ("doo_sabin", lambda: sheet(4, 4)),
 }
+# No element beside these holes has corners of its own.
+HOLES = {
+    "hole in a cube": ("catmull_clark", lambda: tagged(cube(), holes=[1])),
+    "loop hole": ("loop", lambda: tagged(extraordinary_triangles(5), holes=[1])),
+}
 
 
 @lru_cache
 def surface_named(name):
-    """One of `SURFACES`, the same object whenever it is asked for."""
-    scheme, cage = SURFACES[name]
+    """One of `SURFACES` and `HOLES`, the same object whenever it is asked for."""
+    scheme, cage = (SURFACES | HOLES)[name]
     # What is flat needs bumps to have normals that can be wrong. Faces around a vertex of valence 50 are narrow.
     return LimitSurface(bumpy(cage(), size=0.2 if "sheet" in name or "disc" in name else 0.01), scheme)
 
@@ -96,3 +102,33 @@ def on_device(types, element, uv, corner):
 def vectors(found):
     """``(s, 3)`` numbers of 3-vectors."""
     return np.array(dr.detach(found)).T.astype(np.float64)
+
+
+def computed(found):
+    """Samples or hits, computed by one kernel."""
+    dr.eval(found)
+    return found
+
+
+def hit(kernel, o, d, *start):
+    return computed(kernel.intersect(rays_of(kernel.types, o, d), *on_device(kernel.types, *start)))
+
+
+def rays_of(types, o, d):
+    return SimpleNamespace(o=upload(types.vector3, o), d=upload(types.vector3, d))
+
+
+def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
+    """Rays at points of the surface, which are not too flat there, and places near these points to begin at."""
+    element, uv, corner = random_locations(surface, rng, count, deepest)
+    target = surface.evaluate(element, uv, corner)
+    d = rng.normal(size=(count, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    kept = np.abs((d * target.n).sum(axis=1)) > steep
+    domain = surface.scheme.domain
+    start = uv + rng.uniform(-near, near, uv.shape)
+    start += np.maximum(-start, 0)
+    beyond = np.maximum(domain.extent(start) - 1, 0)[:, None]
+    start = np.clip(start - beyond, 0, 1)
+    o, d = target.p - rng.uniform(0.5, 3, (count, 1)) * d, rng.uniform(0.5, 2, (count, 1)) * d
+    return target.p[kept], o[kept], d[kept], [each[kept] for each in (element, start, corner)]

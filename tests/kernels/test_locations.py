@@ -1,20 +1,66 @@
-"""Parameters carried over edges: to the neighbour and back, and to the same point of the surface."""
+"""Locations: in children of a domain, carried over edges to the same points, and on triangles of tessellations."""
 
 import drjit as dr
 import numpy as np
 import pytest
-from kernels.surfaces import kernel_named, surface_named, vectors
-from mitsuba_subdivision.kernels.locations import Location
+from kernels.surfaces import HOLES, kernel_named, surface_named, vectors
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from mitsuba_subdivision.kernels.locations import Location, TriangleLocations, doublings, in_child
+from mitsuba_subdivision.schemes import CatmullClark, Loop
 
 pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
 SURFACES = ["hexagon", "valence 2", "crease", "holes", "non-manifold", "loop corner", "doo_sabin mixed torus"]
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
-# Of parameters, after some sums and products.
-ROUNDING = 1e-14
-# How far beyond an edge parameters are, and of points of a surface of a size of about 3 there.
-BEYOND = 1e-3
-POINT = 1e-13
+TRIANGULATED = ["torus", "hexagon", "holes", "loop corner", "doo_sabin mixed torus", *HOLES]
+# Of parameters, after some sums and products; in single precision, half a unit in the last place of one.
+ROUNDING, ROUNDED = 1e-14, 2.0**-24
+# How far beyond an edge parameters are. Of points of a surface of a size of about 3 there; where parameters are
+# rounded, points move along by some units of that.
+BEYOND, POINT, CHANGED = 1e-3, 1e-13, 1e-12
+MOST = 30
+
+
+@pytest.fixture
+def types(float_type):
+    return ArrayTypes(float_type)
+
+
+def on_device(function, types, *numbers):
+    """Results of a function for some numbers."""
+    return [np.array(each) for each in function(*(types.floats(np.array(each)) for each in numbers))]
+
+
+def test_doubled_so_often_a_number_is_between_a_half_and_one(types, np_rng):
+    powers = 2.0 ** -np.arange(MOST + 10)
+    # Rounding to single precision must not reach the next power of two.
+    x = np.concatenate([powers, powers * (1 - 2.0**-23), np_rng.random(50) * powers[np_rng.integers(0, 40, 50)]])
+    x = x.astype(np.float32).astype(np.float64)
+    count, power = on_device(lambda x: doublings(types, x, types.index(MOST)), types, x.tolist())
+    np.testing.assert_array_equal(power, 2.0**count)
+    is_far = x * 2.0**MOST >= 0.5
+    assert ((x * power >= 0.5) & (x * power <= 1))[is_far].all()
+    assert (count[~is_far] == MOST).all()
+    # What rounding takes beyond the domain is not doubled.
+    assert on_device(lambda x: doublings(types, x, types.index(MOST)), types, [1, 1 + 2.0**-20])[0].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("scheme", [CatmullClark(), Loop()])
+def test_parameters_of_a_copy_lead_back_and_the_first_is_for_small_ones_only(scheme, types, np_rng):
+    domain = scheme.domain
+    uv = np_rng.random((200, 2))
+    uv = np.concatenate([uv, np.round(4 * uv) / 4])
+    uv = uv[domain.extent(uv) <= 1].astype(np.float32).astype(np.float64)
+    number, u, v, scale = on_device(lambda u, v: in_child(domain, types, u, v), types, *uv.T.tolist())
+    for k, child in enumerate(domain.children):
+        of_child = number == k
+        np.testing.assert_allclose(child(uv[of_child]), np.stack([u, v], axis=1)[of_child], rtol=0, atol=ROUNDED)
+        np.testing.assert_array_equal(np.broadcast_to(scale, len(uv))[of_child], child.matrix[0, 0])
+    assert min(map(np.min, domain.edge_distances(u, v))) >= -ROUNDED
+    assert (number[domain.extent(uv) >= 0.5] != 0).all()
+
+
+# Carried over edges
 
 
 def kernel_of(name):
@@ -131,3 +177,53 @@ def test_whole_elements_are_seen_from_their_first_corners(name, np_rng):
     expected = as_seen_from_first(surface, half_edge, uv)
     np.testing.assert_array_equal(np.array(found.half_edge), expected[0])
     np.testing.assert_allclose(np.array([found.u, found.v]).T, expected[1], rtol=0, atol=ROUNDING)
+
+
+# Triangles
+
+
+def made(name, rate):
+    surface = surface_named(name)
+    kernel, table = kernel_named(name, "llvm_ad_rgb_double"), surface.sampling(rate)
+    return surface, kernel, table, TriangleLocations(table, kernel.walk, kernel.types)
+
+
+@pytest.mark.parametrize("name", TRIANGULATED)
+# Even and odd: at odd rates, triangles reach from one corner of a polygon into the next.
+@pytest.mark.parametrize("rate", [1, 2, 3, 4])
+def test_corners_of_triangles_are_vertices(name, rate):
+    surface, kernel, table, locations = made(name, rate)
+    types, expected = kernel.types, table.apply(surface.cage.positions)[0]
+    count = len(table.triangles)
+    triangle = np.repeat(np.arange(count), 3)
+    b1, b2 = (np.tile(weights, count).astype(float) for weights in ((0, 1, 0), (0, 0, 1)))
+    found = locations(types.indices(triangle), types.floats(b1), types.floats(b2))
+    dr.eval(found)
+    elements = surface.patches.elements
+    np.testing.assert_array_equal(elements.face[np.array(found.half_edge)], table.element[triangle])
+    np.testing.assert_allclose(vectors(kernel.at(found).p), expected[table.triangles.ravel()], rtol=0, atol=POINT)
+
+
+@pytest.mark.parametrize("name", TRIANGULATED)
+@pytest.mark.parametrize("rate", [2, 5])
+def test_triangles_that_share_an_edge_have_its_points_in_common(name, rate, np_rng):
+    """Within an element and across: those on either side of a crease have vertices of their own."""
+    surface, kernel, table, locations = made(name, rate)
+    types, triangles = kernel.types, table.triangles.astype(np.int64)
+    edges = {}
+    for triangle, corners in enumerate(triangles.tolist()):
+        for k in range(3):
+            edges[corners[k], corners[(k + 1) % 3]] = triangle, k
+    pairs = [(edges[a, b], edges[b, a]) for a, b in edges if a < b and (b, a) in edges]
+    along = np_rng.random(len(pairs))
+    sides = []
+    for number, share in ((0, along), (1, 1 - along)):
+        triangle, k = np.array([pair[number] for pair in pairs]).T
+        weights = np.zeros((len(pairs), 3))
+        weights[np.arange(len(pairs)), k], weights[np.arange(len(pairs)), (k + 1) % 3] = 1 - share, share
+        found = locations(types.indices(triangle), types.floats(weights[:, 1]), types.floats(weights[:, 2]))
+        dr.eval(found)
+        uv = np.array([found.u, found.v])
+        assert surface.scheme.domain.inside(uv.T).min() >= 0
+        sides.append(vectors(kernel.at(found).p))
+    np.testing.assert_allclose(*sides, rtol=0, atol=CHANGED)

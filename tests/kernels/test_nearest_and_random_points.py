@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import kernel_named, on_device, surface_named, vectors
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 
@@ -87,6 +88,17 @@ def test_minima_on_borders_are_found(name, np_rng):
     assert (distance >= expected.distance - BARS[DOUBLE] * size).all()
     # Others are minima of their own: the surfaces bend.
     assert (distance <= expected.distance + 1e-6 * size).mean() > 0.8
+
+
+@pytest.mark.parametrize("turn", range(3))
+def test_nearest_points_on_every_side_of_a_triangle(turn):
+    """Whichever parameters run along the border, as a triangle may begin at any of its vertices."""
+    positions = np.array([[0, 0, 0], [3, 0, 0.5], [1, 2, 0]])
+    surface = LimitSurface(ControlCage(positions, np.roll([[0, 1, 2]], turn, axis=1)), "loop")
+    outside = 2 * (0.6 * positions + 0.4 * np.roll(positions, 1, axis=0)) - positions.mean(axis=0)
+    start = np.zeros(3, dtype=int), np.full((3, 2), 0.3), np.zeros(3, dtype=int)
+    found = closest(surface.on_device(DOUBLE), outside, *start)
+    np.testing.assert_allclose(np.array(found.distance), surface.closest_point(outside).distance, rtol=1e-6)
 
 
 # Few, as the derivatives of each surface are compiled for itself, which takes up to 13 s.

@@ -9,13 +9,24 @@ from types import SimpleNamespace
 import drjit as dr
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, kernel_named, on_device, random_locations, surface_named, vectors
+from kernels.surfaces import (
+    SURFACES,
+    aimed,
+    computed,
+    hit,
+    kernel_named,
+    on_device,
+    random_locations,
+    rays_of,
+    surface_named,
+    vectors,
+)
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.tree_arrays import PIECE_LEVELS
-from mitsuba_subdivision.kernels.line_intersection import ON_NORMAL
+from mitsuba_subdivision.kernels.algebra import AffineMap
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.schemes import CatmullClark
@@ -48,22 +59,8 @@ STEEP = 1e-4
 THIRD = 1e-5
 
 
-def computed(found):
-    """Samples or hits, computed by one kernel."""
-    dr.eval(found)
-    return found
-
-
 def evaluated(kernel, *locations, derivatives=1):
     return computed(kernel.evaluate(*on_device(kernel.types, *locations), derivatives=derivatives))
-
-
-def hit(kernel, o, d, *start):
-    return computed(kernel.intersect(rays_of(kernel.types, o, d), *on_device(kernel.types, *start)))
-
-
-def rays_of(types, o, d):
-    return SimpleNamespace(o=upload(types.vector3, o), d=upload(types.vector3, d))
 
 
 def assert_same(found, expected, bars):
@@ -332,140 +329,21 @@ def test_derivatives_by_parameters_are_tangents_and_those_of_tangents_and_normal
             np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
 
 
-# Rays
+def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
+    kernel, matrix = kernel_named("mixed torus", DOUBLE), np.eye(4)
+    matrix[:3] = np_rng.normal(size=(3, 4))
+    to_world = AffineMap.of(kernel.types.matrix4(matrix.tolist()))
+    there_and_back = to_world.inverse_point(to_world.point(kernel.types.vector3(1, 2, 3)))
+    np.testing.assert_allclose(vectors(there_and_back), [[1, 2, 3]], rtol=0, atol=10 * BARS[DOUBLE]["point"])
 
+    def at(u, v):
+        return kernel.evaluate(3, (u, v), derivatives=2).placed(to_world)
 
-def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
-    """Rays at points of the surface, which are not too flat there, and places near these points to begin at."""
-    element, uv, corner = random_locations(surface, rng, count, deepest)
-    target = surface.evaluate(element, uv, corner)
-    d = rng.normal(size=(count, 3))
-    d /= np.linalg.norm(d, axis=1)[:, None]
-    kept = np.abs((d * target.n).sum(axis=1)) > steep
-    domain = surface.scheme.domain
-    start = uv + rng.uniform(-near, near, uv.shape)
-    start += np.maximum(-start, 0)
-    beyond = np.maximum(domain.extent(start) - 1, 0)[:, None]
-    start = np.clip(start - beyond, 0, 1)
-    o, d = target.p - rng.uniform(0.5, 3, (count, 1)) * d, rng.uniform(0.5, 2, (count, 1)) * d
-    return target.p[kept], o[kept], d[kept], [each[kept] for each in (element, start, corner)]
-
-
-HIT = ["mixed torus", "sheet", "corner", "chaikin", "loop corner", "doo_sabin mixed torus"]
-# How far a hit is from its ray: the last of Newton's steps is below 3e-4 in parameters of a piece, and what is left is
-# about its square. In single precision, that and the rounding of rays some units long.
-ON_RAY = {DOUBLE: 2e-6, SINGLE: 5e-6}
-
-
-@pytest.mark.core
-@pytest.mark.parametrize(
-    ("name", "variant"), [*((name, DOUBLE) for name in HIT), ("corner", SINGLE), ("loop corner", SINGLE)]
-)
-def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
-    surface, kernel = surface_named(name), kernel_named(name, variant)
-    target, o, d, start = aimed(surface, np_rng, 1000)
-    found = hit(kernel, o, d, *start)
-    t, p = np.array(found.t).astype(float), vectors(found.p)
-    met = np.isfinite(t)
-    assert met.mean() > 0.99
-    assert np.linalg.norm(o + t[:, None] * d - p, axis=1)[met].max() <= ON_RAY[variant]
-    # A few rays meet another part of the surface that is as near.
-    assert (np.linalg.norm(p - target, axis=1)[met] <= 10 * ON_RAY[variant]).mean() > 0.99
-    # The location that is found is where the point lies.
-    again = kernel.at(found.location)
-    np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=BARS[variant]["point"])
-    inside = surface.scheme.domain.inside(np.array([found.location.u, found.location.v]).T)
-    assert inside.min() >= 0
-
-
-def met_past_a_border(kernel, surface, beyond, turns=0):
-    """Points beside a border, and what is met of lines across them; from locations seen from the next corners."""
-    types, elements = kernel.types, surface.patches.elements
-    edges = np.flatnonzero(elements.twin < 0)
-    element = elements.face[edges].astype(int)
-    corner = edges - elements.face_offsets[element]
-    uv = np.stack([np.full(len(edges), 0.4), np.zeros(len(edges))], axis=1)
-    border = surface.evaluate(element, uv, corner)
-    out = -border.dp_dv / np.linalg.norm(border.dp_dv, axis=1)[:, None]
-    p, d = border.p + beyond * out, border.n + 0.1 * border.dp_du
-    u, v = uv[:, 0], uv[:, 1] + 0.03
-    for _ in range(turns):
-        u, v, corner = v, 1 - u, (corner + 1) % 4
-    start = kernel.walk.at(types.indices(element), types.floats(u), types.floats(v), types.indices(corner))
-    met = kernel.line_hits(upload(types.vector3, p), upload(types.vector3, d), start)
-    dr.eval(met.location, met.kind, met.values.value)
-    return p, met
-
-
-@pytest.mark.core
-@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
-@pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2])
-def test_lines_past_a_border_lead_to_the_border(variant, beyond):
-    surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", variant)
-    p, met = met_past_a_border(kernel, surface, beyond)
-    assert (np.array(met.kind) == ON_NORMAL).all()
-    found = kernel.at(met.location)
-    np.testing.assert_allclose(vectors(met.values.value), vectors(found.p), rtol=0, atol=BARS[variant]["point"])
-    inside = surface.scheme.domain.inside(np.array([met.location.u, met.location.v]).T)
-    np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])
-    assert np.linalg.norm(vectors(found.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
-
-
-@pytest.mark.core
-@pytest.mark.parametrize("beyond", [1e-2, 1.0])
-def test_lines_find_the_same_place_of_a_border_seen_from_any_corner(beyond):
-    surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", DOUBLE)
-    _, expected = met_past_a_border(kernel, surface, beyond)
-    for turns in (1, 2, 3):
-        _, met = met_past_a_border(kernel, surface, beyond, turns)
-        np.testing.assert_array_equal(met.location.half_edge, expected.location.half_edge)
-        both = vectors(met.values.value), vectors(expected.values.value)
-        np.testing.assert_allclose(*both, rtol=0, atol=ON_RAY[DOUBLE])
-
-
-@pytest.mark.parametrize("depth", [7, 8, 11, 14, 15])
-@pytest.mark.parametrize(
-    ("cage", "scheme"),
-    [(cube(), "catmull_clark"), (bumpy(cube()), "catmull_clark"), (extraordinary_triangles(3), "loop")],
-)
-def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(cage, scheme, depth, np_rng):
-    """There, steps of Newton's that rounding makes are long, and tolerances shrink below the rounding of points."""
-    surface = LimitSurface(cage, scheme)
-    kernel, t = surface.on_device(SINGLE), surface.patches.elements
-    half_edge = np_rng.choice(np.flatnonzero(np.bincount(cage.face_vertices)[cage.face_vertices] == 3), 500)
-    element = t.face[half_edge].astype(np.int64)
-    corner = half_edge - t.face_offsets[element]
-    uv = np_rng.random((500, 2)) * 2.0**-depth
-    target = surface.evaluate(element, uv, corner)
-    found = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
-    assert np.isfinite(np.array(found.t)).mean() > 0.98
-
-    start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
-    d = -target.n + np_rng.uniform(-0.5, 0.5, (500, 3))
-    found = hit(kernel, target.p - 2 * d, d, element, start, corner)
-    met = np.isfinite(np.array(found.t))
-    # A few wander between pieces until they are given up.
-    assert met.mean() > 0.97
-    np.testing.assert_allclose(vectors(found.p)[met], target.p[met], rtol=0, atol=10 * ON_RAY[SINGLE])
-
-
-@pytest.mark.core
-@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
-def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):
-    surface = LimitSurface(cube())
-    kernel = surface.on_device(variant)
-    element, uv, corner = random_locations(surface, np_rng, 500, deepest=4)
-    s = surface.evaluate(element, uv, corner)
-    along = np_rng.normal(size=(500, 2, 1))
-    d = along[:, 0] * s.dp_du + along[:, 1] * s.dp_dv
-    d /= np.linalg.norm(d, axis=1)[:, None]
-    for height, are_met in ((0.05, False), (-0.05, True)):
-        found = hit(kernel, s.p + height * s.n - 2 * d, d, element, uv, corner)
-        met = np.isfinite(np.array(found.t))
-        assert np.isfinite(vectors(found.p)).all()
-        assert np.isfinite(vectors(found.n)).all()
-        # Grazing rays may be given up.
-        assert met.mean() > 0.9 if are_met else not met.any()
+    found, step = at(0.3, 0.2), 1e-5
+    for turn, du, dv in ((found.dn_du, step, 0), (found.dn_dv, 0, step)):
+        ahead, behind = (vectors(at(0.3 + side * du, 0.2 + side * dv).n) for side in (1, -1))
+        difference = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(vectors(turn), difference, rtol=0, atol=1e-8 * np.abs(difference).max())
 
 
 @pytest.mark.parametrize("name", ["polygons", "border", "triangles"])

@@ -10,6 +10,8 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import VertexKernel
+from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
 
@@ -134,6 +136,16 @@ def test_collapsed_patches_have_zero_normals_and_finite_derivatives_and_missing_
     assert np.isfinite(np.array(dr.grad(points))).all()
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel(dr.zeros(float_type, 21))
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("longer", [-2, 0])
+def test_parallel_tangents_have_no_normal_and_no_derivatives(float_type, longer):
+    vector3 = ArrayTypes(float_type).vector3
+    du = vector3(1, 2, 4)
+    normal = UnitNormal(du, longer * du, 0, du)
+    for found in (normal.value, normal.forward(vector3(1, 0, 0), vector3(0, 1, 0)), *normal.backward(du)):
+        np.testing.assert_array_equal(np.array(found), 0)
 
 
 def test_kernels_let_go_of_the_table(surface, float_type):

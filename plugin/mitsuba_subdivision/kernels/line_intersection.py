@@ -149,8 +149,9 @@ def piece_hits(
     # surface, in the direction of the line if positive, or against it.
     side: Float = 0,
     facing: Float = 0,  # As for `line_hits`
+    steps: int = STEPS_IN_ROUND,
 ) -> tuple[Vector3, tuple[Float, Float], Float, Mask, PatchValues]:
-    """Intersect lines with the polynomial of a piece, continued beyond the piece, by some Newton steps.
+    """Intersect lines with the polynomial of a piece, continued beyond it, by some Newton steps from its parameters.
 
     Returns the directions of the lines; the sum of the steps by u and v; the length of the last step; lanes whose last
     step was along the surface, towards another hit of the line; and the surface before the last step.
@@ -158,7 +159,7 @@ def piece_hits(
 
     def step(steps_left, d, u, v, length, is_along_surface, *_):
         surface = piece.values(u, v)
-        is_first = steps_left > STEPS_IN_ROUND
+        is_first = steps_left > steps
         d = dr.select(is_first & turns, surface.normal, d)
         is_along_surface |= is_first & (side != 0) & (dot(surface.normal, d) * facing < 0)
         is_last = (steps_left == 1) | is_still
@@ -179,7 +180,7 @@ def piece_hits(
         return steps_left, d, u, v, length, is_along_surface, *surface.first_order
 
     zero = types.float(0)
-    start = (types.index(STEPS_IN_ROUND + 1), type(d)(d), zero, zero, zero, zero > 1)
+    start = (types.index(steps + 1), type(d)(d), zero, zero, zero, zero > 1)
     _, d, u, v, length, is_along_surface, *values = dr.while_loop(
         (*start, *(d * 0 for _ in range(4))),
         lambda steps_left, *_: steps_left > 0,

@@ -1,0 +1,204 @@
+"""Hits of lines: on them and on the surface, from nearby and far away, at borders and next to extraordinary points."""
+
+import drjit as dr
+import numpy as np
+import pytest
+from kernels.surfaces import aimed, hit, kernel_named, random_locations, surface_named, vectors
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
+from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.kernels import line_intersection
+from mitsuba_subdivision.kernels.algebra import STEP_TOLERANCE
+from mitsuba_subdivision.kernels.line_intersection import ON_LINE, ON_NORMAL, piece_hits
+from mitsuba_subdivision.kernels.piece_kernel import PieceKernel
+from patches.closed_cages import bumpy
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
+# Of points of a surface of a size of about 3, see test_surface_kernel.
+POINT = {DOUBLE: 1e-13, SINGLE: 1e-6}
+HIT = ["mixed torus", "sheet", "corner", "chaikin", "loop corner", "doo_sabin mixed torus"]
+# How far a hit is from its ray: the last of Newton's steps is below 3e-4 in parameters of a piece, and what is left is
+# about its square. In single precision, that and the rounding of rays some units long.
+ON_RAY = {DOUBLE: 2e-6, SINGLE: 5e-6}
+
+
+@pytest.mark.core
+@pytest.mark.parametrize(
+    ("name", "variant"), [*((name, DOUBLE) for name in HIT), ("corner", SINGLE), ("loop corner", SINGLE)]
+)
+def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
+    surface, kernel = surface_named(name), kernel_named(name, variant)
+    target, o, d, start = aimed(surface, np_rng, 1000)
+    found = hit(kernel, o, d, *start)
+    t, p = np.array(found.t).astype(float), vectors(found.p)
+    met = np.isfinite(t)
+    assert met.mean() > 0.99
+    assert np.linalg.norm(o + t[:, None] * d - p, axis=1)[met].max() <= ON_RAY[variant]
+    # A few rays meet another part of the surface that is as near.
+    assert (np.linalg.norm(p - target, axis=1)[met] <= 10 * ON_RAY[variant]).mean() > 0.99
+    # The location that is found is where the point lies.
+    again = kernel.at(found.location)
+    np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=POINT[variant])
+    inside = surface.scheme.domain.inside(np.array([found.location.u, found.location.v]).T)
+    assert inside.min() >= 0
+
+
+def met_past_a_border(kernel, surface, beyond, turns=0):
+    """Points beside a border, and what is met of lines across them; from locations seen from the next corners."""
+    types, elements = kernel.types, surface.patches.elements
+    edges = np.flatnonzero(elements.twin < 0)
+    element = elements.face[edges].astype(int)
+    corner = edges - elements.face_offsets[element]
+    uv = np.stack([np.full(len(edges), 0.4), np.zeros(len(edges))], axis=1)
+    border = surface.evaluate(element, uv, corner)
+    out = -border.dp_dv / np.linalg.norm(border.dp_dv, axis=1)[:, None]
+    p, d = border.p + beyond * out, border.n + 0.1 * border.dp_du
+    u, v = uv[:, 0], uv[:, 1] + 0.03
+    for _ in range(turns):
+        u, v, corner = v, 1 - u, (corner + 1) % 4
+    start = kernel.walk.at(types.indices(element), types.floats(u), types.floats(v), types.indices(corner))
+    met = kernel.line_hits(upload(types.vector3, p), upload(types.vector3, d), start)
+    dr.eval(met.location, met.kind, met.values.value)
+    return p, met
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+@pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2])
+def test_lines_past_a_border_lead_to_the_border(variant, beyond):
+    surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", variant)
+    p, met = met_past_a_border(kernel, surface, beyond)
+    assert (np.array(met.kind) == ON_NORMAL).all()
+    found = kernel.at(met.location)
+    np.testing.assert_allclose(vectors(met.values.value), vectors(found.p), rtol=0, atol=POINT[variant])
+    inside = surface.scheme.domain.inside(np.array([met.location.u, met.location.v]).T)
+    np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])
+    assert np.linalg.norm(vectors(found.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("beyond", [1e-2, 1.0])
+def test_lines_find_the_same_place_of_a_border_seen_from_any_corner(beyond):
+    surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", DOUBLE)
+    _, expected = met_past_a_border(kernel, surface, beyond)
+    for turns in (1, 2, 3):
+        _, met = met_past_a_border(kernel, surface, beyond, turns)
+        np.testing.assert_array_equal(met.location.half_edge, expected.location.half_edge)
+        both = vectors(met.values.value), vectors(expected.values.value)
+        np.testing.assert_allclose(*both, rtol=0, atol=ON_RAY[DOUBLE])
+
+
+@pytest.mark.parametrize("depth", [7, 8, 11, 14, 15])
+@pytest.mark.parametrize(
+    ("cage", "scheme"),
+    [(cube(), "catmull_clark"), (bumpy(cube()), "catmull_clark"), (extraordinary_triangles(3), "loop")],
+)
+def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(cage, scheme, depth, np_rng):
+    """There, steps of Newton's that rounding makes are long, and tolerances shrink below the rounding of points."""
+    surface = LimitSurface(cage, scheme)
+    kernel, t = surface.on_device(SINGLE), surface.patches.elements
+    half_edge = np_rng.choice(np.flatnonzero(np.bincount(cage.face_vertices)[cage.face_vertices] == 3), 500)
+    element = t.face[half_edge].astype(np.int64)
+    corner = half_edge - t.face_offsets[element]
+    uv = np_rng.random((500, 2)) * 2.0**-depth
+    target = surface.evaluate(element, uv, corner)
+    found = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
+    assert np.isfinite(np.array(found.t)).mean() > 0.98
+
+    start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
+    d = -target.n + np_rng.uniform(-0.5, 0.5, (500, 3))
+    found = hit(kernel, target.p - 2 * d, d, element, start, corner)
+    met = np.isfinite(np.array(found.t))
+    # A few wander between pieces until they are given up.
+    assert met.mean() > 0.97
+    np.testing.assert_allclose(vectors(found.p)[met], target.p[met], rtol=0, atol=10 * ON_RAY[SINGLE])
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
+def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):
+    surface = LimitSurface(cube())
+    kernel = surface.on_device(variant)
+    element, uv, corner = random_locations(surface, np_rng, 500, deepest=4)
+    s = surface.evaluate(element, uv, corner)
+    along = np_rng.normal(size=(500, 2, 1))
+    d = along[:, 0] * s.dp_du + along[:, 1] * s.dp_dv
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    for height, are_met in ((0.05, False), (-0.05, True)):
+        found = hit(kernel, s.p + height * s.n - 2 * d, d, element, uv, corner)
+        met = np.isfinite(np.array(found.t))
+        assert np.isfinite(vectors(found.p)).all()
+        assert np.isfinite(vectors(found.n)).all()
+        # Grazing rays may be given up.
+        assert met.mean() > 0.9 if are_met else not met.any()
+
+
+@pytest.mark.core
+def test_rays_from_far_away_hit_as_exactly_as_from_nearby():
+    """Their origins and directions are exact, and so is the point of the ray that is nearest to the start."""
+    surface, kernel = surface_named("mixed torus"), kernel_named("mixed torus", DOUBLE)
+    uv, d = np.array([[0.25, 0.375]]), np.array([[1.0, -1.0, 1.0]])
+    target = np.round(surface.evaluate([5], uv).p * 1024) / 1024
+    near, far = (hit(kernel, target - t * d, d, np.array([5]), uv + 0.03, np.array([0])) for t in (1.0, 2.0**33))
+    assert np.isfinite(np.array(near.t)).all()
+    np.testing.assert_allclose(vectors(far.p), vectors(near.p), rtol=0, atol=1e-9)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("rounds", [1, 2, 3])
+def test_locations_are_where_the_points_lie_however_few_rounds_there_are(monkeypatch, np_rng, rounds):
+    """Also where a search ends in the last round that it has."""
+    surface, kernel = surface_named("mixed torus"), kernel_named("mixed torus", DOUBLE)
+    types = kernel.types
+    monkeypatch.setattr(line_intersection, "ROUNDS", rounds)
+    samples = surface.sample(12, 2)
+    u, v = np.clip(samples.uv + np_rng.uniform(-0.1, 0.1, (12, 2)), 0.01, 0.49).T
+    start = kernel.walk.at(
+        types.indices(samples.element), types.floats(u), types.floats(v), types.indices(samples.corner)
+    )
+    met = kernel.line_hits(upload(types.vector3, samples.p), upload(types.vector3, samples.n), start)
+    dr.eval(met.location, met.kind, met.values.value)
+    are_hit = np.array(met.kind) == ON_LINE
+    assert are_hit.any()
+    again = vectors(kernel.at(met.location).p)
+    np.testing.assert_allclose(again[are_hit], vectors(met.values.value)[are_hit], rtol=0, atol=ON_RAY[DOUBLE])
+
+
+def first_hits(o, d, corners):
+    """``(n,)`` ray parameters of the nearest of some triangles ``(m, 3, 3)``; infinite where there is none."""
+    a, e, f = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across, away = np.cross(d[:, None], f), o[:, None] - a
+    inverse = 1 / (across * e).sum(axis=2)
+    turned = np.cross(away, e)
+    b1, b2 = (across * away).sum(axis=2) * inverse, (turned * d[:, None]).sum(axis=2) * inverse
+    t = (turned * f).sum(axis=2) * inverse
+    return np.where((b1 >= 0) & (b2 >= 0) & (b1 + b2 <= 1) & (t > 0), t, np.inf).min(axis=1)
+
+
+@pytest.mark.parametrize("name", ["torus", "cube", "loop mixed torus"])
+def test_the_nearest_of_the_hits_on_all_pieces_is_that_on_a_fine_tessellation(name, np_rng):
+    """From some places on each piece, whatever the ray: only hits inside of the piece count."""
+    surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
+    types, patches = kernel.types, PieceKernel.shared(surface.pieces(), kernel.types.float)
+    o = np_rng.normal(size=(50, 3))
+    o *= 6 / np.linalg.norm(o, axis=1)[:, None]
+    d = surface.sample(50, 3).p + 0.2 * np_rng.normal(size=(50, 3)) - o
+    element, uv, corner = (np.concatenate([values] * 50) for values in random_locations(surface, np_rng, 4000, 3))
+    start = kernel.walk.at(types.indices(element), *map(types.floats, uv.T), types.indices(corner))
+    piece = patches.piece(kernel.coefficients, start.half_edge, start.u, start.v)
+    rays = (upload(types.vector3, np.repeat(values, 4000, axis=0)) for values in (o, d))
+    _, step, length, _, values = piece_hits(types, piece, *rays, steps=12)
+    met = (length * piece.magnification < STEP_TOLERANCE) & piece.is_inside(*step, 1e-6)
+    dr.eval(met, values.value)
+    along = ((vectors(values.value).reshape(50, 4000, 3) - o[:, None]) * d[:, None]).sum(axis=2)
+    t = np.where(np.array(met).reshape(50, 4000), along / (d**2).sum(axis=1)[:, None], np.inf).min(axis=1)
+    mesh = surface.tessellate(12)
+    expected = first_hits(o, d, mesh.positions[mesh.triangles])
+    is_hit = np.isfinite(expected)
+    assert 0.5 < is_hit.mean() < 1
+    # Beside outlines, triangles are missed or met that are not the surface.
+    assert (np.isfinite(t) == is_hit).mean() >= 0.97
+    both = is_hit & np.isfinite(t)
+    assert (np.abs(t[both] - expected[both]) < 3e-3).mean() >= 0.97
