@@ -12,7 +12,7 @@ from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from mitsuba_subdivision.evaluation.polynomials import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
-from mitsuba_subdivision.tessellation.criterion import BESIDE_OUTLINE, NormalCone, TangentCone, least_product
+from mitsuba_subdivision.tessellation.criterion import BESIDE_OUTLINE, Cone, least_product
 from patches.closed_cages import bumpy
 from reference.refined_cages import sheet
 from scipy.spatial import ConvexHull
@@ -199,8 +199,7 @@ def test_u_and_v_are_alike(measure, np_rng):
     derivatives, found = derivatives_of(patches), []
     for order in ([0, 1, 2, 3, 4], [1, 0, 4, 3, 2]):
         own = [derivatives[i] for i in order]
-        tangents = TangentCone.of(own[0]), TangentCone.of(own[1])
-        found.append(Criterion(measure, 1e-3).form(own, tangents, NormalCone.of(*tangents), 4))
+        found.append(Criterion(measure, 1e-3).form(patches, own, 4))
     np.testing.assert_allclose(found[1], found[0][::-1], rtol=ROUNDING)
 
 
@@ -208,10 +207,10 @@ def test_u_and_v_are_alike(measure, np_rng):
 def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound(scale):
     """At a curve in place of a surface, however much of the other tangent rounding leaves; in single precision."""
     u, _ = (BICUBIC.indices / 3).T
-    found = [each.astype(np.float32) for each in derivatives_of(np.stack([u, 0 * u, u**3], axis=1)[..., None])]
+    points = np.stack([u, 0 * u, u**3], axis=1)[..., None].astype(np.float32)
+    found = [each.astype(np.float32) for each in derivatives_of(points)]
     found[1][:] = np.float32(scale) * np.array([0, 0, 1])[:, None]
-    tangents = TangentCone.of(found[0]), TangentCone.of(found[1])
-    form = Criterion(Measure.CHORD, 1e-3).form(found, tangents, NormalCone.of(*tangents), 4)
+    form = Criterion(Measure.CHORD, 1.0).form(points, found, 4)
     whole = np.sqrt(np.square(found[2]).sum(axis=1).max(axis=0))
     assert (form[0] <= np.float32(1 + 1e-6) * whole / 8).all()
     assert (form[0] > 0).all()
@@ -225,7 +224,7 @@ def test_an_outline_in_view_is_noticed(direction, np_rng):
     axis, angle = np_rng.normal(size=(3, count)), 0.5 * np_rng.random(count)
     axis /= np.linalg.norm(axis, axis=0)
     eye = np.array([0.0, -4, 1])
-    cone = NormalCone(axis, np.sin(angle))
+    cone = Cone(axis, np.sin(angle))
     found = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone)
 
     points = centre + half * np_rng.uniform(-1, 1, (samples, 3, count))

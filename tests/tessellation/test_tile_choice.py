@@ -45,13 +45,13 @@ def test_tessellations_do_not_depend_on_the_chunks_that_fit_a_cache(monkeypatch)
 
 
 def test_too_many_triangles_are_refused_before_most_tiles_are_looked_at(monkeypatch):
-    surface, seen, decided = surface_named("rook"), [], tile_choice._decided
+    surface, seen, decided = surface_named("rook"), [], tile_choice.TileRates.decided
 
     def counted(rates, part):
         seen.append(len(part.tiles))
         return decided(rates, part)
 
-    monkeypatch.setattr(tile_choice, "_decided", counted)
+    monkeypatch.setattr(tile_choice.TileRates, "decided", counted)
     with pytest.raises(MemoryError, match="expected a larger error"):
         surface.adaptive_sampling(Criterion(Measure.EDGE, 1e-9), 1024)
     assert sum(seen) < 10 * surface.patches.patch_count

@@ -45,25 +45,20 @@ class DividedTile:
         turn: int,
     ) -> None:
         self._scheme, self._source, self._turn = scheme, source, turn
+        self.is_piece = source is None
+        # Whether the tile has an extraordinary point at a corner, so that one child equals the tile.
+        self.is_self_similar = isinstance(source, IrregularPatch)
 
-    @property
-    def control_count(self) -> int:
-        """K, number of control points."""
+    @cached_property
+    def control_points(self) -> FloatArray:
+        """``(n, K)`` stencils of the control points of the one-ring, or of a piece, over the tile's control points."""
         if self._source is None:
-            return len(regular_bernstein(self._scheme).basis.indices)
-        if isinstance(self._source, IrregularPatch):
-            return len(self._source.basis.eigenvalues)
-        return self._source.control_count
-
-    @property
-    def is_piece(self) -> bool:
-        """Whether the tile lies inside one polynomial piece."""
-        return self._source is None
-
-    @property
-    def is_self_similar(self) -> bool:
-        """Whether the tile has an extraordinary point at a corner, so that one child equals the tile."""
-        return isinstance(self._source, IrregularPatch)
+            return np.eye(len(regular_bernstein(self._scheme).basis.indices))
+        return (
+            self._source.basis.vectors
+            if isinstance(self._source, IrregularPatch)
+            else np.eye(self._source.control_count)
+        )
 
     @cached_property
     def children(self) -> tuple[tuple[DividedTile, FloatArray], ...]:
@@ -76,26 +71,22 @@ class DividedTile:
         # The same tile at the next level, and three pieces.
         parts = [(self, transition(source, 1))]
         parts += [(_tile(scheme, None, 0), _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
-        return tuple(parts[number] for number in _own_copies(scheme.domain, turn))
+        return tuple(parts[number] for number in _children_before_turn(scheme.domain, turn))
 
     @cached_property
     def corners(self) -> FloatArray:
         """``(m, K)`` stencils of the surface points at the tile's corners."""
-        corners, identity = [], np.eye(self.control_count)
+        identity = np.eye(self.control_points.shape[1])
         if self.is_piece:
             return identity[regular_bernstein(self._scheme).basis.corners]
-        for number in range(self._scheme.domain.corner_count):
-            tile, rows = self.children[number]
-            # The first eigen-coordinate is the extraordinary point.
-            corners.append(identity[0] if tile is self else (tile.corners @ rows)[number])
-        return np.array(corners)
-
-    @property
-    def control_points(self) -> FloatArray:
-        """``(n, K)`` stencils of the control points of the one-ring."""
-        if isinstance(self._source, IrregularPatch):
-            return self._source.basis.vectors
-        return np.eye(self.control_count)
+        # The first eigen-coordinate is the extraordinary point.
+        children = self.children[: self._scheme.domain.corner_count]
+        return np.array(
+            [
+                identity[0] if tile is self else (tile.corners @ rows)[number]
+                for number, (tile, rows) in enumerate(children)
+            ]
+        )
 
     @cached_property
     def control_faces(self) -> IntArray:
@@ -157,8 +148,9 @@ class DividedTile:
         if self._scheme.has_convex_rules or not isinstance(self._source, IrregularPatch):
             return self.control_points
         # The sum of n vectors is the mean of n times each of them.
-        away = np.diag((self.control_count - 1) * rest_rows(self._source).max(axis=0))[1:]
-        return np.eye(1, self.control_count) + np.concatenate([away, -away])
+        bound = rest_rows(self._source).max(axis=0)
+        away = np.diag((len(bound) - 1) * bound)[1:]
+        return np.eye(1, len(bound)) + np.concatenate([away, -away])
 
     def _divided(
         self, divisions: int, side: int | None = None
@@ -168,7 +160,7 @@ class DividedTile:
         Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the undivided tiles with the
         stencils of their control points.
         """
-        identity, m = np.eye(self.control_count), self._scheme.domain.corner_count
+        identity, m = np.eye(self.control_points.shape[1]), self._scheme.domain.corner_count
         if self.is_piece:
             return [identity if side is None else identity[regular_bernstein(self._scheme).basis.sides[side]]], []
         if not divisions:
@@ -210,9 +202,7 @@ def part_of_tile(
 
 
 # A tile takes some 20 kB.
-@lru_cache(maxsize=4096)
-def _tile(scheme: Scheme, source: PatchTree | IrregularPatch | None, turn: int) -> DividedTile:
-    return DividedTile(scheme, source, turn)
+_tile = lru_cache(maxsize=4096)(DividedTile)
 
 
 @lru_cache(maxsize=64)
@@ -223,7 +213,7 @@ def _turned(scheme: Scheme, turn: int) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def _own_copies(domain: ParameterDomain, turn: int) -> tuple[int, ...]:
+def _children_before_turn(domain: ParameterDomain, turn: int) -> tuple[int, ...]:
     """Return, for each child of a domain, its number among the children of the turned domain."""
     rotation, children = domain.rotation(turn), domain.children
     return tuple(

@@ -20,7 +20,7 @@ from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .criterion import Criterion
-from .stitching import inner_counts, inner_steps, stitched
+from .stitching import SideSamples, inner_counts, inner_steps, stitched
 from .tile_choice import choose_tiles
 from .tiles import PatchFrames, Sides, Tiles, half_edges_around, in_patch, ranked, sides_of, vertices_at_corners
 from .uniform import checked_rate
@@ -194,7 +194,7 @@ class AdaptiveGrid:
             samples = slice(on_sides[block.start], on_sides[block.stop])
             keeps_corner = None if self.keeps_corner is None else self.keeps_corner[block]
             rates, counts = self.tiles["rates"][block], self.side_counts[block]
-            of_block = stitched(rates, counts, self._along(samples), keeps_corner)
+            of_block = stitched(rates, SideSamples(counts, self._along(samples)), keeps_corner)
             count = samples.stop - samples.start
             first_inner = len(self.position) - count + inside[block.start]
             of_block += np.where(of_block >= count, first_inner, samples.start).astype(np.int32)

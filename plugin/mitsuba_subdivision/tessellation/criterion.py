@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ class Sensor:
         eye = self.eye[:, None]
         return self.pixel * np.linalg.norm(np.maximum(0, np.maximum(lower - eye, eye - upper)), axis=-2)
 
-    def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> NDArray[np.bool_]:
+    def may_see_outline(self, lower: FloatArray, upper: FloatArray, cone: Cone) -> NDArray[np.bool_]:
         """``(.., t)`` whether a normal in a cone may be nearly perpendicular to the view of a point in a box."""
         if self.direction is not None:
             view, spread = self.direction[:, None], np.zeros(lower[..., 0, :].shape)
@@ -118,107 +119,104 @@ class Criterion:
         if not self.error >= 0:
             raise ValueError(f"an error of {self.error}; expected a number from 0 on")
 
-    def limit(self, lower: FloatArray, upper: FloatArray, cone: NormalCone) -> FloatArray:
-        """``(.., t)`` the limit for parts of the surface with bounding boxes ``(.., 3, t)`` and normal cones."""
-        limit = np.full(cone.sine.shape, float(self.error))
+    def limit(self, lower: FloatArray, upper: FloatArray, normals: Cone | None = None) -> FloatArray:
+        """``(.., t)`` the limit for parts of the surface in boxes ``(.., 3, t)``, by default with any normals."""
+        limit = np.full(lower[..., 0, :].shape, float(self.error))
         if self.sensor is not None:
             extent = 0.0 if self.displacement is None else self.displacement.extent
             limit *= self.sensor.pixel_size(lower - extent, upper + extent)
-        if self.outline is not None:
-            limit[~self.outline.may_see_outline(lower, upper, cone)] *= COARSE
+        if self.outline is not None and normals is not None:
+            limit[~self.outline.may_see_outline(lower, upper, normals)] *= COARSE
         return limit
 
-    def form(
-        self,
-        derivatives: list[FloatArray],
-        tangents: tuple[TangentCone, TangentCone],
-        cone: NormalCone,
-        corner_count: int,
-    ) -> FloatArray:
-        """Bound the limited quantity by a function of the numbers of segments along u and v.
+    def form(self, points: FloatArray, derivatives: list[FloatArray], corner_count: int) -> FloatArray:
+        """Bound the limited quantity, relative to its limit, by a function of the numbers of segments along u and v.
 
         Parameters
         ----------
-        derivatives : five (b, .., 3, t) float
-            Bernstein coefficients of the derivatives of parts of patches by u, v, uu, uv and vv.
-        tangents : two TangentCone
-            Along u and v.
+        points, derivatives : (b, .., 3, t) float, and five of that
+            Bernstein coefficients of parts of patches, and of their derivatives by u, v, uu, uv and vv.
         corner_count : int
             Of the domain.
 
         Returns
         -------
         (3, .., t) float
-            A, B and C. Over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` must not exceed `bound` of the limit.
-            Over triangles with n segments per side, ``A / n^2`` must not, and B and C are zero.
+            A, B and C. Over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` must not exceed 1. Over triangles with
+            n segments per side, ``A / n^2`` must not, and B and C are zero.
         """
-        du, dv, uu, uv, vv = derivatives
+        (u, shortest_u), (v, shortest_v) = map(tangent_cone, derivatives[:2])
+        normals = normal_cone(u, v)
         if self.measure is Measure.EDGE:
-            if corner_count == 3:
-                # Edges of strips cross at most two triangles of the grid.
-                return _isotropic(4 * np.max([dot(d, d).max(axis=0) for d in (du, dv, du - dv)], axis=0))
-            a, c = (np.sqrt(dot(d, d).max(axis=0)) for d in (du, dv))
-            return np.stack([a**2, np.minimum(a * c, _most_dot(du, dv)), c**2])
-        second = [uu, uv, vv]
-        if corner_count == 3:
-            # The second derivative along a direction is a mean plus a cosine and a sine of twice its angle.
-            mean = (uu - uv + vv) * (2 / 3)
-            second = [mean, uu - mean, (uv - uu / 2) * (2 / sqrt(3))]
-        # The distance from the surface is the normal component of the difference, plus an excess due to its tangential
-        # component, over which the surface curves; at most the length of the difference.
-        longest = [dot(d, d).max(axis=0) for d in second]
-        # Where the surface degenerates to a curve, neither the normal component nor the excess is known. Rounding may
-        # leave a tangent that nearly vanishes, and an excess beyond single precision.
-        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-            slip = 1 + _slip(tangents, np.max(longest, axis=0))
-            sizes = [
-                np.fmin(slip * cone.along(d, most), np.sqrt(most)) for d, most in zip(second, longest, strict=True)
-            ]
-        if corner_count == 3:
-            return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])))
-        return SQUARE_ERROR * np.stack(sizes)
+            form = _edge_form(derivatives[0], derivatives[1], corner_count)
+        else:
+            form = _chord_form(derivatives[2:], np.minimum(shortest_u, shortest_v), normals, corner_count)
+        return self._relative(form, self.limit(points.min(axis=0), points.max(axis=0), normals))
 
-    def bound(self, limit: FloatArray) -> FloatArray:
-        """Upper limit of `form` for a limit of the quantity."""
-        return limit**2 if self.measure is Measure.EDGE else limit
-
-    def form_of_displacement(self, heights: FloatArray) -> FloatArray:
+    def form_of_displacement(self, points: FloatArray, heights: FloatArray, corner_count: int) -> FloatArray:
         """``(3, t)`` contribution of a displacement to `form`, from its heights ``(n, n, t)`` over tiles, by v and u.
 
         On triangles, samples above the diagonal count as well.
         """
+        steps = len(heights) - 1
+        along_u, along_v = np.diff(heights, axis=1), np.diff(heights, axis=0)
         if self.measure is Measure.EDGE:
-            along_u, along_v = (
-                (len(heights) - 1) * np.diff(heights, axis=1),
-                (len(heights) - 1) * np.diff(heights, axis=0),
-            )
-            a, c = (np.square(along).max(axis=(0, 1)) for along in (along_u, along_v))
-            return np.stack([a, np.sqrt(a * c), c])
-        second = [np.diff(heights, 2, axis=1), np.diff(np.diff(heights, axis=0), axis=1), np.diff(heights, 2, axis=0)]
-        return SQUARE_ERROR * (len(heights) - 1) ** 2 * np.stack([np.abs(d).max(axis=(0, 1)) for d in second])
+            a, c = (np.square(steps * along).max(axis=(0, 1)) for along in (along_u, along_v))
+            form = [a, np.sqrt(a * c), c]
+        else:
+            second = np.diff(along_u, axis=1), np.diff(along_v, axis=1), np.diff(along_v, axis=0)
+            form = [SQUARE_ERROR * steps**2 * np.abs(d).max(axis=(0, 1)) for d in second]
+        a, b, c = self._relative(np.stack(form), self.limit(points.min(axis=0), points.max(axis=0)))
+        return _isotropic(a + 2 * b + c) if corner_count == 3 else np.stack([a, b, c])
 
-    def segments(self, second: FloatArray, limit: FloatArray) -> IntArray:
-        """``(t,)`` segments that keep curves with second derivatives ``(b, 3, t)`` within a limit."""
+    def _relative(self, form: FloatArray, limit: FloatArray) -> FloatArray:
+        with np.errstate(over="ignore"):
+            return form / np.maximum(limit**2 if self.measure is Measure.EDGE else limit, TINY)
+
+    def segments(self, second: FloatArray, points: FloatArray) -> IntArray:
+        """``(t,)`` segments that keep curves on surfaces ``(b, 3, t)`` within the limit, from second derivatives."""
         furthest = SQUARE_ERROR * np.sqrt(dot(second, second).max(axis=0))
+        limit = self.limit(points.min(axis=0), points.max(axis=0))
         return rounded_up(np.sqrt(furthest / np.maximum(limit, TINY)))
+
+
+def _edge_form(du: FloatArray, dv: FloatArray, corner_count: int) -> FloatArray:
+    """Bound of the squared length of edges, see `Criterion.form`."""
+    if corner_count == 3:
+        # Edges of strips cross at most two triangles of the grid.
+        return _isotropic(4 * np.max([dot(d, d).max(axis=0) for d in (du, dv, du - dv)], axis=0))
+    a, c = (np.sqrt(dot(d, d).max(axis=0)) for d in (du, dv))
+    most_dot = np.abs(dot(du[:, None], dv[None])).max(axis=(0, 1))
+    return np.stack([a**2, np.minimum(a * c, most_dot), c**2])
+
+
+def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, corner_count: int) -> FloatArray:
+    """Bound of the distance of triangles, see `Criterion.form`, from the least length of both tangents."""
+    if corner_count == 3:
+        # The second derivative along a direction is a mean plus a cosine and a sine of twice its angle.
+        uu, uv, vv = second
+        mean = (uu - uv + vv) * (2 / 3)
+        second = [mean, uu - mean, (uv - uu / 2) * (2 / sqrt(3))]
+    # The distance from the surface is the normal component of the difference, plus an excess due to its tangential
+    # component, over which the surface curves; at most the length of the difference.
+    longest = [dot(d, d).max(axis=0) for d in second]
+    # Where the surface degenerates to a curve, neither the normal component nor the excess is known. Rounding may leave
+    # a tangent that nearly vanishes, and an excess beyond single precision.
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        slip = 1 + np.where(shortest > 0, np.max(longest, axis=0) / shortest**2 / 8, np.inf)
+        # Largest extent along any of the normals.
+        extents = [
+            np.abs(dot(d, normals.axis)).max(axis=0) + normals.sine * np.sqrt(most)
+            for d, most in zip(second, longest, strict=True)
+        ]
+        sizes = [np.fmin(slip * extent, np.sqrt(most)) for extent, most in zip(extents, longest, strict=True)]
+    if corner_count == 3:
+        return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])))
+    return SQUARE_ERROR * np.stack(sizes)
 
 
 def _isotropic(values: FloatArray) -> FloatArray:
     return np.stack([values, np.zeros_like(values), np.zeros_like(values)])
-
-
-def _most_dot(du: FloatArray, dv: FloatArray) -> FloatArray:
-    """``(.., t)`` largest absolute dot product of vectors in two convex hulls."""
-    return np.abs(dot(du[:, None], dv[None])).max(axis=(0, 1))
-
-
-def _slip(
-    tangents: tuple[TangentCone, TangentCone],
-    longest: FloatArray,  # (.., t) float: largest squared second derivative
-) -> FloatArray:
-    """``(.., t)`` relative excess of the distance over its normal component, at one segment."""
-    shortest = np.minimum(tangents[0].shortest, tangents[1].shortest)
-    return np.where(shortest > 0, longest / shortest**2 / 8, np.inf)
 
 
 def least_product(
@@ -275,53 +273,34 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return product
 
 
-@dataclass(frozen=True, eq=False)
-class TangentCone:
-    """Cones of directions that contain all derivatives by one parameter, of patches or of parts of patches."""
+class Cone(NamedTuple):
+    """Cones of directions that contain all derivatives by one parameter, or all normals, of parts of patches."""
 
     axis: FloatArray  # (.., 3, t) float: unit vectors; zero where undefined
-    sine: FloatArray  # (.., t) float: sine of the cone's half angle; 1 where derivatives may have any direction
-    shortest: FloatArray  # (.., t) float: least component of a derivative along the axis
-
-    @classmethod
-    def of(cls, derivative: FloatArray) -> TangentCone:
-        """Cones of derivatives with Bernstein coefficients ``(b, .., 3, t)``."""
-        total = derivative.sum(axis=0)
-        length = np.sqrt(dot(total, total))
-        axis = total / np.where(length > 0, length, 1)[..., None, :]
-        along, squared = dot(derivative, axis), dot(derivative, derivative)
-        cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
-        sine = np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)
-        return cls(axis, sine, along.min(axis=0))
+    sine: FloatArray  # (.., t) float: sine of the cone's half angle; 1 where there may be any direction
 
 
-@dataclass(frozen=True, eq=False)
-class NormalCone:
-    """Cones of directions that contain all normals, of patches or of parts of patches."""
+def tangent_cone(derivative: FloatArray) -> tuple[Cone, FloatArray]:
+    """Cones of derivatives with Bernstein coefficients ``(b, .., 3, t)``, and the least components along their axes."""
+    total = derivative.sum(axis=0)
+    length = np.sqrt(dot(total, total))
+    axis = total / np.where(length > 0, length, 1)[..., None, :]
+    along, squared = dot(derivative, axis), dot(derivative, derivative)
+    cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
+    return Cone(axis, np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)), along.min(axis=0)
 
-    axis: FloatArray  # (.., 3, t) float: unit vectors; zero where undefined
-    sine: FloatArray  # (.., t) float: sine of the cone's half angle; 1 where normals may have any direction
 
-    @classmethod
-    def of(cls, u: TangentCone, v: TangentCone) -> NormalCone:
-        """Cones of normals from cones of tangents along u and v [Sederberg and Meyers 1988]."""
-        normal = cross(u.axis, v.axis)
-        sine, cosine = np.sqrt(dot(normal, normal)), np.abs(dot(u.axis, v.axis))
-        safe = np.maximum(sine, PARALLEL)
-        normal_sine = np.sqrt(u.sine**2 + 2 * u.sine * v.sine * cosine + v.sine**2) / safe
-        exists = (sine > PARALLEL) & (u.sine < 1) & (v.sine < 1) & (normal_sine < 1)
-        return cls(np.where(sine > PARALLEL, 1 / safe, 0)[..., None, :] * normal, np.where(exists, normal_sine, 1))
+def normal_cone(u: Cone, v: Cone) -> Cone:
+    """Cones of normals from cones of tangents along u and v [Sederberg and Meyers 1988]."""
+    normal = cross(u.axis, v.axis)
+    sine, cosine = np.sqrt(dot(normal, normal)), np.abs(dot(u.axis, v.axis))
+    safe = np.maximum(sine, PARALLEL)
+    normal_sine = np.sqrt(u.sine**2 + 2 * u.sine * v.sine * cosine + v.sine**2) / safe
+    exists = (sine > PARALLEL) & (u.sine < 1) & (v.sine < 1) & (normal_sine < 1)
+    return Cone(np.where(sine > PARALLEL, 1 / safe, 0)[..., None, :] * normal, np.where(exists, normal_sine, 1))
 
-    @classmethod
-    def of_any(cls, count: int) -> NormalCone:
-        """Cones for ``count`` patches with unknown normals."""
-        return cls(np.zeros((3, count)), np.ones(count))
 
-    def around(self, axis: FloatArray) -> NormalCone:
-        """Cones about other axes ``(3, t)`` that contain these."""
-        angle = np.arccos(np.clip(dot(self.axis, axis), -1, 1)) + np.arcsin(np.clip(self.sine, 0, 1))
-        return NormalCone(axis, np.where((self.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))
-
-    def along(self, vectors: FloatArray, longest: FloatArray) -> FloatArray:
-        """``(.., t)`` largest extent of vectors ``(b, .., 3, t)`` along a normal, with their largest squared length."""
-        return np.abs(dot(vectors, self.axis)).max(axis=0) + self.sine * np.sqrt(longest)
+def cone_around(cone: Cone, axis: FloatArray) -> Cone:
+    """Cones about other axes ``(3, t)`` that contain cones."""
+    angle = np.arccos(np.clip(dot(cone.axis, axis), -1, 1)) + np.arcsin(np.clip(cone.sine, 0, 1))
+    return Cone(axis, np.where((cone.sine < 1) & (angle < np.pi / 2), np.sin(angle), 1))

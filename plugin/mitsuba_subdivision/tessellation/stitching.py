@@ -11,9 +11,6 @@ none is degenerate: they do not fold.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,50 +20,27 @@ from ..schemes.domain import FloatArray
 
 # Tolerance when comparing parameters.
 PARAMETER_ROUNDING = 1e-9
+# Triangles, as three samples each, and their tiles.
+Triangles = list[tuple[IntArray, IntArray]]
 
 
-@dataclass(frozen=True, eq=False)
 class SideSamples:
     """Samples along the sides of tiles."""
 
-    # (t, m) int64: segments on each side. There are as many samples, as the last point belongs to the next side.
-    counts: IntArray
-    along: FloatArray  # (n,) float64: position of each sample along its side, in [0, 1)
-
-    @cached_property
-    def first(self) -> IntArray:
-        """``(t, m)`` first sample of each side."""
-        return ragged.starts(self.counts.ravel()).reshape(self.counts.shape)
-
-    @cached_property
-    def totals(self) -> IntArray:
-        """``(t,)`` number of samples of each tile."""
-        totals: IntArray = self.counts.sum(axis=1)
-        return totals
-
-    @cached_property
-    def side(self) -> IntArray:
-        """``(n,)`` side on which each sample lies, 0-based in its tile."""
-        t, m = self.counts.shape
-        return np.repeat(np.tile(np.arange(m), t), self.counts.ravel())
-
-    @cached_property
-    def following(self) -> FloatArray:
-        """``(n,)`` position of the next sample along the same side; 1 at the end of the side."""
-        following = np.append(self.along[1:], 0)
-        following[(self.first + self.counts).ravel() - 1] = 1
-        return following
-
-    @cached_property
-    def middles(self) -> FloatArray:
-        """``(n,)`` midpoint of the segment that begins at each sample, as a position along the side."""
-        middles: FloatArray = (self.along + self.following) / 2
-        return middles
-
-    def around(self, tile: IntArray, place: IntArray) -> IntArray:
-        """The samples ``place`` places after the first one of their tiles, cyclically."""
-        samples: IntArray = self.first[tile, 0] + place % self.totals[tile]
-        return samples
+    def __init__(
+        self,
+        # (t, m): segments on each side. There are as many samples, as the last point belongs to the next side.
+        counts: IntArray,
+        along: FloatArray,  # (n,) float64: position of each sample along its side, in [0, 1)
+    ) -> None:
+        self.counts, self.along = counts, along
+        # First sample of each side, and tile and side of each sample.
+        self.first = ragged.starts(counts.ravel()).reshape(counts.shape)
+        self.tile, self.side = np.divmod(np.repeat(np.arange(counts.size), counts.ravel()), counts.shape[1])
+        # Position of the next sample along the same side, and of the middle of the segment before it.
+        self.following = np.append(along[1:], 0)
+        self.following[(self.first + counts).ravel() - 1] = 1
+        self.middles = (along + self.following) / 2
 
 
 def inner_counts(rates: IntArray, corner_count: int) -> IntArray:
@@ -97,9 +71,7 @@ def _inner_sample(rates: IntArray, u: IntArray, v: IntArray, corner_count: int) 
 
 def stitched(
     rates: IntArray,  # (t, 2) int64
-    # (t, m): segments on each side. There are as many samples, as the last point belongs to the next side.
-    counts: IntArray,
-    along: FloatArray,  # (n,) float64: position of each sample along its side, in [0, 1)
+    sides: SideSamples,
     # (t, m) bool: corners of tiles with inner samples that no triangle may cut off
     keeps_corner: NDArray[np.bool_] | None = None,
 ) -> IndexArray:
@@ -108,8 +80,8 @@ def stitched(
     Returns the samples of each triangle, (n, 3) int32, tile by tile. Samples on the sides of all tiles are numbered
     first, then inner samples.
     """
-    sides = SideSamples(counts, along)
-    m, counts = sides.counts.shape[1], inner_counts(rates, sides.counts.shape[1])
+    m = sides.counts.shape[1]
+    counts = inner_counts(rates, m)
     first_inner = len(sides.along) + ragged.starts(counts)
     parts, tiles = _across(rates, sides, np.flatnonzero(counts == 0)), np.flatnonzero(counts)
     if len(tiles):
@@ -126,57 +98,56 @@ def _strips(
     tiles: IntArray,  # (r,) the tile of each strip
     right: IntArray,  # samples of the right rows of all strips
     right_counts: IntArray,  # (r,) segments of the right rows, one less than samples
-    left: IntArray,  # samples of the left rows, in the same direction
-    left_counts: IntArray,  # (r,) segments of the left rows
-    passed: IntArray,  # for each segment of left rows, the right row's segments before it; ascending in each strip
-) -> list[tuple[IntArray, IntArray]]:
-    """Triangulate strips between two rows of samples. Returns triangles, one per segment of either row, and tiles."""
-    strip, base = np.repeat(np.arange(len(tiles)), left_counts), ragged.index_in_row(left_counts)
-    base += ragged.starts(left_counts + 1)[strip]
-    first_right = ragged.starts(right_counts + 1)
-    on_left = np.stack([right[first_right[strip] + passed], left[base + 1], left[base]], axis=1), tiles[strip]
+    right_middles: FloatArray,  # midpoints of these segments, as positions in [0, 4)
+    # The same for the left rows, in the same direction
+    left: IntArray,
+    left_counts: IntArray,
+    left_middles: FloatArray,
+    # (r,) right segments that come before all left segments, and after all of them
+    least_before: IntArray | int = 0,
+    least_after: IntArray | int = 0,
+) -> Triangles:
+    """Triangulate strips between two rows of samples: a triangle for each segment of either row."""
+    strips, first_right, first_left = np.arange(len(tiles)), ragged.starts(right_counts), ragged.starts(left_counts)
+    # The base of a triangle on a left segment; its tip is the end of the right segments with middles before its own.
+    strip, place = np.repeat(strips, left_counts), ragged.index_in_row(left_counts)
+    keys = 4 * np.repeat(strips, right_counts) + right_middles
+    passed = np.searchsorted(keys, 4 * strip + left_middles, side="right") - first_right[strip]
+    low, high = np.broadcast_to(least_before, strips.shape), right_counts - least_after
+    passed = np.clip(passed, low[strip], high[strip])
+    base = (first_left + strips)[strip] + place
+    on_left = (
+        np.stack([right[(first_right + strips)[strip] + passed], left[base + 1], left[base]], axis=1),
+        tiles[strip],
+    )
+    # The tip of a triangle on a right segment is the end of the last left segment before it.
     width = int(right_counts.max(initial=0)) + 1
     keys = width * strip + passed
-    strip, place = np.repeat(np.arange(len(tiles)), right_counts), ragged.index_in_row(right_counts)
-    # The tip of a triangle on a right segment is the end of the last left segment before it.
-    tip = np.searchsorted(keys, width * strip + place, side="right") - ragged.starts(left_counts)[strip]
-    tip += ragged.starts(left_counts + 1)[strip]
-    base = first_right[strip] + place
+    strip, place = np.repeat(strips, right_counts), ragged.index_in_row(right_counts)
+    tip = np.searchsorted(keys, width * strip + place, side="right") + strips[strip]
+    base = (first_right + strips)[strip] + place
     return [on_left, (np.stack([right[base], right[base + 1], left[tip]], axis=1), tiles[strip])]
-
-
-def _passed(
-    middles: FloatArray,  # midpoints of the segments of right rows, as positions in [0, 4)
-    counts: IntArray,  # (r,) segments of right rows
-    left_middles: FloatArray,  # midpoints of the segments of left rows
-    left_counts: IntArray,
-) -> IntArray:
-    """Number of segments of the right row before each segment of the left row."""
-    keys = 4 * np.repeat(np.arange(len(counts)), counts) + middles
-    strip = np.repeat(np.arange(len(counts)), left_counts)
-    return np.searchsorted(keys, 4 * strip + left_middles, side="right") - ragged.starts(counts)[strip]
 
 
 def _around_inner(
     rates: IntArray, sides: SideSamples, tiles: IntArray, first_inner: IntArray, is_cut: NDArray[np.bool_]
-) -> list[tuple[IntArray, IntArray]]:
+) -> Triangles:
     """Triangles between the sides of tiles and the rim of their inner samples, and triangles that cut corners off.
 
     Near a corner that is cut off, within a step of the grid, a strip joins the tile's two sides.
     """
     m, strip_of_tile = sides.counts.shape[1], np.full(len(rates), -1)
     strip_of_tile[tiles] = np.arange(len(tiles))
-    sample_tile = np.repeat(np.arange(len(rates)), sides.totals)
-    reach = 1 / rates[sample_tile, 0] + PARAMETER_ROUNDING
+    reach = 1 / rates[sides.tile, 0] + PARAMETER_ROUNDING
     before = np.append(-1, sides.along[:-1])
     before[sides.first.ravel()] = -1
     # Samples cut off with the corner at the beginning of their side, and with the corner at its end.
-    is_first = is_cut[sample_tile, sides.side] & (sides.following <= reach)
-    is_last = is_cut[sample_tile, (sides.side + 1) % m] & (before >= 1 - reach)
-    outer = np.flatnonzero((strip_of_tile[sample_tile] >= 0) & ~is_first & ~is_last)
-    outer_counts = np.bincount(strip_of_tile[sample_tile[outer]], minlength=len(tiles))
-    position = (sides.side + sides.along)[outer]
-    following, begins = np.append(position[1:], 0), ragged.starts(outer_counts)
+    is_first = is_cut[sides.tile, sides.side] & (sides.following <= reach)
+    is_last = is_cut[sides.tile, (sides.side + 1) % m] & (before >= 1 - reach)
+    outer = np.flatnonzero((strip_of_tile[sides.tile] >= 0) & ~is_first & ~is_last)
+    outer_counts = np.bincount(strip_of_tile[sides.tile[outer]], minlength=len(tiles))
+    position, begins = (sides.side + sides.along)[outer], ragged.starts(outer_counts)
+    following = np.append(position[1:], 0)
     following[begins + outer_counts - 1] = position[begins] + m
     # The rim: inner samples along each side, without the last one, with which the next row begins.
     n = rates[tiles][:, [0, 1, 0, 1] if m == 4 else [0, 0, 0]]
@@ -191,57 +162,50 @@ def _around_inner(
     else:
         u, v = np.choose(side, [k, n_u - 1 - k, 1]), np.choose(side, [1, k, n_u - 1 - k])
         middle = side + (k + 1) / n_u
-    rim = _closed(first_inner[tile] + _inner_sample(rates[tile], u, v, m), rim_counts, first_inner[tiles])
-    passed = _passed((position + following) / 2, outer_counts, middle, rim_counts)
-    strips = _strips(tiles, _closed(outer, outer_counts, outer[begins]), outer_counts, rim, rim_counts, passed)
+    # Both rows are closed: the first sample comes again at the end.
+    outer = np.insert(outer, np.cumsum(outer_counts), outer[begins])
+    rim = first_inner[tile] + _inner_sample(rates[tile], u, v, m)
+    rim = np.insert(rim, np.cumsum(rim_counts), first_inner[tiles])
+    strips = _strips(tiles, outer, outer_counts, (position + following) / 2, rim, rim_counts, middle)
     return strips + _corners(sides, is_first, is_last, np.argwhere(is_cut))
-
-
-def _closed(samples: IntArray, counts: IntArray, last: IntArray) -> IntArray:
-    """Append one sample to each row of samples."""
-    return np.insert(samples, np.cumsum(counts), last)
 
 
 def _corners(
     sides: SideSamples, is_first: NDArray[np.bool_], is_last: NDArray[np.bool_], corners: IntArray
-) -> list[tuple[IntArray, IntArray]]:
+) -> Triangles:
     """Triangles that cut off ``corners``, (n, 2) tile and corner, between the two sides that meet there."""
     tile, corner = corners.T
     previous = (corner - 1) % sides.counts.shape[1]
-    near = ragged.offsets(is_first), ragged.offsets(is_last)
+    near_first, near_last = ragged.offsets(is_first), ragged.offsets(is_last)
     begin, end = sides.first[tile, corner], sides.first[tile, previous] + sides.counts[tile, previous]
-    counts = near[0][begin + sides.counts[tile, corner]] - near[0][begin]
+    counts = near_first[begin + sides.counts[tile, corner]] - near_first[begin]
     # Without the corner itself, which belongs to the right row.
-    left_counts = near[1][end] - near[1][sides.first[tile, previous]]
-    right = ragged.ranges(begin, counts + 1)
+    left_counts = near_last[end] - near_last[sides.first[tile, previous]]
     left = np.repeat(end - 1, left_counts + 1) - ragged.index_in_row(left_counts + 1)
-    passed = _passed(
-        sides.middles[ragged.ranges(begin, counts)],
-        counts,
-        1 - sides.middles[np.repeat(end - 2, left_counts) - ragged.index_in_row(left_counts)],
-        left_counts,
-    )
-    return _strips(tile, right, counts, left, left_counts, np.maximum(passed, 1))
+    left_middles = 1 - sides.middles[np.repeat(end - 2, left_counts) - ragged.index_in_row(left_counts)]
+    right, right_middles = ragged.ranges(begin, counts + 1), sides.middles[ragged.ranges(begin, counts)]
+    return _strips(tile, right, counts, right_middles, left, left_counts, left_middles, 1)
 
 
-def _across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> list[tuple[IntArray, IntArray]]:
+def _across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> Triangles:
     """Triangles of tiles without inner samples: between one side, the base, and all others."""
-    m, counts, total = sides.counts.shape[1], sides.counts[tiles], sides.totals[tiles]
+    m, counts = sides.counts.shape[1], sides.counts[tiles]
+    total, first, strips = counts.sum(axis=1), sides.first[tiles, 0], np.arange(len(tiles))
     # The base runs along the direction in which the tile has more segments.
     may_be_base = np.full((len(tiles), m), True)
     if m == 4:
         u, v = rates[tiles].T
         may_be_base[:, 1::2] = (u <= v)[:, None] | (v > 1)[:, None]
         may_be_base[:, 0::2] = (v <= u)[:, None] | (u > 1)[:, None]
-    base, strips = np.argmax(np.where(may_be_base, counts, 0), axis=1), np.arange(len(tiles))
-    length, begin = counts[strips, base], sides.first[tiles, base] - sides.first[tiles, 0]
+    base = np.argmax(np.where(may_be_base, counts, 0), axis=1)
+    length, begin = counts[strips, base], sides.first[tiles, base] - first
     before, after = counts[strips, (base - 1) % m], counts[strips, (base + 1) % m]
     strip, place = np.repeat(strips, length + 1), ragged.index_in_row(length + 1)
-    right = sides.around(tiles[strip], begin[strip] + place)
+    right = first[strip] + (begin[strip] + place) % total[strip]
     # The opposite row leads clockwise from the sample before the base's first to the sample after its last.
     across = total - length - 2
     strip, place = np.repeat(strips, across + 1), ragged.index_in_row(across + 1)
-    left = sides.around(tiles[strip], begin[strip] - 1 - place)
+    left = first[strip] + (begin[strip] - 1 - place) % total[strip]
     turn, along = (sides.side[left] - base[strip]) % m, sides.along[left]
     if m == 3:
         position = np.where(turn == 1, 1 - along / 2, (1 - along) / 2)
@@ -249,14 +213,12 @@ def _across(rates: IntArray, sides: SideSamples, tiles: IntArray) -> list[tuple[
         position = np.choose(turn, [along, 1.0, 1 - along, 0.0])
     segment = np.flatnonzero(place < across[strip])
     middles = sides.middles[ragged.ranges(sides.first[tiles, base], length)]
-    passed = _passed(middles, length, (position[segment] + position[segment + 1]) / 2, across)
+    left_middles = (position[segment] + position[segment + 1]) / 2
     # Next to a side of several segments, a triangle of that side with the base's end would be degenerate.
-    strip = strip[segment]
-    passed = np.clip(passed, (before > 1)[strip], (length - (after > 1))[strip])
-    return _strips(tiles, right, length, left, across, passed)
+    return _strips(tiles, right, length, middles, left, across, left_middles, before > 1, after > 1)
 
 
-def _inside(rates: IntArray, first_inner: IntArray, corner_count: int) -> list[tuple[IntArray, IntArray]]:
+def _inside(rates: IntArray, first_inner: IntArray, corner_count: int) -> Triangles:
     """Triangles between inner samples: two per cell of the grid; over triangles, one upright and one inverted."""
     tile = np.repeat(np.arange(len(rates)), inner_counts(rates, corner_count))
     (u, v), (n_u, n_v) = inner_steps(rates, corner_count).T, rates[tile].T
@@ -266,7 +228,7 @@ def _inside(rates: IntArray, first_inner: IntArray, corner_count: int) -> list[t
     else:
         room = n_u - u - v
         cells = (((0, 0), (1, 0), (0, 1)), 1), (((1, 0), (1, 1), (0, 1)), 2)
-    parts: list[tuple[IntArray, IntArray]] = []
+    parts: Triangles = []
     for steps, needed in cells:
         origins = np.flatnonzero(room > needed)
         cell_tile = tile[origins]

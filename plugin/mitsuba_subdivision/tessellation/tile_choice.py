@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import chain
 from typing import NamedTuple
 
@@ -12,16 +14,27 @@ from numpy.typing import NDArray
 from ..cage.errors import warn
 from ..evaluation.divided_tile import DividedTile, part_of_tile
 from ..evaluation.patch_tree import patch_trees
-from ..evaluation.polynomials import times
-from ..mesh.connectivity import IntArray
+from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
+from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
 from ..progress import counted
 from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
 from . import HIGHEST_RATE
-from .criterion import Criterion, Measure, dot
+from .criterion import (
+    Cone,
+    Criterion,
+    Measure,
+    cone_around,
+    cross,
+    dot,
+    least_product,
+    normal_cone,
+    rounded_up,
+    tangent_cone,
+)
 from .memory import require_memory_for_triangles
-from .tile_rates import TileRates
-from .tiles import DEEPEST, PatchFrames, Tiles, child, tile_type, whole_patches
+from .tiles import DEEPEST, PatchFrames, Tiles, child, half_edges_around, in_patch, tile_type, whole_patches
 
 # Tiles of a kind that are processed together, whose bounds stay in a core's cache; and most tiles that wait for more of
 # their kind. Both bound temporary memory; smaller numbers would take more time.
@@ -31,14 +44,18 @@ TILES_AT_ONCE, MOST_WAITING = 1 << 10, 1 << 15
 MOST_TRIANGLES, MOST_TRIANGLES_AT_OUTLINE = 32, 18
 # Largest cosine of the angle between the normals of the elements beside a fold.
 FOLD_COSINE = -0.1
+# Samples of a displacement along each side of a tile.
+HEIGHT_SAMPLES = 9
+# Signed area of a control face, relative to the largest, whose sign may be due to rounding.
+FOLDED = 1e-6
 
 
-class _Part(NamedTuple):
+class Part(NamedTuple):
     """Tiles of one kind, whose children have the same matrices."""
 
     kind: DividedTile
     tiles: Tiles
-    values: FloatArray  # (K, 3, t) float64: control points
+    values: FloatArray  # (K, 3, t) float64: control points; of pieces, Bernstein coefficients
 
 
 def choose_tiles(
@@ -64,7 +81,8 @@ def choose_tiles(
     needed = np.concatenate([none, *_chosen(rates, _whole_patches(patches, frames, points, features))])
     u, v = needed["origin"].T
     needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
-    tiles = rates.clipped(needed)
+    tiles, most = needed.copy(), rates.most(needed)[:, None]
+    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
     if criterion.outline is None:
         _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
     return tiles
@@ -77,9 +95,8 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
         return
     coarse, t = needed[is_coarse], patches.elements
     tile_rate = np.maximum(coarse["rates"].max(axis=1), coarse["sides"].max(axis=1)).astype(np.int64)
-    most = (tile_rate << coarse["halvings"]).max()
     # Rates along an edge of the cage are powers of two, as tiles arise by halving.
-    rate = 1 << int(most - 1).bit_length()
+    rate = 1 << int((tile_rate << coarse["halvings"]).max() - 1).bit_length()
     count, total = len(np.unique(t.face[coarse["corner"]])), int(np.count_nonzero(t.face_sizes))
     kind, larger = "faces" if patches.scheme.element == "face" else "vertices", "a larger error"
     warn(
@@ -94,7 +111,7 @@ def _whole_patches(
     frames: PatchFrames,
     points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
     features: NDArray[np.bool_],  # (n_h,) bool: `feature_edges`
-) -> Iterator[_Part]:
+) -> Iterator[Part]:
     """Iterate over all patches, each as one tile."""
     refined = patches.refined
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
@@ -110,14 +127,13 @@ def _whole_patches(
             block = slice(begin, begin + TILES_AT_ONCE)
             controls = patch_class.controls[block].T
             values = np.stack([axis.take(controls, mode="clip") for axis in coordinates], axis=1)
-            values = values if rows is identity else times(rows, values)
-            yield _Part(kind, tiles[block], values)
+            yield Part(kind, tiles[block], values if rows is identity else times(rows, values))
 
 
-def _chosen(rates: TileRates, patches: Iterable[_Part]) -> Iterator[Tiles]:
+def _chosen(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
     """Iterate over the tiles of all patches, with their rates. Raises MemoryError if there are too many triangles."""
     # Tiles wait by kind, as one call bounds many tiles of a kind in little more time than one of them.
-    waiting: dict[DividedTile, list[_Part]] = {}
+    waiting: dict[DividedTile, list[Part]] = {}
     triangle_count = waiting_count = 0
     for part in chain(patches, [None]):
         if part is not None:
@@ -127,77 +143,245 @@ def _chosen(rates: TileRates, patches: Iterable[_Part]) -> Iterator[Tiles]:
                 continue
         waiting_count = 0
         while waiting:
-            # Pieces wait until there are enough of them. Larger tiles come first, to detect too many triangles early.
-            not_pieces = [kind for kind in waiting if not kind.is_piece]
-            piece_count = sum(len(part.tiles) for kind in waiting if kind.is_piece for part in waiting[kind])
-            for kind in list(waiting) if piece_count > TILES_AT_ONCE or not not_pieces else not_pieces:
+            # Pieces, which are all of one kind, wait until there are enough of them. Larger tiles come first, to detect
+            # too many triangles early.
+            pieces = [kind for kind in waiting if kind.is_piece]
+            others = [kind for kind in waiting if not kind.is_piece]
+            has_enough = sum(len(part.tiles) for kind in pieces for part in waiting[kind]) > TILES_AT_ONCE
+            for kind in pieces + others if has_enough or not others else others:
                 taken = _taken(waiting[kind])
                 if not waiting[kind]:
                     del waiting[kind]
-                done, undecided = _decided(rates, taken)
+                done, undecided = rates.decided(taken)
                 triangle_count += int(rates.triangle_counts(done).sum())
-                if taken.kind.is_piece:
+                if kind.is_piece:
                     # The counts of undecided tiles are upper bounds, as division makes fewer triangles.
                     require_memory_for_triangles(triangle_count + int(rates.triangle_counts(undecided.tiles).sum()))
                 yield done
-                for divided in _divided(rates, undecided) if len(undecided.tiles) else ():
+                for divided in rates.divided(undecided) if len(undecided.tiles) else ():
                     waiting.setdefault(divided.kind, []).append(divided)
 
 
-def _taken(parts: list[_Part]) -> _Part:
-    """Remove about `TILES_AT_ONCE` tiles from the end of a list, and return them."""
+def _taken(parts: list[Part]) -> Part:
+    """Remove about `TILES_AT_ONCE` tiles from the end of a list of parts of one kind, and return them."""
     taken, count = [], 0
     while parts and count < TILES_AT_ONCE:
         taken.append(parts.pop())
         count += len(taken[-1].tiles)
     if len(taken) == 1:
         return taken[0]
-    values = np.concatenate([part.values for part in taken], axis=2)
-    return _Part(taken[0].kind, np.concatenate([part.tiles for part in taken]), values)
+    kinds, tiles, values = zip(*taken, strict=True)
+    return Part(kinds[0], np.concatenate(tiles), np.concatenate(values, axis=2))
 
 
-def _decided(rates: TileRates, part: _Part) -> tuple[Tiles, _Part]:
-    """Separate the tiles that need no division, with their rates, from all others."""
-    kind, tiles, values = part
-    heights = rates.heights(tiles)
-    # The depth ends division around extraordinary points. Elsewhere, rates decrease with every division.
-    is_flat = rates.are_flat(kind, tiles, values, heights) | (tiles["depth"] >= DEEPEST - 1)
-    flat, tiles, values = tiles[is_flat], tiles[~is_flat], values[..., ~is_flat]
-    if not len(tiles):
-        return flat, _Part(kind, tiles, values)
+@dataclass(frozen=True, eq=False)
+class TileRates:
+    """Division and rates of tiles for a criterion."""
+
+    scheme: Scheme
+    frames: PatchFrames  # Of the tiles' patches
+    criterion: Criterion
+    max_rate: int  # Most segments along an edge of the cage
+
+    @property
+    def basis(self) -> BernsteinBasis:
+        return regular_bernstein(self.scheme).basis
+
+    @property
+    def _corner_count(self) -> int:
+        return self.scheme.domain.corner_count
+
+    def most(self, tiles: Tiles) -> IntArray:
+        """``(t,)`` highest rates that tiles may have, which are powers of two, as on sides."""
+        rates: IntArray = np.maximum(1, (1 << self.max_rate.bit_length() - 1) >> tiles["halvings"])
+        return rates
+
+    def triangle_counts(self, tiles: Tiles) -> IntArray:
+        """``(t,)`` triangles of tiles with clipped rates, without those that higher rates of neighbours add."""
+        cells: IntArray = np.minimum(tiles["rates"], self.most(tiles)[:, None]).prod(axis=1, dtype=np.int64)
+        return cells * (self._corner_count - 2)
+
+    def decided(self, part: Part) -> tuple[Tiles, Part]:
+        """Separate the tiles that need no division, with their rates, from all others."""
+        kind, tiles, values = part
+        heights = self._heights(tiles)
+        # The depth ends division around extraordinary points. Elsewhere, rates decrease with every division.
+        is_flat = self.are_flat(kind, tiles, values, heights) | (tiles["depth"] >= DEEPEST - 1)
+        flat, tiles, values = tiles[is_flat], tiles[~is_flat], values[..., ~is_flat]
+        if not len(tiles):
+            return flat, Part(kind, tiles, values)
+        if kind.is_piece:
+            tiles["rates"] = self._rates(values, None if heights is None else heights[..., ~is_flat])
+            tiles["sides"] = self._along_sides(tiles, values)
+            along_sides = np.minimum(tiles["sides"].max(axis=1), self.most(tiles))
+            most = MOST_TRIANGLES if self.criterion.outline is None else MOST_TRIANGLES_AT_OUTLINE
+            is_done = np.maximum(self.triangle_counts(tiles), along_sides) <= most
+            done = self._without_pairs(tiles[is_done])
+        else:
+            is_done = (self.most(tiles) == 1) & (not kind.is_self_similar)
+            done = tiles[is_done]
+            # The tile needs more than one segment, but the number is unknown.
+            done["rates"] *= 2
+        return np.concatenate([flat, done]), Part(kind, tiles[~is_done], values[..., ~is_done])
+
+    def divided(self, part: Part) -> Iterator[Part]:
+        """Divide tiles. Iterates over their first children, their second children, and so on."""
+        kind, tiles, values = part
+        tiles["rates"], tiles["sides"] = 1, np.minimum(tiles["sides"], 1)
+        for number, (child_kind, rows) in enumerate(kind.children):
+            children = child(tiles, number, self.scheme.domain)
+            if child_kind is kind and kind.is_self_similar:
+                # Each ring around an extraordinary point may have as many segments as the next larger one.
+                children["halvings"] = tiles["halvings"]
+            yield Part(child_kind, children, times(rows, values))
+
+    def _without_pairs(self, tiles: Tiles) -> Tiles:
+        """Divide triangular tiles of two segments, whose only inner edges join the midpoints of the sides."""
+        is_pair = (np.minimum(tiles["rates"][:, 0], self.most(tiles)) == 2) & (self._corner_count == 3)
+        parts = [tiles[~is_pair], *(child(tiles[is_pair], number, self.scheme.domain) for number in range(4))]
+        for children in parts[1:]:
+            children["rates"] = -(-children["rates"] // 2)
+        return np.concatenate(parts)
+
+    def are_flat(
+        self, kind: DividedTile, tiles: Tiles, values: FloatArray, heights: FloatArray | None = None
+    ) -> NDArray[np.bool_]:
+        """``(t,)`` whether two triangles (or one) approximate each tile within the limit, also along feature edges."""
+        corners, ring = times(kind.corners, values), kind.one_ring_points(values)
+        lower, upper = ring.min(axis=0), ring.max(axis=0)
+        limit = self.criterion.limit(lower, upper)
+        height_range = np.zeros(len(tiles)) if heights is None else np.ptp(heights, axis=(0, 1))
+        if self.criterion.measure is Measure.EDGE:
+            extent = _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles)))
+            return np.hypot(extent, height_range) <= limit
+        # The displacement uses up a part of the limit.
+        limit = limit - height_range
+        # Tiles that fit into the limit as a whole: the only test for tiles that are folded or have no normal.
+        fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & self.scheme.has_convex_rules
+        axis, extent = axis_across(corners), np.full(len(tiles), np.inf)
+        tested = np.flatnonzero(~fits & axis.any(axis=0))
+        extent[tested] = _extent(kind, values.take(tested, axis=2), axis[None].take(tested, axis=2))
+        is_flat = fits | (extent <= limit)
+        # Tiles whose control faces are folded along the axis need a bound of their normals.
+        folded = np.flatnonzero(is_flat & ~fits)
+        folded = folded[_are_folded(kind, ring.take(folded, axis=2), axis.take(folded, axis=1))]
+        is_flat[folded] = _normals(kind, values.take(folded, axis=2), axis.take(folded, axis=1)).sine < 1
+        if self.criterion.outline is not None:
+            # Tiles on a border are left out, as it may be a silhouette for any normals.
+            inner = np.flatnonzero(~is_flat & ~tiles["sides"].any(axis=1) & np.isfinite(extent))
+            normals = _normals(kind, values.take(inner, axis=2), axis[:, inner])
+            coarse_limit = self.criterion.limit(lower[:, inner], upper[:, inner], normals)
+            is_flat[inner] = (normals.sine < 1) & (extent[inner] <= coarse_limit - height_range[inner])
+        for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
+            featured = np.flatnonzero(is_flat & ~fits & (tiles["sides"][:, side] > 0))
+            hull = kind.side_hulls[side] if len(featured) else None
+            if hull is None:
+                is_flat[featured] = False
+            else:
+                curve, across = times(hull, values[..., featured]), _normals_to(end[:, featured] - begin[:, featured])
+                width = np.hypot(*(np.ptp(dot(curve, direction), axis=0) for direction in across))
+                is_flat[featured] = width <= limit[featured]
+        return is_flat
+
+    def _rates(self, coefficients: FloatArray, heights: FloatArray | None) -> IntArray:
+        """``(t, 2)`` rates of pieces that the limit needs, which may exceed `most`, from bounds of their quarters."""
+        b, _, count = coefficients.shape
+        points, *derivatives = times(_of_quarters(self.basis).reshape(-1, b), coefficients).reshape(6, b, 4, 3, count)
+        # For the same limit, a quarter of half the size needs half as many segments: its form is a fourth.
+        forms = 4 * self.criterion.form(points, derivatives, self._corner_count).swapaxes(0, 1)
+        if heights is not None:
+            forms += self.criterion.form_of_displacement(coefficients, heights, self._corner_count)
+        if self._corner_count == 3:
+            return np.repeat(rounded_up(np.sqrt(forms[:, 0].max(axis=0)))[:, None], 2, axis=1)
+        return least_product(forms)
+
+    def _along_sides(self, tiles: Tiles, coefficients: FloatArray) -> IndexArray:
+        """``(t, m)`` segments on sides that keep curves along feature edges within the limit; 0 on other sides."""
+        sides = np.zeros_like(tiles["sides"])
+        _, _, uu, uv, vv = self.basis.two_derivatives
+        along = [uu, uu - 2 * uv + vv, vv] if self._corner_count == 3 else [uu, vv, uu, vv]
+        for side, (second, side_indices) in enumerate(zip(along, self.basis.sides, strict=True)):
+            featured = np.flatnonzero(tiles["sides"][:, side])
+            if len(featured):
+                points = coefficients[..., featured]
+                sides[featured, side] = self.criterion.segments(times(second[side_indices], points), points)
+        return sides
+
+    def _heights(self, tiles: Tiles) -> FloatArray | None:
+        """``(n, n, t)`` heights of the displacement over tiles, by v and by u; None without a displacement."""
+        displacement = self.criterion.displacement
+        if displacement is None:
+            return None
+        v, u = np.indices((HEIGHT_SAMPLES,) * 2).reshape(2, -1) / (HEIGHT_SAMPLES - 1)
+        if self._corner_count == 3:
+            # Samples outside the triangle are mirrored at the diagonal, as they lie in another element.
+            u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
+        tile = np.tile(np.arange(len(tiles)), len(u))
+        corner = tiles["corner"][tile].astype(np.int64)
+        uv = in_patch(tiles, tile, np.repeat([u, v], len(tiles), axis=1))
+        uv *= self.frames.scale[self.frames.topology.face[corner]]
+        return displacement.heights(corner, uv.T).reshape(HEIGHT_SAMPLES, HEIGHT_SAMPLES, -1)
+
+
+def _extent(kind: DividedTile, values: FloatArray, axes: FloatArray) -> FloatArray:
+    """``(t,)`` upper bounds of the size of the surface over tiles along axes ``(d, 3, t)``; infinite if unknown."""
+    if kind.hull is None:
+        return np.full(values.shape[2], np.inf)
+    extent: FloatArray = np.linalg.norm([np.ptp(times(kind.hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
+    return extent
+
+
+def _normals(kind: DividedTile, values: FloatArray, axis: FloatArray) -> Cone:
+    """Cones about axes ``(3, t)`` that contain all normals of tiles; of sine 1 where the angle is not below 90 degrees.
+
+    The pieces of the kind bound normals nearer to an extraordinary point as well, which vary less.
+    """
+    if kind.tangents is None or not len(axis.T):
+        return Cone(axis, np.ones(axis.shape[1]))
+    shape = kind.tangents.shape
+    derivatives = times(kind.tangents.reshape(-1, shape[3]), values).reshape(*shape[:3], *values.shape[1:])
+    (u, _), (v, _) = map(tangent_cone, derivatives)
+    return Cone(axis, cone_around(normal_cone(u, v), axis).sine.max(axis=0))
+
+
+def _are_folded(kind: DividedTile, ring: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
+    """``(t,)`` whether control faces of one-rings ``(n, 3, t)`` face opposite ways along the axes; true for pieces.
+
+    A folded surface has silhouettes along its folds, and not only along edges of the cage.
+    """
     if kind.is_piece:
-        tiles = rates.rated(tiles, values, None if heights is None else heights[..., ~is_flat])
-        along_sides = np.minimum(tiles["sides"].max(axis=1), rates.most(tiles))
-        most = MOST_TRIANGLES if rates.criterion.outline is None else MOST_TRIANGLES_AT_OUTLINE
-        is_done = np.maximum(rates.triangle_counts(tiles), along_sides) <= most
-        done = _without_pairs(rates, tiles[is_done])
-    else:
-        is_done = (rates.most(tiles) == 1) & (not kind.is_self_similar)
-        done = tiles[is_done]
-        # The tile needs more than one segment, but the number is unknown.
-        done["rates"] *= 2
-    return np.concatenate([flat, done]), _Part(kind, tiles[~is_done], values[..., ~is_done])
+        return np.ones(axis.shape[1], dtype=bool)
+    (a, c, b, d), (x, y) = kind.control_faces, (dot(ring, along) for along in _normals_to(axis))
+    areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
+    are_folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
+    return are_folded
 
 
-def _divided(rates: TileRates, part: _Part) -> Iterator[_Part]:
-    """Divide tiles. Iterates over their first children, their second children, and so on."""
-    kind, tiles, values = part
-    tiles["rates"], tiles["sides"] = 1, np.minimum(tiles["sides"], 1)
-    for number, (child_kind, rows) in enumerate(kind.children):
-        children = child(tiles, number, rates.domain)
-        if child_kind is kind and kind.is_self_similar:
-            # Each ring around an extraordinary point may have as many segments as the next larger one.
-            children["halvings"] = tiles["halvings"]
-        yield _Part(child_kind, children, times(rows, values))
+def axis_across(corners: FloatArray) -> FloatArray:
+    """``(3, t)`` unit normals of tiles with corners ``(m, 3, t)``; zero if undefined.
+
+    They are orthogonal to both diagonals of a quadrilateral, or to two sides of a triangle.
+    """
+    axis = cross(corners[2] - corners[0], corners[-1] - corners[1])
+    length = np.linalg.norm(axis, axis=0)
+    return axis / np.where(length > 0, length, 1)
 
 
-def _without_pairs(rates: TileRates, tiles: Tiles) -> Tiles:
-    """Divide triangular tiles of two segments, whose only inner edges join the midpoints of the sides."""
-    is_pair = (np.minimum(tiles["rates"][:, 0], rates.most(tiles)) == 2) & (rates.domain.corner_count == 3)
-    parts = [tiles[~is_pair], *(child(tiles[is_pair], number, rates.domain) for number in range(4))]
-    for children in parts[1:]:
-        children["rates"] = -(-children["rates"] // 2)
-    return np.concatenate(parts)
+def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two unit vectors ``(3, t)`` orthogonal to each vector and to each other; any two for a zero vector."""
+    length = np.linalg.norm(vectors, axis=0)
+    direction = np.where(length > 0, vectors / np.where(length > 0, length, 1), np.array([[0.0], [0], [1]]))
+    # The first is orthogonal to the axis along which the direction is smallest.
+    first = cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=0)].T)
+    first /= np.linalg.norm(first, axis=0)
+    return first, cross(direction, first)
+
+
+@lru_cache(maxsize=16)
+def _of_quarters(basis: BernsteinBasis) -> FloatArray:
+    """``(6, b, 4, b)`` maps from coefficients to those of the four quarters and of their five derivatives."""
+    maps = np.concatenate([np.eye(len(basis.indices))[None], basis.two_derivatives])
+    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, basis.halves))
 
 
 def feature_edges(
@@ -215,12 +399,12 @@ def feature_edges(
     if criterion.measure is Measure.EDGE:
         return np.zeros(t.half_edge_count, dtype=bool)
     # Squared length of the sum of the normals of the elements beside each edge.
-    squares = sum(np.square(np.bincount(names, x.take(t.face))) for x in _normals(patches, points))
+    squares = sum(np.square(np.bincount(names, x.take(t.face))) for x in _element_normals(patches, points))
     is_fold = (np.bincount(names) != 2) | (squares < 2 + 2 * FOLD_COSINE)
     return is_fold[names] | ((t.twin < 0) & (criterion.outline is not None))
 
 
-def _normals(patches: PatchTable, points: FloatArray) -> FloatArray:
+def _element_normals(patches: PatchTable, points: FloatArray) -> FloatArray:
     """``(3, n_e)`` approximate unit normals of elements, or zero."""
     t = patches.topology
     normals: FloatArray = np.empty((3, t.face_count))
@@ -240,10 +424,8 @@ def sides_on(edges: NDArray[np.bool_], frames: PatchFrames, corners: IntArray) -
     t, m = frames.topology, frames.domain.corner_count
     is_whole = frames.is_whole[t.face[corners]]
     is_on = np.zeros((len(corners), m), dtype=bool)
-    half_edge = corners
-    for side in range(m):
+    for side, half_edge in enumerate(half_edges_around(frames, corners)):
         is_on[:, side] = is_whole & edges[half_edge]
-        half_edge = t.next[half_edge]
     # The first and the last side of a patch at a corner of a polygon are halves of edges.
     is_on[:, 0] |= edges[corners]
     is_on[:, -1] |= ~is_whole & edges[t.prev[corners]]
