@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import drjit as dr
 
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
 SPANNING = 0.5
 
 
-class Heights(Protocol):
-    """Heights as a function of the values of a channel."""
+class Heights:
+    """Heights as a function of the values of a channel: these values themselves."""
 
-    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
+    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:  # noqa: ARG002
         """Heights and their derivatives by the parameters, from the channel's values and their derivatives."""
-        ...
+        return value, du, dv
 
     def height(self, value: Value) -> Float:
         """Heights without derivatives."""
-        ...
+        return value
 
     def variables(self) -> list:
         """Arrays that the heights are differentiable with respect to."""
-        ...
+        return []
 
 
 def displaced(

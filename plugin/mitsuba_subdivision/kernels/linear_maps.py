@@ -148,8 +148,11 @@ class WeightBlocks:
         # weights.
         block: np.ndarray,
         patch: np.ndarray,
+        # (l,) int: first packet that each lane writes
+        packet: np.ndarray | None = None,
     ) -> None:
         self._types, self._controls = types, controls
+        self._packet: IndexBuffer = None if packet is None else types.indices(packet)
         self.width, self.count = weights[0].shape[1], len(block)
         self._row_size = -(-self.width // PACKET) * PACKET
         rows = np.zeros((sum(len(part) * part.shape[2] for part in weights), self._row_size), types.numpy_float)
@@ -198,6 +201,20 @@ class WeightBlocks:
 
         start: tuple[Index] = (dr.zeros(types.index, self.count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
+
+    def write(self, padded: FloatBuffer, results: FloatBuffer) -> None:
+        """Compute all vectors from the padded control points, and scatter them as packets."""
+        numbers = [number for vector in self.vectors(padded)[0] for number in vector]
+        numbers += [self._types.float(0)] * (-len(numbers) % PACKET)
+        for i in range(0, len(numbers), PACKET):
+            packet = self._types.vector4(*numbers[i : i + PACKET])
+            dr.scatter(results, packet, self._packet + i // PACKET, mode=NO_CONFLICTS)
+
+    def write_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
+        """Scatter-add the gradients by all packets, times the weights, to the control points' packets."""
+        packet_count = piece_packets(self.width)
+        numbers = self._types.row(gradient, PACKET * packet_count, self._packet // packet_count)
+        self.add_transposed([self._types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self.width)], sums)
 
     def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index]:
         """A function that returns the k-th control point of each lane; their number; the first row of weights."""
@@ -278,14 +295,14 @@ class CoefficientMap:
             refined, padded = padded, dr.zeros(types.float, PACKET * self._point_count)
             index: Index = dr.arange(types.index, self._refined_count)
             dr.scatter(padded, dr.gather(types.vector4, refined, index), index, mode=NO_CONFLICTS)
-            self._write(self._parts, refined, padded)
+            self._parts.write(refined, padded)
         coefficients: FloatBuffer = dr.zeros(types.float, PACKET * self._packet_count)
         if self._rings is not None:
             control, first, packet = self._rings
             origin = dr.gather(types.vector4, padded, first, first != NOTHING)
             dr.scatter(coefficients, dr.gather(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
         if self._pieces is not None:
-            self._write(self._pieces, padded, coefficients)
+            self._pieces.write(padded, coefficients)
         return coefficients
 
     def _transposed(self, gradient: FloatBuffer) -> FloatBuffer:
@@ -298,31 +315,12 @@ class CoefficientMap:
             dr.scatter_add(sums, ring_gradient, control)
             dr.scatter_add(sums, -ring_gradient, first, first != NOTHING)
         if self._pieces is not None:
-            self._add_transposed(self._pieces, gradient, sums)
+            self._pieces.write_transposed(gradient, sums)
         if self._parts is not None:
             dr.eval(sums)
-            self._add_transposed(self._parts, type(sums)(sums), sums)
+            self._parts.write_transposed(type(sums)(sums), sums)
         points_gradient = types.unpadded(sums, self._refined_count)
         return points_gradient if self._refinement is None else self._refinement.transposed(points_gradient)
-
-    def _write(self, packet_blocks: PacketBlocks, padded: FloatBuffer, coefficients: FloatBuffer) -> None:
-        """Compute all vectors from the padded control points, and scatter them as packets."""
-        blocks, first = packet_blocks
-        numbers = [number for vector in blocks.vectors(padded)[0] for number in vector]
-        numbers += [self._types.float(0)] * (-len(numbers) % PACKET)
-        for i in range(0, len(numbers), PACKET):
-            packet = self._types.vector4(*numbers[i : i + PACKET])
-            dr.scatter(coefficients, packet, first + i // PACKET, mode=NO_CONFLICTS)
-
-    def _add_transposed(self, packet_blocks: PacketBlocks, gradient: FloatBuffer, sums: FloatBuffer) -> None:
-        """Scatter-add the gradients by all vectors, times the weights, to the control points' packets."""
-        blocks, first = packet_blocks
-        packet_count = piece_packets(blocks.width)
-        numbers = self._types.row(gradient, PACKET * packet_count, first // packet_count)
-        blocks.add_transposed([self._types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(blocks.width)], sums)
-
-
-PacketBlocks = tuple[WeightBlocks, IndexBuffer]
 
 
 def _packet_blocks(
@@ -331,8 +329,8 @@ def _packet_blocks(
     # packet of the results, its distance from one block to the next, and from one patch to the next
     added: list[tuple[np.ndarray, int, int, int, int, int, int]],
     controls: IndexBuffer,
-) -> PacketBlocks | None:
-    """Upload blocks of weights for all patches of classes, and the first packet that each lane writes."""
+) -> WeightBlocks | None:
+    """Blocks of weights for all patches of classes; None if there are none."""
     weights, table, row_count = {}, [], 0
     for block_weights, first, count, control_count, *packets in added:
         if id(block_weights) not in weights:
@@ -348,8 +346,8 @@ def _packet_blocks(
     # Successive controls of a patch are as far apart as the class has patches.
     columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
     block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
-    blocks = WeightBlocks(types, [part for part, _ in weights.values()], columns, controls, block, patch)
-    return blocks, types.indices((packet + index * block_step)[block] + patch * patch_step[block])
+    packets = (packet + index * block_step)[block] + patch * patch_step[block]
+    return WeightBlocks(types, [part for part, _ in weights.values()], columns, controls, block, patch, packets)
 
 
 class ControlValues:

@@ -32,7 +32,7 @@ from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import DisplacementBound
 from ..variants import Variant
 from .device_state import is_recording
-from .heights import AttributeHeights, HeightRange, SurfaceHeights, TextureHeights
+from .heights import AttributeHeights, HeightRange, TextureHeights
 
 if TYPE_CHECKING:
     from ..patches import Channel
@@ -59,7 +59,7 @@ class ShapeDisplacement:
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
         # ``self.attribute`` is the name of the channel that the heights depend on: an attribute, or "texcoords".
-        self.heights: SurfaceHeights
+        self.heights: AttributeHeights | TextureHeights
         if isinstance(given, str):
             self.attribute = _attribute_named(given, surface)
             self._loaded = surface.channel(self.attribute)

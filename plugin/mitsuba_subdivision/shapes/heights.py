@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -44,15 +44,7 @@ class HeightRange:
     high: float
 
 
-class SurfaceHeights(Heights, Protocol):
-    """Heights with a known range."""
-
-    def range(self) -> HeightRange:
-        """Interval that contains all heights; for textures that are no bitmaps, only those of samples."""
-        ...
-
-
-class AttributeHeights:
+class AttributeHeights(Heights):
     """Heights equal to a channel's values."""
 
     def __init__(
@@ -61,24 +53,12 @@ class AttributeHeights:
     ) -> None:
         self._values = channel.values
 
-    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:  # noqa: ARG002
-        """See `Heights`."""
-        return value, du, dv
-
-    def height(self, value: Value) -> Float:
-        """Heights without derivatives."""
-        return value
-
-    def variables(self) -> list:
-        """Differentiable arrays: none."""
-        return []
-
     def range(self) -> HeightRange:
         """Interval of the control values, which contains all heights because weights are not negative."""
         return HeightRange(float(self._values.min()), float(self._values.max()))
 
 
-class TextureHeights:
+class TextureHeights(Heights):
     """Heights of a texture, with derivatives by the chain rule.
 
     The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
