@@ -10,6 +10,7 @@ import sys
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision import example_file
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.messages import print_error
@@ -65,17 +66,29 @@ def test_warnings_name_no_place_in_the_code(folder, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["info", "cube.obj", "--rate", "fine"], '"fine"; expected an integer'),
-        (["info", "cube.obj", "--rate", "0"], "0; expected 1 or more"),
-        (["info", "cube.obj", "--rate", "100000000000"], "expected 1024 or less"),
-        (["figure", "domains", "--width", "8cm"], '"8cm"; expected a width from 84mm to 1200mm, or in inches'),
-        (["figure", "domains", "--width", "3.3in"], '"3.3in"; expected a width from 84mm'),
+        ("info cube.obj --rate fine", '"fine"; expected an integer'),
+        ("info cube.obj --rate 0", "0; expected 1 or more"),
+        ("info cube.obj --rate 100000000000", "expected 1024 or less"),
+        ("figure domains --width 8cm", '"8cm"; expected a width from 84mm to 1200mm, or in inches'),
+        ("figure domains --width 3.3in", '"3.3in"; expected a width from 84mm'),
+        ("render cube.obj -o a.png --size 0x4", '"0x4"; expected width and height of 1 or more'),
+        ("render cube.obj -o a.png --size 4", '"4"; expected width and height'),
+        ("render cube.obj -o a.png --view left", "invalid choice: 'left'"),
+        ("render cube.obj -o a.png --turntable 0", "0; expected 1 or more"),
+        ("render cube.obj -o a.png --frames 3:1", '"3:1"; expected FIRST:LAST or FIRST:LAST:STEP'),
+        ("render cube.obj -o a.png --fps 0", '"0"; expected a number above 0'),
+        ("render cube.obj -o a.png --azimuth nan", '"nan"; expected a number'),
+        ("render scene.xml -o a.exr --seed 4294967296", '"4294967296"; expected an integer from 0 to 4294967295'),
+        ("render scene.xml -o a.exr -s -1", '"-1"; expected an integer, 0 or more'),
+        ("render scene.xml -o a.exr --pass 3/2", '"3/2"; expected I/N with I from 1 to N'),
+        ("render scene.xml -o a.exr -D a", '"a"; expected NAME=VALUE'),
     ],
 )
 @pytest.mark.usefixtures("folder")
-def test_wrong_numbers_are_told(capsys, words, message):
-    with pytest.raises(SystemExit):
-        main(words)
+def test_wrong_values_are_told(capsys, words, message):
+    with pytest.raises(SystemExit) as stop:
+        main(words.split())
+    assert stop.value.code == 2
     assert message in capsys.readouterr().err
 
 
@@ -87,28 +100,56 @@ def test_saving_into_a_missing_folder_is_told_by_its_name(suffix):
 
 
 NEEDS_PASSES = "--batch is for passes; expected --pass, --passes, --dask or --reference beside it"
+NO_NOISE = "--denoise removes the noise that passes and references measure; expected no --pass"
+ROOK = example_file("rook.xml")
+REFUSED = [
+    ("render scene.xml -o a.exr --batch 4", NEEDS_PASSES),
+    ("render scene.xml -o a.exr --tolerance alpha=0.1", "--tolerance is stored with a reference; expected --reference"),
+    ("render scene.xml -o a.exr --filter foo", 'Plugin "foo" not found'),
+    ("render scene.xml -o a.tif", "expected a name ending in one of .exr, .png, .jpg, .hdr"),
+    ("render scene.xml -o a.png --passes 2", "ending in .exr"),
+    ("render scene.xml -o a.exr --passes 2 --pass 1/2", "expected one of them"),
+    ("render scene.xml -o a.exr --reference --filter tent", 'filter "box"'),
+    ("render scene.xml -o a.exr --passes 9 --spp 8 --batch 4", "2 batches, fewer than 9 passes"),
+    ("render scene.xml -o a.exr --dask nonsense://", "Dask"),
+    ("render scene.xml -o a.exr --denoise --reference", NO_NOISE),
+    ("render scene.xml -o a.exr --denoise --passes 2", NO_NOISE),
+    ("render scene.xml -o a.exr --denoise --filter gaussian", '--denoise needs the filter "box", not "gaussian"'),
+    (f"render {ROOK} -o a.png --cage", "--cage was given for the scene"),
+    (f"render {ROOK} -o a.png -s 2", "there is no sensor 2; the scene has one sensor, 0"),
+    ("render missing.xml -o new/picture.exr", 'scene "missing.xml" is not a file'),
+    ("render none.obj -o a.png", '"none.obj": there is no such file; expected a model'),
+    ("render f_%04d.obj -o a.png", "or --frames for a name of several files"),
+    ("render text.obj -o a.png", '"text.obj": there are no faces'),
+    ("render cube.stl -o a.png", "expected a Mitsuba scene (.xml) or a model (.obj"),
+    ("render cube.obj -o a.tga", "expected a name ending in one of .exr"),
+    ("render cube.obj -o a.gif", "--turntable or --frames for a video"),
+    ("render cube.obj -o a.png --elevation 100", "expected -90 to 90 degrees"),
+    ("render cube.obj -o a.png --frames 1:2", "expected a name such as frame_%04d.obj"),
+    ("render f_%04d.obj -o a.png --frames 1:2", '"f_0001.obj": there is no such file (2 such files)'),
+    ("render cube.obj -o a.png --prim /a", "expected it for USD files only"),
+    ("render cube.obj -o a.png --checker", "has no texture coordinates"),
+    ("render cube.obj -o a.png --texture-size 8", "expected it for a whole USD file"),
+    ("render cube.obj -o a.png -D a=1", "-D was given for the model"),
+    ("render cube.obj -o a.png -s 0", "--sensor was given for the model"),
+    ("render cube.obj -o a.png --fps 5", "--fps is for videos"),
+    ("render cube.obj -o a.png --turntable 2 --frames 1:2", "expected only one of them"),
+    ("render cube.obj -o a.png --save-scene a.txt", "expected a name ending in .xml"),
+    ("figure domains --format exr", 'the figure "domains" is not drawn as exr; expected png or pdf'),
+    ("figure creases --scheme loop", 'on the figure "creases"; expected one of "domains", "artifact"'),
+    ("figure hero --cage cube.obj", '"hero"; expected one of "subdivision", "artifact", "error"'),
+    ("figure domains --spp 2", '--spp has no effect on the figure "domains"'),
+    ("tessellate cube.obj -o ./cube.obj", 'output "cube.obj" is an input as well'),
+    ("tessellate cube.obj -o cube.obj/a.ply", '"cube.obj" is a file; expected a folder'),
+    ("figure domains -o cube.obj", '"cube.obj" is a file; expected a folder'),
+]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([*RENDER, "--batch", "4"], NEEDS_PASSES),
-        ([*RENDER, "--tolerance", "alpha=0.1"], "--tolerance is stored with a reference; expected --reference"),
-        ([*RENDER, "--filter", "foo"], 'Plugin "foo" not found'),
-        (["render", "scene.xml", "-o", "picture.tif"], "expected a name ending in one of .exr, .png, .jpg, .hdr"),
-        (["render", "missing.xml", "-o", "new/picture.exr"], 'scene "missing.xml" is not a file'),
-        (["figure", "domains", "--format", "exr"], 'the figure "domains" is not drawn as exr; expected png or pdf'),
-        (["figure", "creases", "--scheme", "loop"], 'on the figure "creases"; expected one of "domains", "artifact"'),
-        (["figure", "hero", "--cage", "cube.obj"], '"hero"; expected one of "subdivision", "artifact", "error"'),
-        (["figure", "domains", "--spp", "2"], '--spp has no effect on the figure "domains"'),
-        (["tessellate", "cube.obj", "-o", "./cube.obj"], 'output "cube.obj" is an input as well'),
-        (["tessellate", "cube.obj", "-o", "cube.obj/a.ply"], '"cube.obj" is a file; expected a folder'),
-        (["figure", "domains", "-o", "cube.obj"], '"cube.obj" is a file; expected a folder'),
-    ],
-)
-def test_what_does_nothing_or_harm_is_refused(folder, capsys, words, message):
+@pytest.mark.parametrize(("words", "message"), REFUSED)
+def test_what_does_nothing_or_harm_is_refused_before_anything_is_written(folder, capsys, words, message):
+    (folder / "text.obj").write_text("v 1 2\n")
     before = sorted(folder.iterdir())
-    assert main([*words, *(["--variant", "scalar_rgb"] if words[0] == "render" else [])]) == 1
+    assert main([*words.split(), *(["--variant", "scalar_rgb"] if words.startswith("render") else [])]) == 1
     told = capsys.readouterr().err
     assert message in told
     assert "Traceback" not in told

@@ -121,23 +121,6 @@ def test_passes_and_merge_give_what_one_command_gives(tmp_path):
     assert (tmp_path / "merged.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["-o", "a.png", "--passes", "2"], "ending in .exr"),
-        (["-o", "a.exr", "--passes", "2", "--pass", "1/2"], "expected one of them"),
-        (["-o", "a.exr", "--reference", "--filter", "tent"], 'filter "box"'),
-        (["-o", "a.exr", "--passes", "9", "--spp", "8", "--batch", "4"], "2 batches, fewer than 9 passes"),
-        (["-o", "a.exr", "--dask", "nonsense://"], "Dask"),
-    ],
-)
-def test_contradicting_options_are_said(words, message, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(["render", SCENE, *SMALL, *words]) == 1
-    assert message in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture(scope="module")
 def passes(tmp_path_factory):
     """Passes 1 to 3 of 3, and ones that do not belong to them."""

@@ -1,7 +1,6 @@
 """Pictures denoised by Open Image Denoise."""
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,21 +42,6 @@ def test_denoised_pictures_are_no_references(capsys):
     assert load_image("a.exr").metadata["denoised"]
     assert main(["compare", "a.exr", "a.exr"]) == 3
     assert '"a.exr" is denoised, which removes what is compared; expected one as rendered' in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("model")
-@pytest.mark.parametrize(
-    ("words", "problem"),
-    [
-        (["--reference"], "--denoise removes the noise that passes and references measure; expected no --pass"),
-        (["--passes", "2"], "--denoise removes the noise that passes and references measure; expected no --pass"),
-        (["--filter", "gaussian"], '--denoise needs the filter "box", not "gaussian"'),
-    ],
-)
-def test_denoising_is_refused_where_noise_is_measured(capsys, words, problem):
-    Path("a.xml").write_text('<scene version="3.0.0"/>')
-    assert main(["render", "a.xml", "-o", "a.exr", "--denoise", *words]) == 1
-    assert problem in capsys.readouterr().err
 
 
 def test_a_missing_denoiser_names_the_extra(model, capsys, monkeypatch):

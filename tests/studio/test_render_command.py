@@ -192,39 +192,6 @@ def test_times_of_a_usd_file_are_frames(folder):
     assert render("m.usda", "-o", "m.png", "--prim", "/none", *SMALL) == 1
 
 
-MODEL = ["cube.obj", "-o", "a.png"]
-ERRORS = [
-    (["none.obj", "-o", "a.png"], '"none.obj": there is no such file; expected a model'),
-    (["f_%04d.obj", "-o", "a.png"], "or --frames for a name of several files"),
-    (["text.obj", "-o", "a.png"], '"text.obj": there are no faces'),
-    (["cube.stl", "-o", "a.png"], "expected a Mitsuba scene (.xml) or a model (.obj"),
-    (["cube.obj", "-o", "a.tga"], "expected a name ending in one of .exr"),
-    (["cube.obj", "-o", "a.gif"], "--turntable or --frames for a video"),
-    ([*MODEL, "--elevation", "100"], "expected -90 to 90 degrees"),
-    ([*MODEL, "--frames", "1:2"], "expected a name such as frame_%04d.obj"),
-    (["f_%04d.obj", "-o", "a.png", "--frames", "1:2"], '"f_0001.obj": there is no such file (2 such files)'),
-    ([*MODEL, "--prim", "/a"], "expected it for USD files only"),
-    ([*MODEL, "--checker"], "has no texture coordinates"),
-    ([*MODEL, "--texture-size", "8"], "expected it for a whole USD file"),
-    ([*MODEL, "-D", "a=1"], "-D was given for the model"),
-    ([*MODEL, "-s", "0"], "--sensor was given for the model"),
-    ([*MODEL, "--fps", "5"], "--fps is for videos"),
-    ([*MODEL, "--turntable", "2", "--frames", "1:2"], "expected only one of them"),
-    ([*MODEL, "--save-scene", "a.txt"], "expected a name ending in .xml"),
-    ([str(SCENES / "rook.xml"), "-o", "a.png", "--cage"], "--cage was given for the scene"),
-    ([str(SCENES / "rook.xml"), "-o", "a.png", "-s", "2"], "there is no sensor 2; the scene has one sensor, 0"),
-]
-
-
-@pytest.mark.parametrize(("words", "message"), ERRORS)
-def test_errors_come_before_anything_is_written(folder, capsys, words, message):
-    (folder / "text.obj").write_text("v 1 2\n")
-    before = {path.name for path in folder.iterdir()}
-    assert render(*words, "-m", "scalar_rgb") == 1
-    assert message in capsys.readouterr().err
-    assert {path.name for path in folder.iterdir()} == before
-
-
 EXACT = ["--size", "20x15", "--rate", "2", "--shading", "exact"]
 
 
@@ -251,12 +218,3 @@ def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
     assert render(*words, "--spp", "4", "-m", "llvm_ad_rgb") == 1
     assert capsys.readouterr().err.endswith("error: no surface\n")
     assert {path.name for path in folder.iterdir()} == {"cube.obj", "scene.xml"}
-
-
-@pytest.mark.parametrize(
-    "words", ["--size 0x4", "--size 4", "--view left", "--turntable 0", "--frames 3:1", "--rate 0"]
-)
-def test_words_that_are_no_values_are_refused(words, capsys):
-    with pytest.raises(SystemExit):
-        render(*MODEL, *words.split())
-    assert "expected" in capsys.readouterr().err or words == "--view left"
