@@ -6,6 +6,7 @@ Importing this package registers the shape ``subdivision`` in every variant, bef
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .deferred import deferred
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from .device_arrays import upload
     from .evaluation.element import limit_stencil
     from .evaluation.scheme_laws import check_scheme
-    from .examples import example_file
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
     from .schemes import SchemeError
@@ -84,7 +84,6 @@ _MODULES = {
     "Tessellation": "tessellation",
     "VertexMatrices": "tessellation",
     "check_scheme": "evaluation.scheme_laws",
-    "example_file": "examples",
     "limit_stencil": "evaluation.element",
     "loss_of_views": "shapes.moving_vertices",
     "pixel_error_for": "shapes.tessellation_parameters",
@@ -93,6 +92,33 @@ _MODULES = {
     "studio_scene": "studio",
     "upload": "device_arrays",
 }
+
+
+def example_file(name: str) -> str:
+    """Path of a file in the folder ``scenes``, in the installed package or in the source tree.
+
+    Parameters
+    ----------
+    name : str
+        Path in that folder, such as "cages/rook.obj", "rook.xml" or "export_cage.py".
+
+    Returns
+    -------
+    str
+        As the shape's parameter ``filename`` takes it.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    """
+    package = Path(__file__).resolve().parent
+    candidates = [package / "scenes", package.parents[1] / "scenes"]
+    for folder in candidates:
+        if (folder / name).is_file():
+            return str(folder / name)
+    folders = " nor in ".join(f'"{folder}"' for folder in candidates)
+    raise FileNotFoundError(f'there is no example "{name}", neither in {folders}')
 
 
 _deferred = deferred(__name__, _MODULES)

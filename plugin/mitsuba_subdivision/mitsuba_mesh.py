@@ -1,15 +1,22 @@
-"""Triangles in memory as a mesh of Mitsuba."""
+"""Triangles in memory: as a mesh of Mitsuba, as an entry of a scene that can be loaded, and as a PLY file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from .device_arrays import upload
+from .files.ply import write_polygons
+from .mesh.connectivity import IntArray
+from .variants import SceneNode
 
+_COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
 # Buffers that a mesh has without adding them as attributes.
 OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords")
 
@@ -55,3 +62,68 @@ def mitsuba_mesh(
     if averages_normals:
         mesh.recompute_vertex_normals()
     return mesh
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonMesh:
+    """Triangles in the world, with their own normals or flat."""
+
+    name: str
+    triangles: IntArray  # (n_t, 3)
+    # (n_v, k) each: buffers of Mitsuba's mesh by name: `vertex_positions`, and if it has them `vertex_normals`,
+    # `vertex_texcoords` and attributes
+    vertices: dict[str, NDArray]
+
+    def entry(self, bsdf: SceneNode, emitter: SceneNode | None) -> SceneNode:
+        """The mesh as an entry of a scene, for `with_meshes` and `save_scene`."""
+        # Otherwise Mitsuba would make normals.
+        facets = {} if "vertex_normals" in self.vertices else {"face_normals": True}
+        shining = {} if emitter is None else {"emitter": emitter}
+        return {"type": "ply", "mesh": self, **facets, "bsdf": bsdf, **shining}
+
+    def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None, interior: mi.Medium | None = None) -> mi.Mesh:
+        """The mesh as an object of Mitsuba."""
+        return mitsuba_mesh(self.name, self.triangles, self.vertices, bsdf=bsdf, emitter=emitter, interior=interior)
+
+    def save(self, path: Path) -> None:
+        """Write the mesh to a PLY file, so that Mitsuba's shape ``ply`` has the same buffers."""
+        columns: dict[str, NDArray] = {}
+        for name, values in self.vertices.items():
+            stem = name.removeprefix("vertex_")
+            columns.update(zip(_COLUMNS.get(name, [f"{stem}_{letter}" for letter in "xyz"]), values.T, strict=False))
+        properties = {name: values.astype(np.float32) for name, values in columns.items()}
+        write_polygons(path, properties, np.full(len(self.triangles), 3), self.triangles.ravel())
+
+
+def with_meshes(scene: SceneNode) -> SceneNode:
+    """A scene for ``mi.load_dict``, of which polygon meshes are loaded; those of one material share its BSDF."""
+    bsdfs: dict[str, mi.Object] = {}
+    used = set()
+
+    def loaded(entry: Any) -> Any:
+        if not isinstance(entry, dict):
+            return entry
+        given = entry.get("bsdf", {})
+        shared = given["id"] if isinstance(given, dict) and given.get("type") == "ref" else None
+        if "mesh" not in entry:
+            used.add(shared)
+            return {name: loaded(each) if entry["type"] == "shapegroup" else each for name, each in entry.items()}
+        if shared is None:
+            bsdf = mi.load_dict(given)
+        else:
+            bsdf = bsdfs[shared] = bsdfs.get(shared) or mi.load_dict(scene[shared])
+        parts = (mi.load_dict(entry[name]) if name in entry else None for name in ("emitter", "interior"))
+        return entry["mesh"].loaded(bsdf, *parts)
+
+    found = {name: loaded(entry) for name, entry in scene.items()}
+    return {name: entry for name, entry in found.items() if name not in bsdfs or name in used}
+
+
+def points_at(points: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points ``(n, 3)`` transformed by a matrix ``(4, 4)``."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def box_corners(box: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The eight corners ``(8, 3)`` of a box, given by its least and greatest coordinates ``(2, 3)``."""
+    return np.array(np.meshgrid(*box.T)).reshape(3, -1).T

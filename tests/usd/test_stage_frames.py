@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
+from mitsuba_subdivision.mitsuba_mesh import with_meshes
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
-from mitsuba_subdivision.studio.polygon_mesh import with_meshes
 from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_usd import shapes, stage_scenes

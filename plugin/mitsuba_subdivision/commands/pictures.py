@@ -24,8 +24,7 @@ from ..regression.scene import BOX, LoadedScene, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..studio.animation import FrameRange, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
-from ..studio.denoising import denoised
-from ..studio.picture import shading_for
+from ..studio.picture import denoised, shading_for
 from ..studio.saving import save_scene
 from ..studio.studio_entries import DEFAULT_VIEW, VIEWS, Look, sampler, variant_in_use
 from ..whole_file import require_writable

@@ -20,7 +20,7 @@ from ..progress import counted
 from ..regression.image import METADATA_ATTRIBUTE
 from ..regression.scene import BOX, kept_search_folders, load_scene
 from ..shapes.parameter_table import SHADINGS
-from ..studio.denoising import require_denoiser
+from ..studio.picture import require_denoiser
 from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS
 from ..variants import set_variant
 from ..whole_file import require_writable, whole_file

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
+from .. import example_file
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..examples import example_file
 from ..regression.tier_tests import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from .. import example_file
 from ..cage import ControlCage
-from ..examples import example_file
 from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, rows_of, write_figure
 from .own_cage import fitted, read

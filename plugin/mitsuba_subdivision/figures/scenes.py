@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import example_file
 from ..device_arrays import upload
-from ..examples import example_file
 from ..mitsuba_mesh import mitsuba_mesh
 from ..shapes.tessellation_parameters import pixel_error_for
 from ..tessellation import HIGHEST_RATE

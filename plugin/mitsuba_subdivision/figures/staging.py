@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
+from .. import example_file
 from ..cage import ControlCage
 from ..device_arrays import upload
-from ..examples import example_file
 from ..mitsuba_mesh import mitsuba_mesh
 from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded

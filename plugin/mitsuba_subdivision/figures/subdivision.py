@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from numpy.typing import NDArray
 
+from .. import example_file
 from ..cage import ControlCage
 from ..evaluation.patch_tree import lattice_stencils
-from ..examples import example_file
 from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure

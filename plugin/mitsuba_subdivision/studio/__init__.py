@@ -1,9 +1,9 @@
 """A neutral studio around a model: camera, lights and backdrop, turntables, frames, and scenes saved as XML."""
 
+from ..mitsuba_mesh import PolygonMesh, box_corners, points_at, with_meshes
 from ..regression.scene import LoadedScene
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .cage_scenes import studio_scene
-from .denoising import render_denoised
 from .model import frame_table
 from .picture import (
     MOST_SEGMENTS,
@@ -11,11 +11,11 @@ from .picture import (
     highest_rate,
     outline_for,
     pixels_of_boxes,
+    render_denoised,
     segments_for,
     shading_for,
     triangles_for,
 )
-from .polygon_mesh import PolygonMesh, box_corners, points_at, with_meshes
 from .studio_entries import (
     DEFAULT_SIZE,
     DEFAULT_SPP,

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, CageWarning
 from ..device_arrays import upload
+from ..mitsuba_mesh import points_at, with_meshes
 from ..regression.scene import LoadedScene, load_scene
 from ..variants import SceneNode
-from .polygon_mesh import points_at, with_meshes
 from .studio_entries import RIG, outermost, studio_axes, turned
 
 PATTERN = re.compile(r"%(0\d+)?d")

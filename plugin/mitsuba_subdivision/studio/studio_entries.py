@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..cage import ControlCage
 from ..cage.errors import CageSource, in_digits, warn
+from ..mitsuba_mesh import box_corners
 from ..variants import SceneNode
-from .polygon_mesh import box_corners
 
 # Azimuth and elevation in degrees. Azimuth 0 is the model's front, 90 its own left, which is +x.
 VIEWS = {
