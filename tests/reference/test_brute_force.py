@@ -1,13 +1,13 @@
 """Laws of the brute-force reference itself."""
 
 import json
-import math
 from decimal import Decimal
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mitsuba_subdivision.cage.named_cages import torus
+from patches.closed_cages import bipyramid, bumpy, polygons, prism, trapezohedron, triangulated
 
 from reference.brute_force import BruteForce, ring
 from reference.decimals import precision
@@ -25,62 +25,23 @@ def high_precision():
         yield
 
 
-def bumpy(points):
-    """Positions without symmetry, exact in float64."""
-    return (np.array(points) + np.random.default_rng(1).uniform(-0.15, 0.15, np.shape(points))).tolist()
-
-
 def decimals(points):
     return {i: tuple(map(Decimal, p)) for i, p in enumerate(points)}
 
 
-def circle(n, radius, height, shift=0.0):
-    return [(radius * math.cos(a), radius * math.sin(a), height) for a in 2 * math.pi * (np.arange(n) + shift) / n]
-
-
-def double_pole(n):
-    """Quads only: two poles of valence n, vertices of valence 3 between, of which edges join extraordinary ones."""
-    points = [(0, 0, 1), *circle(n, 1, 0.4), *circle(n, 1, -0.4, 0.5), (0, 0, -1)]
-    top, low = range(1, n + 1), range(n + 1, 2 * n + 1)
-    faces = [(0, low_0, low_1, low_2) for low_0, low_1, low_2 in ((top[i], low[i], top[i - n + 1]) for i in range(n))]
-    faces += [(2 * n + 1, low[i], top[i], low[i - 1]) for i in range(n)]
-    return bumpy(points), faces
-
-
-def prism(n):
-    """Two n-gons, n quads between two rings, n quads and 2 n triangles (a mixed cage with valences 3 to 5)."""
-    points = [*circle(n, 0.8, 1), *circle(n, 1.2, 0.2), *circle(n, 0.9, -0.9)]
-    a, b, c = range(n), range(n, 2 * n), range(2 * n, 3 * n)
-    faces = [tuple(a), tuple(reversed(c))]
-    for i, j in pairwise([*range(n), 0]):
-        faces += [(b[i], b[j], a[j], a[i]), (c[i], c[j], b[j]), (c[i], b[j], b[i])]
-    return bumpy(points), faces
-
-
-def bipyramid(n):
-    """Triangles; two poles of valence n, n vertices of valence 4."""
-    points = [(0, 0, 1), *circle(n, 1, 0), (0, 0, -1)]
-    faces = [face for i in range(n) for face in ((0, 1 + i, 1 + (i + 1) % n), (n + 1, 1 + (i + 1) % n, 1 + i))]
-    return bumpy(points), faces
-
-
-def torus(m, n, triangles=False):
-    """Grid that closes in both directions; vertex (i, j) is i n + j."""
-    a, b = (2 * np.pi * turn.ravel() / size for turn, size in zip(np.mgrid[:m, :n], (m, n), strict=True))
-    points = np.stack([(2 + np.cos(b)) * np.cos(a), (2 + np.cos(b)) * np.sin(a), np.sin(b)], axis=1)
-    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
-    quads = [tuple((i + di) % m * n + (j + dj) % n for di, dj in corners) for i in range(m) for j in range(n)]
-    return bumpy(points), [t for a, b, c, d in quads for t in ((a, b, d), (b, c, d))] if triangles else quads
+def without_symmetry(cage):
+    """Positions and faces of a cage, moved at random."""
+    return bumpy(cage, size=0.15).positions.tolist(), polygons(cage.topology)
 
 
 CAGES = [
-    ("catmull_clark", *double_pole(3)),
-    ("catmull_clark", *double_pole(7)),
-    ("catmull_clark", *prism(5)),
-    ("loop", *bipyramid(3)),
-    ("loop", *bipyramid(8)),
-    ("doo_sabin", *double_pole(3)),
-    ("doo_sabin", *prism(5)),
+    ("catmull_clark", *without_symmetry(trapezohedron(3))),
+    ("catmull_clark", *without_symmetry(trapezohedron(7))),
+    ("catmull_clark", *without_symmetry(prism())),
+    ("loop", *without_symmetry(bipyramid(3))),
+    ("loop", *without_symmetry(bipyramid(8))),
+    ("doo_sabin", *without_symmetry(trapezohedron(3))),
+    ("doo_sabin", *without_symmetry(prism())),
 ]
 IDS = [f"{scheme}-{len(points)}" for scheme, points, _ in CAGES]
 
@@ -114,7 +75,7 @@ BIQUADRATIC = np.array([[1, 1, 0], [-2, 2, 0], [1, -2, 1]]) / 2
     ("scheme", "basis", "i", "j"), [("catmull_clark", BICUBIC, 2, 4), ("doo_sabin", BIQUADRATIC, 2, 3)]
 )
 def test_regular_patches_are_b_splines(scheme, basis, i, j):
-    points, faces = torus(5, 6)
+    points, faces = without_symmetry(torus(5, 6))
     u, v, k = 0.3, 0.8, np.arange(len(basis))
     bu, bv, dv = u**k @ basis, v**k @ basis, k * v ** (k - 1.0) @ basis
     grid = np.array(points).reshape(5, 6, 3)[np.ix_((i - 1 + k) % 5, (j - 1 + k) % 6)]
@@ -136,7 +97,9 @@ def test_box_spline_has_the_known_values_and_symmetry():
     assert abs(12 * box_weights(v, w)(-1, 0)[0] - (u**4 + 2 * u**3 * w)) < EXACT
 
 
-@pytest.mark.parametrize("cage", [*CAGES, ("loop", *torus(3, 4, triangles=True))], ids=[*IDS, "loop-regular"])
+@pytest.mark.parametrize(
+    "cage", [*CAGES, ("loop", *without_symmetry(triangulated(torus(4, 4))))], ids=[*IDS, "loop-regular"]
+)
 def test_one_more_level_changes_nothing(cage):
     evaluator = BruteForce(*cage)
     for sample in some_samples(*cage, 6):
@@ -178,12 +141,12 @@ def test_rules_have_the_stated_weights():
 
 # Scheme, cage, extraordinary point, and an element with its corner that has (0, 0) there.
 LIMITS = [
-    ("catmull_clark", double_pole(3), {"vertex": 0}, 0, 0),
-    ("catmull_clark", double_pole(5), {"vertex": 1}, 0, 1),
-    ("loop", bipyramid(3), {"vertex": 0}, 0, 0),
-    ("loop", bipyramid(5), {"vertex": 1}, 0, 1),
-    ("doo_sabin", prism(3), {"face": 0}, 0, 0),
-    ("doo_sabin", prism(5), {"face": 0}, 2, 0),
+    ("catmull_clark", without_symmetry(trapezohedron(3)), {"vertex": 0}, 0, 0),
+    ("catmull_clark", without_symmetry(trapezohedron(5)), {"vertex": 1}, 0, 1),
+    ("loop", without_symmetry(bipyramid(3)), {"vertex": 0}, 0, 0),
+    ("loop", without_symmetry(bipyramid(5)), {"vertex": 1}, 0, 1),
+    ("doo_sabin", without_symmetry(prism(3)), {"face": 0}, 0, 0),
+    ("doo_sabin", without_symmetry(prism(5)), {"face": 0}, 2, 0),
 ]
 
 
@@ -210,12 +173,12 @@ def test_digits_are_enough(scheme, cage, element, corner):
 
 
 def test_refuses_what_it_cannot_evaluate():
-    points, faces = double_pole(5)
+    points, faces = without_symmetry(trapezohedron(5))
     for scheme, cage, uv, message in (
         ("catmull_clark", (points, faces), (0, 0), "extraordinary"),
         ("catmull_clark", (points, faces), (1.5, 0), "outside the domain"),
         ("catmull_clark", (points, faces[1:]), (0.5, 0.5), "boundary"),
-        ("loop", bipyramid(3), (0.75, 0.5), "outside the domain"),
+        ("loop", without_symmetry(bipyramid(3)), (0.75, 0.5), "outside the domain"),
     ):
         with pytest.raises(ValueError, match=message):
             BruteForce(scheme, *cage).evaluate(0, 0, *uv)
