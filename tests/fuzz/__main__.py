@@ -14,7 +14,7 @@ from pathlib import Path
 
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
-from fuzz.campaign import Findings, run  # noqa: E402 - from the folder of tests
+from fuzz.campaign import run  # noqa: E402 - from the folder of tests
 
 
 def main(arguments=None):
@@ -27,18 +27,18 @@ def main(arguments=None):
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--output", type=Path, default=Path(tempfile.gettempdir()) / "mitsuba-subdivision-findings")
     options = parser.parse_args(arguments)
-    found = False
+    total = 0
     for reader in options.reader:
-        findings, start = Findings(options.output), time.monotonic()
-        done = run(reader, options.first, options.count, options.seed, options.processes, findings)
-        total = sum(findings.counts.values())
-        print(f"{reader}: {done} files, {total} findings, {time.monotonic() - start:.0f} s", flush=True)
-        for problem, count in sorted(findings.counts.items(), key=lambda item: -item[1]):
+        start = time.monotonic()
+        problems = run(reader, options.first, options.count, options.seed, options.processes, options.output)
+        seconds = time.monotonic() - start
+        print(f"{reader}: {options.count} files, {problems.total()} findings, {seconds:.0f} s", flush=True)
+        for problem, count in problems.most_common():
             print(f"  {count:7d}  {problem!r}")
-        found |= bool(total)
-    if found:
+        total += problems.total()
+    if total:
         print(f"findings are in {options.output}")
-    return int(found)
+    return int(total > 0)
 
 
 if __name__ == "__main__":

@@ -1,44 +1,83 @@
-"""Many damaged files, read by processes that a hang or a crash may take down."""
+"""Damaged files, each read as any user's file is, by processes that a hang or a crash may take down.
+
+The law: every file is a cage or a `CageError`, told in few words, and nothing stays behind.
+"""
 
 import multiprocessing
 import os
 import re
 import tempfile
 import time
+import traceback
+import warnings
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import TimeoutError as TookTooLong
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from random import Random
 
-from fuzz.law import broken_law, damaged_file
+from fuzz.mutations import mutated
+from fuzz.seed_files import WORDS, seed_files
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 from pebble import ProcessExpired, ProcessPool
 from tqdm import tqdm
 
+OPTIONS = {"obj": {}, "ply": {}, "usd": {"prim": "*"}}
+# What a message may be long, besides the path.
+LONGEST_MESSAGE = 500
 # Seconds of computing that one small file may take, those on the clock, as others may use the machine, and memory.
 PATIENCE, PATIENCE_ON_CLOCK = 8.0, 120.0
 MEMORY = 1 << 30
 # So many findings with the same beginning are kept as files.
-_KEPT = 5
-_BEGINNING = 60
+_KEPT, _BEGINNING = 5, 60
+_DESCRIPTORS = Path("/proc/self/fd")
 
 
-@dataclass
-class Findings:
-    """Broken laws, by the beginnings of what they say, without names of files and numbers."""
+def damaged_file(reader: str, seed: int, index: int) -> tuple[str, bytes]:
+    """Suffix and content of a file, the same for the same numbers."""
+    random = Random(f"{reader} {seed} {index}")
+    suffix, content = random.choice(seed_files(reader))
+    return suffix, mutated(content, tuple(WORDS[reader]), random)
 
-    folder: Path
-    counts: dict[str, int] = field(default_factory=dict)
 
-    def add(self, reader: str, seed: int, index: int, problem: str) -> None:
-        key = re.sub(r'"/[^"]*"|\d+', "..", problem)[:_BEGINNING]
-        self.counts[key] = self.counts.get(key, 0) + 1
-        if self.counts[key] <= _KEPT:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            suffix, content = damaged_file(reader, seed, index)
-            path = self.folder / f"{reader}_{seed}_{index}{suffix}"
-            path.write_bytes(content)
-            path.with_suffix(f"{suffix}.txt").write_text(problem + "\n", errors="backslashreplace")
+def broken_law(path: Path) -> str | None:
+    """What reading a file does that no file may make it do; None where all is well."""
+    before = _open_files()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        problem = _outcome(path)
+    for warning in told:
+        if not issubclass(warning.category, CageWarning):
+            return f"{warning.category.__name__}: {warning.message}"
+        problem = problem or _wrong_message("warning", str(warning.message), path)
+    left = _open_files()
+    return problem or (f"open file left: {left - before}" if sum(left.values()) > sum(before.values()) else None)
+
+
+def _outcome(path: Path) -> str | None:
+    try:
+        ControlCage.from_file(path, **OPTIONS["usd" if path.suffix.startswith(".usd") else path.suffix[1:]])
+    except CageError as error:
+        return _wrong_message("error", str(error), path)
+    except Exception as error:  # Which is the finding.
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        return f"{type(error).__name__} at {Path(frame.filename).name}:{frame.lineno}: {error}"
+    return None
+
+
+def _wrong_message(kind: str, message: str, path: Path) -> str | None:
+    if str(path) not in message:
+        return f"{kind} without the file's name: {message}"
+    length = len(message) - len(str(path))
+    return f"{kind} of {length} characters: {message}" if length > LONGEST_MESSAGE else None
+
+
+def _open_files() -> Counter[str]:
+    """Files that descriptors of this process refer to, where the system tells."""
+    descriptors = list(_DESCRIPTORS.iterdir()) if _DESCRIPTORS.is_dir() else []
+    # That of the folder itself is closed by now.
+    return Counter(os.readlink(path) for path in descriptors if path.is_symlink())
 
 
 def read_one(folder: str, reader: str, seed: int, index: int) -> str | None:
@@ -52,13 +91,16 @@ def read_one(folder: str, reader: str, seed: int, index: int) -> str | None:
 
 
 def run(
-    reader: str, first: int, count: int, seed: int, processes: int, findings: Findings, read: Callable = read_one
-) -> int:
-    """Read files of one kind, and say how many were read."""
-    indices = range(first, first + count)
+    reader: str, first: int, count: int, seed: int, processes: int, folder: Path, read: Callable = read_one
+) -> Counter[str]:
+    """Read files of one kind, and count the broken laws by their beginnings, without names of files and numbers.
+
+    Some files that break them are kept in a folder.
+    """
+    problems: Counter[str] = Counter()
     with (
         # Here, as a process that is ended leaves its files behind.
-        tempfile.TemporaryDirectory(prefix="fuzz-") as folder,
+        tempfile.TemporaryDirectory(prefix="fuzz-") as place,
         ProcessPool(
             processes,
             initializer=_prepare,
@@ -66,17 +108,26 @@ def run(
             context=multiprocessing.get_context("spawn"),
         ) as pool,
     ):
-        found = pool.map(partial(read, folder, reader, seed), indices, timeout=PATIENCE_ON_CLOCK).result()
+        indices = range(first, first + count)
+        results = pool.map(partial(read, place, reader, seed), indices, timeout=PATIENCE_ON_CLOCK).result()
         for index in tqdm(indices, desc=reader, leave=False, disable=None):
             try:
-                problem = next(found)
+                problem = next(results)
             except TookTooLong:
                 problem = f"hang of more than {PATIENCE_ON_CLOCK:.0f} s"
             except ProcessExpired as ended:
                 problem = f"crash, exit code {ended.exitcode}"
-            if problem:
-                findings.add(reader, seed, index, problem)
-    return len(indices)
+            if problem is None:
+                continue
+            kind = re.sub(r'"/[^"]*"|\d+', "..", problem)[:_BEGINNING]
+            problems[kind] += 1
+            if problems[kind] <= _KEPT:
+                folder.mkdir(parents=True, exist_ok=True)
+                suffix, content = damaged_file(reader, seed, index)
+                path = folder / f"{reader}_{seed}_{index}{suffix}"
+                path.write_bytes(content)
+                path.with_suffix(f"{suffix}.txt").write_text(problem + "\n", errors="backslashreplace")
+    return problems
 
 
 def _prepare(reader: str, seed: int) -> None:
