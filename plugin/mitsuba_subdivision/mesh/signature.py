@@ -10,6 +10,8 @@ around it. The limit surface over an element depends on its one-ring only.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -98,7 +100,8 @@ def near_behind(ahead: Number, behind: Number) -> Number:
     return np.minimum(behind, NEAR_FACES - np.minimum(ahead, NEAR_FACES // 2))
 
 
-class Signature(NamedTuple):
+@dataclass(frozen=True)
+class Signature:
     """Shape of a one-ring, in the order that the half-edge of the element determines.
 
     Elements with equal signatures have the same limit stencils over their one-rings.
@@ -119,12 +122,12 @@ class Signature(NamedTuple):
         """Largest sharpness of all semi-sharp features; 0 if there are none."""
         return max(max(fan.vertex, *(row[0] for row in (*fan.edges, *fan.across)), 0.0) for fan in self.fans)
 
-    @property
+    @cached_property
     def is_semi_sharp(self) -> bool:
         """Whether there are semi-sharp features."""
         return any(fan.edges for fan in self.fans)
 
-    @property
+    @cached_property
     def smoothed(self) -> Signature:
         """The signature without semi-sharp features."""
         return Signature(self.kind, tuple(fan.smoothed() for fan in self.fans)) if self.is_semi_sharp else self

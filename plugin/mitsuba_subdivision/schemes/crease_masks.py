@@ -56,80 +56,60 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     border = t.twin < 0
     # Edges at each vertex: the outgoing half-edges, and the last edge of an open fan, whose half-edge ends there.
     origin, end = t.face_vertices, t.face_vertices[t.next]
-    centre = np.concatenate([origin, end[border]])
-    far = np.concatenate([end, origin[border]])
+    centre, far = np.concatenate([origin, end[border]]), np.concatenate([end, origin[border]])
     infinite = np.concatenate([border, np.ones(np.count_nonzero(border), dtype=bool)])
-    no_vertices, no_edges = np.zeros(t.vertex_count, dtype=bool), np.zeros(0, dtype=np.int64)
-    if semi is None:
-        before = _vertex_masks(t, centre, infinite, infinite, no_vertices, no_edges)
-        return _blended([(before, np.ones(t.vertex_count))], centre, far, border.astype(float))
+    # Sharpness of these edges, of vertices, and of edges across cuts that sharpen a vertex. There is a row for the
+    # masks before a refinement and, with semi-sharp features, one for those after it.
+    row_count = 1 if semi is None else 2
+    edges, vertices = np.zeros((row_count, len(centre))), np.zeros((row_count, t.vertex_count))
+    across_vertex: IntArray = np.zeros(0, dtype=np.int64)
+    across = np.zeros((row_count, 0))
+    if semi is not None:
+        edges[:, : t.half_edge_count] = semi.edges, semi.edges_refined
+        vertices[:] = semi.vertices, semi.vertices_refined
+        across_vertex = semi.across_vertex[semi.across_sharpens]
+        across = np.stack([semi.across_sharpness, semi.across_refined])[:, semi.across_sharpens]
 
-    of_borders = np.zeros(np.count_nonzero(border))
-    sharpness, refined = (np.concatenate([edges, of_borders]) for edges in (semi.edges, semi.edges_refined))
-    across, across_sharpness = semi.across_vertex[semi.across_sharpens], semi.across_sharpness[semi.across_sharpens]
-    across_refined = semi.across_refined[semi.across_sharpens]
-    before = _vertex_masks(
-        t, centre, infinite, infinite | (sharpness > 0), semi.vertices > 0, across[across_sharpness > 0]
-    )
-    after = _vertex_masks(
-        t, centre, infinite, infinite | (refined > 0), semi.vertices_refined > 0, across[across_refined > 0]
-    )
+    # 1 for a sharp edge, 0 for others. The sharp edge of a dart is cut into two border edges, which count 1/2 each.
+    along = (infinite | (edges > 0)).astype(float)
+    along[:, infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5
+    counts = [
+        np.rint(np.bincount(centre, sharp_edges, minlength=t.vertex_count))
+        + np.bincount(across_vertex, sharpness > 0, minlength=t.vertex_count)
+        for sharp_edges, sharpness in zip(along, across, strict=True)
+    ]
+    is_corner = (t.vertex_rules == VertexRule.CORNER) | (t.vertex_half_edge < 0) | (vertices > 0)
+    # Number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3 for the corner mask.
+    sharp_count = np.where(is_corner, 3, np.minimum(counts, 3)).astype(np.int64)
 
-    # The mean sharpness of all features that become smooth. With Chaikin's method their sharpness may exceed 1, and in
-    # meshes cut along seams so may the mean.
-    vertex = np.concatenate([centre, np.arange(t.vertex_count), across])
-    sharpness_before = np.concatenate([sharpness, semi.vertices, across_sharpness])
-    becomes_smooth = (sharpness_before > 0) & (np.concatenate([refined, semi.vertices_refined, across_refined]) == 0)
-    count = np.bincount(vertex[becomes_smooth], minlength=t.vertex_count)
-    total = np.bincount(vertex[becomes_smooth], sharpness_before[becomes_smooth], minlength=t.vertex_count)
-    weight_before = np.minimum(total / np.maximum(count, 1), 1)
-    weight_before[(before[0] == after[0]) | (before[0] < 2)] = 1
+    share, midpoint = np.ones(sharp_count.shape), border.astype(float)
+    if semi is not None:
+        share[0] = _mean_of_smoothed(
+            np.concatenate([centre, np.arange(t.vertex_count), across_vertex]),
+            *np.concatenate([edges, vertices, across], axis=1),
+        )
+        share[0, (sharp_count[0] == sharp_count[1]) | (sharp_count[0] < 2)] = 1
+        share[1] = 1 - share[0]
+        stays_sharp = (semi.edges_refined > 0) & (semi.edges_refined[np.maximum(t.twin, 0)] > 0)
+        midpoint = np.where(border | stays_sharp, 1, semi.edges)
+    smooth = (share * (sharp_count < 2)).sum(axis=0)
+    # The vertex's weight beside the smooth mask (none), in the crease mask and in the corner mask.
+    at_vertex = (share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]).sum(axis=0)
+    row, edge = np.nonzero((along > 0) & ((sharp_count == 2) & (share > 0))[:, centre])
+    weights = CREASE_NEIGHBOUR * along[row, edge] * share[row, centre[edge]]
+    return CreaseMasks(smooth, at_vertex, centre[edge], far[edge], weights, midpoint)
 
-    twin_refined = semi.edges_refined[np.maximum(t.twin, 0)]
-    stays_sharp = border | ((semi.edges_refined > 0) & (twin_refined > 0))
-    shares = [(before, weight_before), (after, 1 - weight_before)]
-    return _blended(shares, centre, far, np.where(stays_sharp, 1, semi.edges))
 
+def _mean_of_smoothed(vertex: IntArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return ``(n_v,)`` mean sharpness of all features that become smooth, which is the weight of the mask before.
 
-def _vertex_masks(
-    t: Topology,
-    centre: IntArray,  # (n,) int: the vertex of each pair of a vertex and an edge at it
-    infinite: NDArray[np.bool_],  # (n,) bool: whether the edge of each pair is infinitely sharp
-    sharp: NDArray[np.bool_],  # (n,) bool: whether it is infinitely sharp or semi-sharp
-    sharp_vertices: NDArray[np.bool_],  # (n_v,) bool: semi-sharp vertices
-    across: IntArray,  # (m,) int: the vertex of each semi-sharp edge across the cut that sharpens it
-) -> tuple[IntArray, FloatArray]:
-    """Determine the mask of every vertex, before or after a refinement.
-
-    Returns (n_v,) int64, the number of sharp edges at each vertex: 0 or 1 for the smooth mask, 2 for the crease mask, 3
-    for the corner mask. It is also 3 for more edges and for other corners. And (n,) float64, for each pair 1 if the
-    edge is sharp and 0 if not. The sharp edge of a dart is cut into two border edges, which count 1/2 each.
+    ``vertex`` is that of each feature. With Chaikin's method sharpness may exceed 1, and in meshes cut along seams so
+    may the mean.
     """
-    along = sharp.astype(float)
-    along[infinite & (t.vertex_rules == VertexRule.DART)[centre]] = 0.5
-    count = np.rint(np.bincount(centre, along, minlength=t.vertex_count)).astype(np.int64)
-    count += np.bincount(across, minlength=t.vertex_count)
-    stays = (t.vertex_rules == VertexRule.CORNER) | (t.vertex_half_edge < 0) | sharp_vertices
-    return np.where(stays, 3, np.minimum(count, 3)), along
-
-
-def _blended(
-    shares: list[tuple[tuple[IntArray, FloatArray], FloatArray]], centre: IntArray, far: IntArray, midpoint: FloatArray
-) -> CreaseMasks:
-    """Blend the masks before and after a refinement with their weights at each vertex, which sum to one."""
-    smooth, at_vertex = np.zeros((2, len(shares[0][1])))
-    rows, columns, weights = [], [], []
-    for (sharp_count, along), share in shares:
-        smooth += share * (sharp_count < 2)
-        # The vertex's weight beside the smooth mask (none), in the crease mask and in the corner mask.
-        at_vertex += share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]
-        creased = np.flatnonzero((along > 0) & (sharp_count == 2)[centre] & (share > 0)[centre])
-        rows.append(centre[creased])
-        columns.append(far[creased])
-        weights.append(CREASE_NEIGHBOUR * along[creased] * share[centre[creased]])
-    return CreaseMasks(
-        smooth, at_vertex, np.concatenate(rows), np.concatenate(columns), np.concatenate(weights), midpoint
-    )
+    is_smoothed = (before > 0) & (after == 0)
+    count = np.bincount(vertex[is_smoothed], minlength=int(vertex.max()) + 1)
+    total = np.bincount(vertex[is_smoothed], before[is_smoothed], minlength=len(count))
+    return np.minimum(total / np.maximum(count, 1), 1)
 
 
 def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:

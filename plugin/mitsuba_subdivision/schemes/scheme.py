@@ -61,7 +61,9 @@ class StencilTable:
         columns: IntArray = np.concatenate(
             [columns for _, columns, _ in entries], dtype=index_type, casting="same_kind"
         )
-        weights = np.concatenate([np.broadcast_to(weights, rows.shape) for rows, _, weights in entries])
+        weights = np.concatenate(
+            [weights if np.ndim(weights) else np.full(len(rows), weights) for rows, _, weights in entries]
+        )
         return cls(row_count, column_count, rows, columns, weights)
 
     @classmethod
