@@ -35,34 +35,24 @@ _DEEPEST = 24
 _ROULETTE = 3
 
 
-class Bsdfs:
-    """Builds BSDFs and emitters from materials."""
+def bsdf(
+    material: MaterialContents | None, shape: ShapeContents, textures: Textures, notes: StageWarnings
+) -> SceneNode:
+    """BSDF of a material, which may read attributes of the shape; without one, its display colour and opacity."""
+    return _Surface(material, shape, textures, notes).bsdf()
 
-    def __init__(self, textures: Textures, notes: StageWarnings) -> None:
-        self._textures, self._notes = textures, notes
 
-    def display(self, shape: ShapeContents) -> SceneNode:
-        """BSDF of a shape without a material: its display colour and opacity."""
-        values = _Values(self._textures, self._notes, shape)
-        color = values.color(PrimvarContents("displayColor", GREY))
-        opacity = values.number(PrimvarContents("displayOpacity", [1.0]))
-        return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
-
-    def surface(self, material: MaterialContents, shape: ShapeContents) -> SceneNode:
-        """BSDF of a material, which may read attributes of the shape."""
-        return _Surface(material, _Values(self._textures, self._notes, shape)).bsdf()
-
-    def radiance(self, material: MaterialContents) -> SceneNode | None:
-        """What a surface emits, as a texture or a spectrum; None if it is black."""
-        emission = material.inputs.get("emission", 0.0)
-        if isinstance(emission, PrimvarContents):
-            self._notes.add("emissiveColor from a primvar is ignored", material.name)
-            return None
-        if not material.is_emissive:
-            return None
-        if isinstance(emission, (TextureContents, NodeContents)):
-            return self._textures.color(emission, is_radiance=True)
-        return rgb(constant(emission))
+def radiance(material: MaterialContents, textures: Textures, notes: StageWarnings) -> SceneNode | None:
+    """What a surface emits, as a texture or a spectrum; None if it is black."""
+    emission = material.inputs.get("emission", 0.0)
+    if isinstance(emission, PrimvarContents):
+        notes.add("emissiveColor from a primvar is ignored", material.name)
+        return None
+    if not material.is_emissive:
+        return None
+    if isinstance(emission, (TextureContents, NodeContents)):
+        return textures.color(emission, is_radiance=True)
+    return rgb(constant(emission))
 
 
 def interior(material: MaterialContents | None) -> SceneNode:
@@ -96,20 +86,25 @@ def integrator(
     Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
     """
     kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
-    if all(each.inputs.get("transmission", 0.0) == 0 for each in materials):
+    if all(material.inputs.get("transmission", 0.0) == 0 for material in materials):
         return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
 
-class _Values:
-    """Inputs as Mitsuba's textures and numbers, for one shape."""
+class _Surface:
+    """Assembles the BSDF of a shape with a material; its inputs as Mitsuba's textures and numbers."""
 
-    def __init__(self, textures: Textures, notes: StageWarnings, shape: ShapeContents) -> None:
-        self._textures, self.notes, self._shape = textures, notes, shape
+    def __init__(
+        self, material: MaterialContents | None, shape: ShapeContents, textures: Textures, notes: StageWarnings
+    ) -> None:
+        self._material, self._shape, self._textures, self._notes = material, shape, textures, notes
+        given = {} if material is None else {name: self._for_shape(value) for name, value in material.inputs.items()}
+        self._inputs: dict[str, Input] = {**NEUTRAL, **given}
+        self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 
-    def for_shape(self, given: Input) -> Input:
+    def _for_shape(self, given: Input) -> Input:
         """An input with attributes as the constants that they are for the shape; as a whole, it may be an attribute."""
-        names = {each.name for each in leaves(given) if isinstance(each, PrimvarContents)}
+        names = {leaf.name for leaf in leaves(given) if isinstance(leaf, PrimvarContents)}
         if not names:
             return given
         varying = names & set(self._shape.cage.attributes)
@@ -117,71 +112,61 @@ class _Values:
             return given
         if varying:
             what = "primvars that vary over a mesh are ignored within expressions; their fallbacks are used"
-            self.notes.add(what, self._shape.name)
+            self._notes.add(what, self._shape.name)
         return with_shape(given, {name: self._shape.constants[name] for name in names & set(self._shape.constants)})
 
-    def color(self, given: Input) -> SceneNode:
-        found = self.for_shape(given)
-        if isinstance(found, PrimvarContents):
-            return _attribute(found)
-        if isinstance(found, (TextureContents, NodeContents)):
-            return self._textures.color(found)
-        if np.min(found) < 0 or np.max(found) > 1:
-            self.notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
-        return rgb(np.clip(found, 0, 1))
+    def _color(self, given: Input) -> SceneNode:
+        value = self._for_shape(given)
+        if isinstance(value, PrimvarContents):
+            return _attribute(value)
+        if isinstance(value, (TextureContents, NodeContents)):
+            return self._textures.color(value)
+        if np.min(value) < 0 or np.max(value) > 1:
+            self._notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
+        return rgb(np.clip(value, 0, 1))
 
-    def number(self, given: Input) -> SceneNode | float:
-        found = self.for_shape(given)
-        if isinstance(found, PrimvarContents):
-            return _attribute(found)
-        return self._textures.number(found) if isinstance(found, (TextureContents, NodeContents)) else _first(found)
+    def _number(self, given: Input) -> SceneNode | float:
+        value = self._for_shape(given)
+        if isinstance(value, PrimvarContents):
+            return _attribute(value)
+        return self._textures.number(value) if isinstance(value, (TextureContents, NodeContents)) else _first(value)
 
-    def normals(self, given: Input) -> SceneNode | None:
-        found = self.for_shape(given)
-        return self._textures.normals(found) if isinstance(found, (TextureContents, NodeContents)) else None
-
-    def mean(self, given: Input) -> NDArray[np.float64]:
-        """A number or a colour, or the mean of a picture."""
-        found = self.for_shape(given)
-        if isinstance(found, (TextureContents, NodeContents)):
-            return self._textures.mean(found)
-        return np.asarray(found.fallback if isinstance(found, PrimvarContents) else found, dtype=np.float64)
-
-
-class _Surface:
-    """Assembles the BSDF of a material."""
-
-    def __init__(self, material: MaterialContents, values: _Values) -> None:
-        self._material, self._values, self._notes = material, values, values.notes
-        inputs = {name: values.for_shape(value) for name, value in material.inputs.items()}
-        self._inputs: dict[str, Input] = {**NEUTRAL, **inputs}
-        self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
+    def _mean(self, name: str) -> NDArray[np.float64]:
+        """An input as a number or a colour, or the mean of a picture."""
+        value = self._for_shape(self._inputs[name])
+        if isinstance(value, (TextureContents, NodeContents)):
+            return self._textures.mean(value)
+        return np.asarray(value.fallback if isinstance(value, PrimvarContents) else value, dtype=np.float64)
 
     def _is(self, name: str, value: float) -> bool:
         """Whether an input has a value everywhere."""
         return is_all(self._inputs[name], value)
 
     def _leave(self, what: str) -> None:
-        self._notes.add(what, self._material.name)
+        self._notes.add(what, self._shape.name if self._material is None else self._material.name)
 
     def bsdf(self) -> SceneNode:
         """The BSDF, with its normal map and its holes."""
+        if self._material is None:
+            color = self._color(PrimvarContents("displayColor", GREY))
+            opacity = self._number(PrimvarContents("displayOpacity", [1.0]))
+            return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
             opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
             weight = number("multiply", weight, opaque)
         if is_constant(weight) and _first(weight) <= 0:
-            found = self._opaque()
+            entry = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
-            found = self._turned(self._glass(), is_diffuse=False)
+            entry = self._turned(self._glass(), is_diffuse=False)
         else:
-            found = {
+            entry = {
                 "type": "blendbsdf",
-                "weight": self._values.number(weight),
+                "weight": self._number(weight),
                 "bsdf_0": self._opaque(),
                 "bsdf_1": self._turned(self._glass(), is_diffuse=False),
             }
-        return _masked(found, self._values.number(self._inputs["opacity"]))
+        return _masked(entry, self._number(self._inputs["opacity"]))
 
     def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
         """A BSDF with the normal map, if there is one.
@@ -189,7 +174,8 @@ class _Surface:
         Normals that face away from the viewer are flipped, which leaves no black patches. Cycles has the shadowing
         function for diffuse lobes only.
         """
-        normals = self._values.normals(self._inputs.get("normal", 0.0))
+        normal = self._for_shape(self._inputs.get("normal", 0.0))
+        normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
         return {
@@ -208,18 +194,18 @@ class _Surface:
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
             return _both_sides(self._turned(self._metal(), is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
-            diffuse = {"type": "diffuse", "reflectance": self._values.color(self._inputs["base_color"])}
+            diffuse = {"type": "diffuse", "reflectance": self._color(self._inputs["base_color"])}
             return _both_sides(self._turned(diffuse))
         return _both_sides(self._turned(self._principled()))
 
     def _principled(self) -> SceneNode:
-        inputs, values = self._inputs, self._values
-        found: SceneNode = {
+        inputs = self._inputs
+        entry: SceneNode = {
             "type": "principled",
-            "base_color": values.color(inputs["base_color"]),
-            "roughness": values.number(inputs["roughness"]),
+            "base_color": self._color(inputs["base_color"]),
+            "roughness": self._number(inputs["roughness"]),
             "eta": max(self._eta(), _LEAST_ETA),
-            "metallic": values.number(inputs["metalness"]),
+            "metallic": self._number(inputs["metalness"]),
         }
         if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
@@ -227,30 +213,30 @@ class _Surface:
         if ratio is not None:
             # The ratio of its widths is 1 - 0.9 anisotropic.
             rest = node("invert", "float", in_=ratio, amount=1.0)
-            found["anisotropic"] = values.number(number("divide", rest, 0.9))
+            entry["anisotropic"] = self._number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
             factor = self._reflectance("coat_ior") / _COAT
-            found["clearcoat"] = values.number(number("multiply", inputs["coat"], factor))
-            found["clearcoat_gloss"] = self._gloss()
+            entry["clearcoat"] = self._number(number("multiply", inputs["coat"], factor))
+            entry["clearcoat_gloss"] = self._gloss()
         if not self._is("sheen", 0):
-            color = np.broadcast_to(values.mean(inputs["sheen_color"]), (3,))
+            color = np.broadcast_to(self._mean("sheen_color"), (3,))
             brightness = float(color @ LUMINANCE)
-            found["sheen"] = values.number(number("multiply", inputs["sheen"], brightness))
+            entry["sheen"] = self._number(number("multiply", inputs["sheen"], brightness))
             if np.ptp(color) > 0:
                 self._leave("colours of sheen only set its brightness; it is white")
-        return found
+        return entry
 
     def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
         roughness = self._inputs["coat_roughness"]
-        if np.any(np.square(self._values.mean(roughness)) > _DULL):
+        if np.any(np.square(self._mean("coat_roughness")) > _DULL):
             self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
         width = number("multiply", roughness, roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
-        return self._values.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
+        return self._number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
 
     def _metal(self) -> SceneNode:
-        n, k = conductor(constant(self._inputs["base_color"], 3), self._values.mean(self._inputs["edge_color"]))
+        n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
         optics = {"eta": rgb(np.broadcast_to(n, (3,))), "k": rgb(np.broadcast_to(k, (3,)))}
         widths = self._widths()
         if widths is None:
@@ -260,53 +246,53 @@ class _Surface:
     def _glass(self) -> SceneNode:
         if not self._is("thin", 0):
             return self._sheet(1.0)
-        eta = _first(self._values.mean(self._inputs["ior"]))
-        found: SceneNode = {
+        eta = _first(self._mean("ior"))
+        entry: SceneNode = {
             "int_ior": float(np.clip(eta, 1 / _MOST_ETA, _MOST_ETA)) if abs(eta - 1) > _MIRROR else 1 + _MIRROR,
             "ext_ior": 1.0,
-            "specular_transmittance": self._values.color(self._inputs["transmission_color"]),
+            "specular_transmittance": self._color(self._inputs["transmission_color"]),
         }
         widths = self._widths()
         if widths is None:
-            return {"type": "dielectric", **found}
-        return {"type": "roughdielectric", "distribution": "ggx", **found, **widths}
+            return {"type": "dielectric", **entry}
+        return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
         """A sheet both sides of which are outside."""
-        inputs, values = self._inputs, self._values
+        inputs = self._inputs
         if transmission == 1 and self._widths() is None:
             return {
                 "type": "thindielectric",
                 "int_ior": self._eta(),
                 "ext_ior": 1.0,
-                "specular_transmittance": values.color(inputs["transmission_color"]),
+                "specular_transmittance": self._color(inputs["transmission_color"]),
             }
-        found: SceneNode = {
+        entry: SceneNode = {
             "type": "principledthin",
-            "base_color": values.color(inputs["transmission_color" if transmission == 1 else "base_color"]),
-            "roughness": values.number(inputs["roughness"]),
+            "base_color": self._color(inputs["transmission_color" if transmission == 1 else "base_color"]),
+            "roughness": self._number(inputs["roughness"]),
             "eta": self._eta(),
             "spec_trans": transmission,
         }
         if transmission < 1:
-            found["diff_trans"] = values.number(number("multiply", inputs["translucency"], 2.0))
-        return found
+            entry["diff_trans"] = self._number(number("multiply", inputs["translucency"], 2.0))
+        return entry
 
     def _reflectance(self, name: str) -> float:
         """What an index of refraction reflects head-on."""
-        eta = max(_first(self._values.mean(self._inputs[name])), 0.0)
+        eta = max(_first(self._mean(name)), 0.0)
         if not is_constant(self._inputs[name]):
             self._leave("textures of indices of refraction are replaced by their means")
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
         """Index of refraction of what reflects as much head-on: white, from outside."""
-        color = np.broadcast_to(self._values.mean(self._inputs["specular_color"]), (3,))
+        color = np.broadcast_to(self._mean("specular_color"), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
             self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
             self._leave("textures of specular weights and colours are replaced by their means")
-        factor = _first(self._values.mean(self._inputs["specular"])) * float(color @ LUMINANCE)
+        factor = _first(self._mean("specular")) * float(color @ LUMINANCE)
         root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
         return float((1 + root) / (1 - root))
 
@@ -316,7 +302,7 @@ class _Surface:
             return None
         ratio = node("invert", "float", in_=self._inputs["anisotropy"], amount=1.0)
         ratio = number("max", ratio, 0.02)
-        quarters = _first(self._values.mean(self._inputs["rotation"])) * 4
+        quarters = _first(self._mean("rotation")) * 4
         if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
             self._leave("rotations of anisotropy are rounded to quarter turns")
         return number("divide", 1.0, ratio) if round(quarters) % 2 else ratio
@@ -330,10 +316,10 @@ class _Surface:
         width = number("max", width, _MIRROR)
         ratio = self._ratio()
         if ratio is None:
-            return {"alpha": self._values.number(width)}
+            return {"alpha": self._number(width)}
         root = number("power", ratio, 0.5)
         u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
-        return {"alpha_u": self._values.number(u), "alpha_v": self._values.number(v)}
+        return {"alpha_u": self._number(u), "alpha_v": self._number(v)}
 
 
 def _clamped(given: Input) -> Input:
@@ -358,10 +344,10 @@ def _first(value: Any) -> float:
     return float(np.asarray(value, dtype=np.float64).ravel()[0])
 
 
-def _both_sides(bsdf: SceneNode) -> SceneNode:
-    return {"type": "twosided", "bsdf": bsdf}
+def _both_sides(entry: SceneNode) -> SceneNode:
+    return {"type": "twosided", "bsdf": entry}
 
 
-def _masked(bsdf: SceneNode, opacity: SceneNode | float) -> SceneNode:
+def _masked(entry: SceneNode, opacity: SceneNode | float) -> SceneNode:
     """A BSDF with an opacity."""
-    return bsdf if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": bsdf}
+    return entry if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": entry}

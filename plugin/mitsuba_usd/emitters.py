@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import mitsuba as mi
 import numpy as np
@@ -21,15 +20,18 @@ _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]
 _TURNED = np.diag([-1.0, 1, -1, 1])
 # Mitsuba divides by the width of the edge of a cone.
 _LEAST_SOFTNESS = 1e-3
-_WITH_SHAPES = ("rect", "disk", "sphere", "cylinder")
 
 
 def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
     """An emitter, or a shape with one; ``up`` is the up axis of the stage."""
-    return _MAKERS[light.kind](light, up, textures)
+    if light.kind == "dome":
+        return _dome(light, up, textures)
+    if light.kind == "rect":
+        return _rect(light, textures)
+    return _MAKERS[light.kind](light)
 
 
-def _distant(light: LightContents, *_others: object) -> SceneNode:
+def _distant(light: LightContents) -> SceneNode:
     angle = math.radians(min(light.size[0], 180.0))
     irradiance = np.array(light.emission)
     if angle > 0 and not light.is_normalized:
@@ -40,66 +42,54 @@ def _distant(light: LightContents, *_others: object) -> SceneNode:
     return {"type": "directional", "direction": direction.tolist(), "irradiance": rgb(irradiance)}
 
 
-def _rect(light: LightContents, _up: str, textures: Textures) -> SceneNode:
+def _rect(light: LightContents, textures: Textures) -> SceneNode:
     width, height = light.size
-    found = _area(light, width * height * _stretch(light.to_world, 0, 1))
-    bitmap = None if light.texture is None else textures.radiance(light.texture, found["radiance"]["value"])
+    area = _area(light, width * height * _stretch(light.to_world, 0, 1))
+    bitmap = None if light.texture is None else textures.radiance(light.texture, area["radiance"]["value"])
     if bitmap is not None:
         # The image is upright for a viewer that looks at the light.
         upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
-        found["radiance"] = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
-    matrix = mi.ScalarTransform4f((light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])).tolist())
-    return {"type": "rectangle", "to_world": matrix, "emitter": found}
+        area["radiance"] = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
+    matrix = light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix.tolist()), "emitter": area}
 
 
-def _disk(light: LightContents, _up: str, _textures: Textures) -> SceneNode:
+def _disk(light: LightContents) -> SceneNode:
     radius = light.size[0]
     matrix = light.to_world @ _TURNED @ np.diag([radius, radius, 1, 1])
     area = math.pi * radius**2 * _stretch(light.to_world, 0, 1)
     return {"type": "disk", "to_world": mi.ScalarTransform4f(matrix.tolist()), "emitter": _area(light, area)}
 
 
-def _sphere(light: LightContents, *_others: object) -> SceneNode:
-    radius = light.size[0] * _scale(light.to_world)
-    return {
-        "type": "sphere",
-        "center": light.to_world[:3, 3].tolist(),
-        "radius": radius,
-        "emitter": _area(light, 4 * math.pi * radius**2),
-    }
+def _sphere(light: LightContents) -> SceneNode:
+    radius, center = _world_radius(light), light.to_world[:3, 3].tolist()
+    return {"type": "sphere", "center": center, "radius": radius, "emitter": _area(light, 4 * math.pi * radius**2)}
 
 
-def _point(light: LightContents, *_others: object) -> SceneNode:
+def _point(light: LightContents) -> SceneNode:
     # The intensity of a sphere from afar, which does not depend on its radius if it is normalised.
-    radius = light.size[0] * _scale(light.to_world)
-    intensity = np.array(light.emission) * (0.25 if light.is_normalized else math.pi * radius**2)
+    intensity = np.array(light.emission) * (0.25 if light.is_normalized else math.pi * _world_radius(light) ** 2)
     return {"type": "point", "position": light.to_world[:3, 3].tolist(), "intensity": rgb(intensity)}
 
 
-def _spot(light: LightContents, *others: object) -> SceneNode:
+def _spot(light: LightContents) -> SceneNode:
     _, angle, softness = light.size
     place, forward = light.to_world[:3, 3], -light.to_world[:3, 2]
     return {
         "type": "spot",
         "to_world": mi.ScalarTransform4f().look_at(place, place + forward, light.to_world[:3, 1]),
-        "intensity": _point(light, *others)["intensity"],
+        "intensity": _point(light)["intensity"],
         "cutoff_angle": angle,
         "beam_width": angle * (1 - np.clip(softness, _LEAST_SOFTNESS, 1)),
     }
 
 
-def _cylinder(light: LightContents, *_others: object) -> SceneNode:
+def _cylinder(light: LightContents) -> SceneNode:
     length = light.size[0]
     radius = light.size[1] * math.sqrt(_stretch(light.to_world, 1, 2))
-    ends = [(light.to_world @ [x, 0, 0, 1])[:3] for x in (-length / 2, length / 2)]
-    area = 2 * math.pi * radius * float(np.linalg.norm(ends[1] - ends[0]))
-    return {
-        "type": "cylinder",
-        "p0": ends[0].tolist(),
-        "p1": ends[1].tolist(),
-        "radius": radius,
-        "emitter": _area(light, area),
-    }
+    start, end = ((light.to_world @ [x, 0, 0, 1])[:3] for x in (-length / 2, length / 2))
+    area = _area(light, 2 * math.pi * radius * float(np.linalg.norm(end - start)))
+    return {"type": "cylinder", "p0": start.tolist(), "p1": end.tolist(), "radius": radius, "emitter": area}
 
 
 def _dome(light: LightContents, up: str, textures: Textures) -> SceneNode:
@@ -114,24 +104,20 @@ def _dome(light: LightContents, up: str, textures: Textures) -> SceneNode:
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 
 
-_MAKERS: dict[str, Callable[[LightContents, str, Textures], SceneNode]] = {
+_MAKERS = {
     "distant": _distant,
-    "rect": _rect,
     "disk": _disk,
     "sphere": _sphere,
     "point": _point,
     "spot": _spot,
     "cylinder": _cylinder,
-    "dome": _dome,
 }
 
 
 def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[LightContents]:
     """The lights, with one dome at most, as Mitsuba's scenes have one environment: the first with a picture."""
     domes = [light for light in lights if light.kind == "dome"]
-    if len(domes) < 2:
-        return lights
-    kept = next((light for light in domes if light.texture), domes[0])
+    kept = next((light for light in domes if light.texture), domes[0] if domes else None)
     left = [light for light in domes if light is not kept]
     for light in left:
         notes.add("further dome lights are ignored; a scene of Mitsuba has one environment", light.name)
@@ -145,10 +131,10 @@ def are_lamps_in_the_way(lights: list[LightContents], points: NDArray[np.float64
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = np.linalg.norm(points - middle, axis=1).max()
-    sources = [each for each in lights if each.kind != "dome" or each.texture is not None]
-    for lamp in (each for each in lights if each.kind in _WITH_SHAPES):
+    sources = [light for light in lights if light.kind != "dome" or light.texture is not None]
+    for lamp in (light for light in lights if light.kind in ("rect", "disk", "sphere", "cylinder")):
         place = lamp.to_world[:3, 3]
-        for other in (each for each in sources if each is not lamp):
+        for other in (source for source in sources if source is not lamp):
             if other.kind == "dome":
                 return True
             start, start_radius = other.to_world[:3, 3], _bounding_radius(other)
@@ -174,8 +160,9 @@ def _area(light: LightContents, area: float) -> SceneNode:
     return {"type": "area", "radiance": rgb(radiance)}
 
 
-def _scale(to_world: NDArray[np.float64]) -> float:
-    return abs(float(np.linalg.det(to_world[:3, :3]))) ** (1 / 3)
+def _world_radius(light: LightContents) -> float:
+    """Radius of a sphere, scaled by the mean of its axes."""
+    return light.size[0] * abs(float(np.linalg.det(light.to_world[:3, :3]))) ** (1 / 3)
 
 
 def _stretch(to_world: NDArray[np.float64], first: int, second: int) -> float:

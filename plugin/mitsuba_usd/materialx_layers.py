@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mitsuba_subdivision.cage import warn
+from pxr import Ar, Sdf, Usd, UsdShade, UsdUtils
 
 if TYPE_CHECKING:
     import MaterialX
-    from pxr import Sdf, Usd
 
 _EXTENSION = ".mtlx"
 _OUTPUTS = {"surfaceshader": "surface", "displacementshader": "displacement", "volumeshader": "volume"}
@@ -43,68 +43,53 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
 
     Warns about each document that cannot be read; messages begin with the name.
     """
-    from pxr import Sdf, Usd
-
     if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None or not has_materialx():
         return stage
-    copies = _Copies(name)
-    root = copies.identifier(stage.GetRootLayer())
-    return Usd.Stage.Open(Sdf.Layer.Find(root)) if copies.layers else stage
+    identifiers: dict[str, str] = {}
+    # Kept, as nothing else holds them before the stage is open.
+    layers: list[Sdf.Layer] = []
 
+    def document(path: str) -> str:
+        """Identifier of the layer of a document; that of the document if it cannot be read, so that USD says so."""
+        if path not in identifiers:
+            layer = _layer_of_document(path, name)
+            layers.extend([] if layer is None else [layer])
+            identifiers[path] = path if layer is None else layer.identifier
+        return identifiers[path]
 
-class _Copies:
-    """Copies of the layers that lead to documents."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._identifiers: dict[str, str] = {}
-        # Kept, as nothing else holds them before the stage is open.
-        self.layers: list[Sdf.Layer] = []
-
-    def identifier(self, layer: Sdf.Layer) -> str:
-        """Identifier of a layer, or of its copy if it needs one."""
-        from pxr import Sdf, UsdUtils
-
-        known = self._identifiers.get(layer.identifier)
-        if known is not None:
-            return known
-        self._identifiers[layer.identifier] = layer.identifier
+    def copied(layer: Sdf.Layer) -> str:
+        """Identifier of a layer, or of its copy if it leads to documents."""
+        if layer.identifier in identifiers:
+            return identifiers[layer.identifier]
+        identifiers[layer.identifier] = layer.identifier
         replaced = {}
         for path in layer.GetCompositionAssetDependencies():
             absolute = layer.ComputeAbsolutePath(path)
             if path.endswith((_EXTENSION, f"{_EXTENSION}]")):
-                replaced[path] = self._document(absolute)
-            elif (found := Sdf.Layer.Find(absolute)) and self.identifier(found) != found.identifier:
-                replaced[path] = self.identifier(found)
+                replaced[path] = document(absolute)
+            elif (below := Sdf.Layer.Find(absolute)) and copied(below) != below.identifier:
+                replaced[path] = copied(below)
         if not replaced:
             return layer.identifier
 
         def moved(path: str) -> str:
-            if path in replaced:
-                return replaced[path]
-            return layer.ComputeAbsolutePath(path) if path and not path.startswith("`") else path
+            is_absolute = not path or path.startswith("`")
+            return replaced.get(path) or (path if is_absolute else layer.ComputeAbsolutePath(path))
 
         copy = Sdf.Layer.CreateAnonymous(Path(layer.GetDisplayName()).stem + ".usda")
         copy.TransferContent(layer)
         UsdUtils.ModifyAssetPaths(copy, moved)
-        self.layers.append(copy)
-        self._identifiers[layer.identifier] = copy.identifier
+        layers.append(copy)
+        identifiers[layer.identifier] = copy.identifier
         return copy.identifier
 
-    def _document(self, path: str) -> str:
-        """Identifier of the layer of a document; that of the document if it cannot be read, so that USD says so."""
-        if path not in self._identifiers:
-            layer = _layer_of_document(path, self._name)
-            if layer is not None:
-                self.layers.append(layer)
-            self._identifiers[path] = path if layer is None else layer.identifier
-        return self._identifiers[path]
+    root = copied(stage.GetRootLayer())
+    return Usd.Stage.Open(Sdf.Layer.Find(root)) if layers else stage
 
 
 def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
     """The layer of a document; None, with a note, if it cannot be read."""
     import MaterialX
-    from pxr import Ar, Sdf, Usd
 
     resolved = Ar.GetResolver().Resolve(path)
     if not resolved:
@@ -130,15 +115,18 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
 
 def _beside(path: str, document: str) -> str:
     """Path of a file that a document refers to, maybe in an archive."""
-    from pxr import Ar
+
+    def beside(file: str) -> str:
+        return posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
 
     if not Ar.IsPackageRelativePath(document):
-        found = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
+        absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
         # What is not there, as the pattern of a picture's tiles, may come back as it is.
-        return found if found != path else posixpath.normpath(posixpath.join(posixpath.dirname(document), path))
+        return absolute if absolute != path else beside(document)
     package, inner = Ar.SplitPackageRelativePathInner(document)
-    found = posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))
-    return str(Ar.JoinPackageRelativePath([package, found]))
+    return str(
+        Ar.JoinPackageRelativePath([package, posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))])
+    )
 
 
 class _Material:
@@ -146,7 +134,6 @@ class _Material:
 
     def __init__(self, stage: Usd.Stage, node: MaterialX.Node, document: str) -> None:
         import MaterialX
-        from pxr import UsdShade
 
         self._stage, self._document = stage, document
         self._path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))
@@ -154,24 +141,19 @@ class _Material:
         material = UsdShade.Material.Define(stage, self._path)
         for kind, output in _OUTPUTS.items():
             for shader in MaterialX.getShaderNodes(node, kind):
-                source = self._add_shader(shader)
-                if source is not None:
-                    port = material.CreateOutput(f"mtlx:{output}", _sdf_type("token"))
-                    port.GetAttr().AddConnection(source)
+                definition = shader.getNodeDef("", True)
+                if definition is not None:
+                    source = self._add_shader(shader, definition.getName())
+                    material.CreateOutput(f"mtlx:{output}", _sdf_type("token")).GetAttr().AddConnection(source)
 
-    def _add_shader(self, shader: MaterialX.Node) -> Sdf.Path | None:
-        """Add the shader of a material, and return the path of its output; None if it is of no known kind."""
-        from pxr import UsdShade
-
-        definition = shader.getNodeDef("", True)
-        if definition is None:
-            return None
-        prim = UsdShade.Shader.Define(self._stage, self._path.AppendChild(definition.getName()))
-        prim.CreateIdAttr(definition.getName())
+    def _add_shader(self, shader: MaterialX.Node, name: str) -> Sdf.Path:
+        """Add the shader of a material, whose inputs are those of the material, and return the path of its output."""
+        prim = UsdShade.Shader.Define(self._stage, self._path.AppendChild(name))
+        prim.CreateIdAttr(name)
         out = prim.CreateOutput("out", _sdf_type("token"))
         material = UsdShade.ConnectableAPI.Get(self._stage, self._path)
-        for each in shader.getInputs():
-            given = self._add_input(material, each, self._path, self._source)
+        for port in shader.getInputs():
+            given = self._add_input(material, port, self._path, self._source)
             prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
         return out.GetAttr().GetPath()
 
@@ -179,11 +161,9 @@ class _Material:
         self, graph: Any, path: Sdf.Path, inputs: Iterable[MaterialX.Input], parent: Sdf.Path, container: Any
     ) -> None:
         """Add a graph with inputs, all its nodes, and its outputs."""
-        from pxr import UsdShade
-
         connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
-        for each in inputs:
-            self._add_input(connectable, each, parent, container)
+        for port in inputs:
+            self._add_input(connectable, port, parent, container)
         for node in graph.getNodes():
             self._add_node(node, path, graph)
         for output in graph.getOutputs():
@@ -193,7 +173,6 @@ class _Material:
     def _add_node(self, node: MaterialX.Node, parent: Sdf.Path, container: Any) -> Sdf.Path:
         """Add a node, and return its path. One that the document itself builds of others is a graph."""
         import MaterialX
-        from pxr import UsdShade
 
         path = parent.AppendChild(_prim_name(node.getName()))
         if self._stage.GetPrimAtPath(path):
@@ -202,16 +181,16 @@ class _Material:
         name = "" if definition is None else definition.getName()
         implementation = None if definition is None else definition.getImplementation()
         if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
-            own = {each.getName() for each in node.getInputs()}
-            others = [each for each in definition.getActiveInputs() if each.getName() not in own]
+            given = {port.getName() for port in node.getInputs()}
+            others = [port for port in definition.getActiveInputs() if port.getName() not in given]
             self._add_graph(implementation, path, (*others, *node.getInputs()), parent, container)
             return path
         shader = UsdShade.Shader.Define(self._stage, path)
         shader.CreateIdAttr(name or node.getCategory())
         for output in [] if definition is None else definition.getActiveOutputs():
             shader.CreateOutput(output.getName(), _sdf_type(output.getType()))
-        for each in node.getInputs():
-            self._add_input(shader.ConnectableAPI(), each, parent, container)
+        for port in node.getInputs():
+            self._add_input(shader.ConnectableAPI(), port, parent, container)
         return path
 
     def _add_input(self, connectable: Any, given: MaterialX.Input, parent: Sdf.Path, container: Any) -> Any:
@@ -223,7 +202,7 @@ class _Material:
 
     def _connect(self, attribute: Usd.Attribute, port: Any, parent: Sdf.Path, container: Any) -> bool:
         """Connect an attribute to what a port of MaterialX reads, if it reads anything."""
-        name, output = port.getNodeName(), _prim_name(port.getOutputString() or "out")
+        output = port.getOutputString() or "out"
         if port.hasInterfaceName():
             attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
             return True
@@ -235,26 +214,23 @@ class _Material:
             if not self._stage.GetPrimAtPath(path):
                 self._add_graph(graph, path, graph.getInputs(), self._path, self._source)
             if not port.getOutputString() and graph.getOutputs():
-                output = _prim_name(graph.getOutputs()[0].getName())
-            attribute.AddConnection(path.AppendProperty(f"outputs:{output}"))
-            return True
-        node = container.getNode(name) if name else None
-        if node is None:
-            return False
-        path = self._add_node(node, parent, container)
-        attribute.AddConnection(path.AppendProperty(f"outputs:{output}"))
+                output = graph.getOutputs()[0].getName()
+        else:
+            node = container.getNode(port.getNodeName()) if port.getNodeName() else None
+            if node is None:
+                return False
+            path = self._add_node(node, parent, container)
+        attribute.AddConnection(path.AppendProperty(f"outputs:{_prim_name(output)}"))
         return True
 
     def _set(self, attribute: Usd.Attribute, given: MaterialX.Input) -> None:
-        from pxr import Ar, Sdf
-
         kind, text = given.getType(), given.getValueString()
         if not text:
             return
         if kind == "filename":
             # Some documents repeat their file prefix in the name.
-            files = [_beside(each, self._document) for each in (given.getResolvedValueString(), text)]
-            there = [each for each in files if Ar.GetResolver().Resolve(each)]
+            files = [_beside(path, self._document) for path in (given.getResolvedValueString(), text)]
+            there = [path for path in files if Ar.GetResolver().Resolve(path)]
             attribute.Set(Sdf.AssetPath((there or files)[0]))
         elif kind == "string":
             attribute.Set(text)
@@ -267,8 +243,6 @@ class _Material:
 
 
 def _sdf_type(kind: str) -> Sdf.ValueTypeName:
-    from pxr import Sdf
-
     return getattr(Sdf.ValueTypeNames, _TYPES.get(kind, "Token"))
 
 
@@ -299,9 +273,9 @@ def numbers(text: str, kind: str) -> float | list[float] | str:
     if kind == "boolean":
         return float(text == "true")
     try:
-        found = [float(each) for each in text.replace(",", " ").split()]
+        values = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         return text
-    if kind in ("string", "filename") or not found:
+    if kind in ("string", "filename") or not values:
         return text
-    return found[0] if len(found) == 1 else found
+    return values[0] if len(values) == 1 else values

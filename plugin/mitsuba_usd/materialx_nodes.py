@@ -7,9 +7,12 @@ here.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Protocol
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.cage import same
@@ -26,68 +29,62 @@ CHANNELS = {
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
-class Sampling(Protocol):
-    """Where expressions are evaluated: at points of texture coordinates, all at once."""
+class Sampling:
+    """Where expressions are evaluated: at points of texture coordinates ``(..., 2)``, all at once."""
 
-    def texcoords(self) -> Values:
-        """Texture coordinates ``(..., 2)``."""
+    def __init__(self, texcoords: Values) -> None:
+        self.texcoords = texcoords
 
     def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
         """Values ``(..., k)`` of a picture at texture coordinates, or where the points themselves are."""
+        raise NotImplementedError
 
     def gradient(self, values: Values) -> Values:
         """Derivatives ``(..., 2)`` of values ``(..., 1)`` along texture coordinates."""
+        return np.zeros((len(values), 2))
 
 
 def evaluate(given: Input, sampling: Sampling) -> Values:
     """Values of an expression, ``(..., k)``; attributes of meshes are their fallbacks."""
     known: dict[int, Values] = {}
 
-    def value_of(each: Input) -> Any:
-        if isinstance(each, str):
-            return each
-        if isinstance(each, (int, float, list)):
-            return np.atleast_1d(np.asarray(each, dtype=np.float32))
-        if id(each) not in known:
-            known[id(each)] = computed(each)
-        return known[id(each)]
+    def value_of(part: Input) -> Any:
+        if isinstance(part, str):
+            return part
+        if isinstance(part, (int, float, list)):
+            return np.atleast_1d(np.asarray(part, dtype=np.float32))
+        if id(part) not in known:
+            known[id(part)] = computed(part)
+        return known[id(part)]
 
-    def computed(each: TextureContents | PrimvarContents | NodeContents) -> Values:
-        if isinstance(each, TextureContents):
-            return sampling.texels(each, None)
-        if isinstance(each, PrimvarContents):
-            return np.asarray(each.fallback, dtype=np.float32)
-        if each.category == "texcoord":
-            return sampling.texcoords()
-        if each.category == "image":
-            file = each.inputs["file"]
+    def computed(part: TextureContents | PrimvarContents | NodeContents) -> Values:
+        if isinstance(part, TextureContents):
+            return sampling.texels(part, None)
+        if isinstance(part, PrimvarContents):
+            return np.asarray(part.fallback, dtype=np.float32)
+        if part.category == "texcoord":
+            return sampling.texcoords
+        if part.category == "image":
+            file = part.inputs["file"]
             assert isinstance(file, TextureContents)
-            return sampling.texels(file, value_of(each.inputs["texcoord"]))
-        inputs = {name: value_of(value) for name, value in each.inputs.items()}
-        if each.category == "heighttonormal":
+            return sampling.texels(file, value_of(part.inputs["texcoord"]))
+        inputs = {name: value_of(value) for name, value in part.inputs.items()}
+        if part.category == "heighttonormal":
             slope = sampling.gradient(inputs["in"]) * inputs["scale"] / 16
             return _unit(np.concatenate([-slope, np.ones_like(slope[..., :1])], axis=-1)) / 2 + 0.5
-        return operation(each.category, each.type, inputs)
+        return operation(part.category, part.type, inputs)
 
     return value_of(given)
 
 
 def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
     """What a category computes of values; ``kind`` is the type of its output."""
+    named = {"in_" if name == "in" else name: value for name, value in inputs.items()}
+    arguments = SimpleNamespace(**{**named, "kind": kind, "width": CHANNELS[kind]})
     with np.errstate(all="ignore"):
-        found = np.asarray(OPERATIONS[category](_Arguments(inputs, kind)))
+        values = np.asarray(OPERATIONS[category](arguments))
     # As shaders do, which have no way to say that there is no number.
-    return np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-class _Arguments:
-    """Inputs of a node, by attribute; ``in`` is ``value``."""
-
-    def __init__(self, inputs: Mapping[str, Any], kind: str) -> None:
-        self.inputs, self.kind, self.width = inputs, kind, CHANNELS[kind]
-
-    def __getattr__(self, name: str) -> Any:
-        return self.inputs["in" if name == "value_in" else name]
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _unit(values: Values) -> Values:
@@ -104,9 +101,9 @@ def _stacked(values: tuple[Values, ...]) -> Values:
     return np.concatenate([np.broadcast_to(each, (*shape, each.shape[-1])) for each in values], axis=-1)
 
 
-def _converted(n: _Arguments) -> Values:
+def _converted(n: SimpleNamespace) -> Values:
     """Of another width: repeated, cut off, or with an alpha of 1, or with zeros."""
-    values, width = n.value_in, n.width
+    values, width = n.in_, n.width
     there = values.shape[-1]
     if there == 1 and n.kind == "color4":
         return _stacked((values, values, values, np.ones_like(values)))
@@ -120,29 +117,29 @@ def _converted(n: _Arguments) -> Values:
     return _stacked((values, rest))
 
 
-def _rotated(n: _Arguments) -> Values:
+def _rotated(n: SimpleNamespace) -> Values:
     angle = np.radians(n.amount)
     sine, cosine = np.sin(angle), np.cos(angle)
-    x, y = n.value_in[..., :1], n.value_in[..., 1:2]
+    x, y = n.in_[..., :1], n.in_[..., 1:2]
     return _stacked((cosine * x + sine * y, -sine * x + cosine * y))
 
 
-def _rotated_in_space(n: _Arguments) -> Values:
+def _rotated_in_space(n: SimpleNamespace) -> Values:
     angle, axis = np.radians(n.amount), _unit(n.axis)
     sine, cosine = np.sin(angle), np.cos(angle)
-    along = np.sum(n.value_in * axis, axis=-1, keepdims=True)
-    return n.value_in * cosine + np.cross(axis, n.value_in) * sine + axis * along * (1 - cosine)
+    along = np.sum(n.in_ * axis, axis=-1, keepdims=True)
+    return n.in_ * cosine + np.cross(axis, n.in_) * sine + axis * along * (1 - cosine)
 
 
-def _smooth_step(n: _Arguments) -> Values:
-    t = np.clip((n.value_in - n.low) / (n.high - n.low), 0, 1)
-    return np.where(n.value_in >= n.high, 1.0, np.where(n.value_in <= n.low, 0.0, t * t * (3 - 2 * t)))
+def _smooth_step(n: SimpleNamespace) -> Values:
+    t = np.clip((n.in_ - n.low) / (n.high - n.low), 0, 1)
+    return np.where(n.in_ >= n.high, 1.0, np.where(n.in_ <= n.low, 0.0, t * t * (3 - 2 * t)))
 
 
-def _luminance(n: _Arguments) -> Values:
-    coefficients = n.inputs.get("lumacoeffs", LUMINANCE)
-    luma = np.sum(n.value_in[..., :3] * coefficients, axis=-1, keepdims=True)
-    return _with_alpha(np.broadcast_to(luma, (*luma.shape[:-1], 3)), n.value_in)
+def _luminance(n: SimpleNamespace) -> Values:
+    coefficients = getattr(n, "lumacoeffs", LUMINANCE)
+    luma = np.sum(n.in_[..., :3] * coefficients, axis=-1, keepdims=True)
+    return _with_alpha(np.broadcast_to(luma, (*luma.shape[:-1], 3)), n.in_)
 
 
 def _with_alpha(color: Values, source: Values) -> Values:
@@ -173,24 +170,24 @@ def _rgb(values: Values) -> Values:
     return _with_alpha(value[..., None] * (1 - saturation[..., None] * ramp), values)
 
 
-def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[_Arguments], Values]:
+def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[SimpleNamespace], Values]:
     """Of a foreground and a background, mixed with the background."""
     return lambda n: _mixed(n.bg, blend(n.fg, n.bg), n.mix)
 
 
-def _extracted(n: _Arguments) -> Values:
+def _extracted(n: SimpleNamespace) -> Values:
     index = int(np.ravel(n.index)[0])
-    return n.value_in[..., index : index + 1] if n.value_in.shape[-1] > 1 else n.value_in
+    return n.in_[..., index : index + 1] if n.in_.shape[-1] > 1 else n.in_
 
 
-def _roughness(n: _Arguments) -> Values:
+def _roughness(n: SimpleNamespace) -> Values:
     """GGX widths along the tangent and across it, of a roughness and an anisotropy."""
     squared = np.clip(n.roughness**2, 1e-8, 1)
     aspect = np.sqrt(1 - np.clip(n.anisotropy, 0, 0.98))
     return _stacked((np.minimum(squared / aspect, 1), squared * aspect))
 
 
-def _fractal(n: _Arguments) -> Values:
+def _fractal(n: SimpleNamespace) -> Values:
     octaves = int(np.ravel(n.octaves)[0])
     return n.amplitude * noise.fractal(n.texcoord, octaves, n.lacunarity, n.diminish, n.width)
 
@@ -200,50 +197,50 @@ def _truth(values: Values) -> Values:
     return (np.asarray(values) != 0).astype(np.float64)
 
 
-OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
+OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "constant": lambda n: n.value,
-    "dot": lambda n: n.value_in,
+    "dot": lambda n: n.in_,
     "add": lambda n: n.in1 + n.in2,
     "subtract": lambda n: n.in1 - n.in2,
     "multiply": lambda n: n.in1 * n.in2,
     "divide": lambda n: n.in1 / n.in2,
     "modulo": lambda n: n.in1 - n.in2 * np.floor(n.in1 / n.in2),
-    "fract": lambda n: n.value_in - np.floor(n.value_in),
-    "invert": lambda n: n.amount - n.value_in,
-    "absval": lambda n: np.abs(n.value_in),
-    "floor": lambda n: np.floor(n.value_in),
-    "ceil": lambda n: np.ceil(n.value_in),
-    "round": lambda n: np.floor(n.value_in + 0.5),
+    "fract": lambda n: n.in_ - np.floor(n.in_),
+    "invert": lambda n: n.amount - n.in_,
+    "absval": lambda n: np.abs(n.in_),
+    "floor": lambda n: np.floor(n.in_),
+    "ceil": lambda n: np.ceil(n.in_),
+    "round": lambda n: np.floor(n.in_ + 0.5),
     "power": lambda n: np.power(n.in1, n.in2),
-    "sin": lambda n: np.sin(n.value_in),
-    "cos": lambda n: np.cos(n.value_in),
-    "tan": lambda n: np.tan(n.value_in),
-    "asin": lambda n: np.arcsin(n.value_in),
-    "acos": lambda n: np.arccos(n.value_in),
+    "sin": lambda n: np.sin(n.in_),
+    "cos": lambda n: np.cos(n.in_),
+    "tan": lambda n: np.tan(n.in_),
+    "asin": lambda n: np.arcsin(n.in_),
+    "acos": lambda n: np.arccos(n.in_),
     "atan2": lambda n: np.arctan2(n.iny, n.inx),
-    "sqrt": lambda n: np.sqrt(n.value_in),
-    "ln": lambda n: np.log(n.value_in),
-    "exp": lambda n: np.exp(n.value_in),
-    "sign": lambda n: np.sign(n.value_in),
-    "clamp": lambda n: np.minimum(np.maximum(n.value_in, n.low), n.high),
+    "sqrt": lambda n: np.sqrt(n.in_),
+    "ln": lambda n: np.log(n.in_),
+    "exp": lambda n: np.exp(n.in_),
+    "sign": lambda n: np.sign(n.in_),
+    "clamp": lambda n: np.minimum(np.maximum(n.in_, n.low), n.high),
     "min": lambda n: np.minimum(n.in1, n.in2),
     "max": lambda n: np.maximum(n.in1, n.in2),
     "and": lambda n: _truth(n.in1) * _truth(n.in2),
     "or": lambda n: np.maximum(_truth(n.in1), _truth(n.in2)),
-    "not": lambda n: 1 - _truth(n.value_in),
-    "normalize": lambda n: _unit(n.value_in),
-    "magnitude": lambda n: np.linalg.norm(n.value_in, axis=-1, keepdims=True),
+    "not": lambda n: 1 - _truth(n.in_),
+    "normalize": lambda n: _unit(n.in_),
+    "magnitude": lambda n: np.linalg.norm(n.in_, axis=-1, keepdims=True),
     "dotproduct": lambda n: np.sum(n.in1 * n.in2, axis=-1, keepdims=True),
     "crossproduct": lambda n: np.cross(n.in1, n.in2),
     "rotate2d": _rotated,
     "rotate3d": _rotated_in_space,
-    "remap": lambda n: n.outlow + (n.value_in - n.inlow) * (n.outhigh - n.outlow) / (n.inhigh - n.inlow),
+    "remap": lambda n: n.outlow + (n.in_ - n.inlow) * (n.outhigh - n.outlow) / (n.inhigh - n.inlow),
     "smoothstep": _smooth_step,
     "luminance": _luminance,
-    "rgbtohsv": lambda n: _hsv(n.value_in),
-    "hsvtorgb": lambda n: _rgb(n.value_in),
-    "premult": lambda n: _with_alpha(n.value_in[..., :3] * n.value_in[..., 3:], n.value_in),
-    "unpremult": lambda n: _with_alpha(n.value_in[..., :3] / n.value_in[..., 3:], n.value_in),
+    "rgbtohsv": lambda n: _hsv(n.in_),
+    "hsvtorgb": lambda n: _rgb(n.in_),
+    "premult": lambda n: _with_alpha(n.in_[..., :3] * n.in_[..., 3:], n.in_),
+    "unpremult": lambda n: _with_alpha(n.in_[..., :3] / n.in_[..., 3:], n.in_),
     "plus": _blended(lambda fg, bg: bg + fg),
     "minus": _blended(lambda fg, bg: bg - fg),
     "difference": _blended(lambda fg, bg: np.abs(bg - fg)),
@@ -254,8 +251,8 @@ OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
     "in": _blended(lambda fg, bg: fg * bg[..., 3:]),
     "mask": _blended(lambda fg, bg: bg * fg[..., 3:]),
     "out": _blended(lambda fg, bg: fg * (1 - bg[..., 3:])),
-    "inside": lambda n: n.value_in * n.mask,
-    "outside": lambda n: n.value_in * (1 - n.mask),
+    "inside": lambda n: n.in_ * n.mask,
+    "outside": lambda n: n.in_ * (1 - n.mask),
     "mix": lambda n: _mixed(n.bg, n.fg, n.mix),
     "ifgreater": lambda n: np.where(n.value1 > n.value2, n.in1, n.in2),
     "ifgreatereq": lambda n: np.where(n.value1 >= n.value2, n.in1, n.in2),
@@ -272,7 +269,7 @@ OPERATIONS: dict[str, Callable[[_Arguments], Values]] = {
     "noise2d": lambda n: n.amplitude * noise.perlin(n.texcoord, n.width) + n.pivot,
     "fractal2d": _fractal,
     "cellnoise2d": lambda n: noise.cells(n.texcoord),
-    "worleynoise2d": lambda n: noise.worley(n.texcoord, n.jitter, int(np.ravel(n.inputs.get("style", 0))[0])),
+    "worleynoise2d": lambda n: noise.worley(n.texcoord, n.jitter, int(np.ravel(getattr(n, "style", 0))[0])),
     "roughness_anisotropy": _roughness,
 }
 # That read texture coordinates or pictures themselves.
@@ -280,19 +277,22 @@ SAMPLED = ("texcoord", "image", "heighttonormal")
 
 
 def node(category: str, kind: str, **inputs: Input) -> Input:
-    """An expression: a node of a type, or what it comes to; ``in_`` is its input ``in``.
+    """`node_of` inputs by name; ``in_`` is the input ``in``."""
+    return node_of(category, kind, {"in" if name == "in_" else name: value for name, value in inputs.items()})
+
+
+def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
+    """An expression: a node of a type, or what it comes to.
 
     What has only constant inputs is computed. A picture that is multiplied by constants and moved by them stays a
     picture; what changes nothing is left out.
     """
-    given = {"in" if name == "in_" else name: value for name, value in inputs.items()}
     if category not in SAMPLED and all(map(is_constant, given.values())):
         numbers = {name: value if isinstance(value, str) else constant(value) for name, value in given.items()}
         values = operation(category, kind, numbers)
         return _plain(np.broadcast_to(values, (CHANNELS[kind],)) if values.shape[-1] == 1 else values)
-    simple = _SIMPLER.get(category)
-    found = None if simple is None else simple(kind, given)
-    return NodeContents(category, kind, given) if found is None else found
+    simpler = _SIMPLER[category](kind, given) if category in _SIMPLER else None
+    return NodeContents(category, kind, given) if simpler is None else simpler
 
 
 def is_constant(given: Input) -> bool:
@@ -342,46 +342,41 @@ def affine(texture: Input, factor: Any, offset: Any) -> TextureContents | None:
     )
 
 
-def _simpler_product(kind: str, given: dict[str, Input]) -> Input | None:
-    for one, other in (("in1", "in2"), ("in2", "in1")):
-        if is_all(given[one], 1):
-            return _as_wide(given[other], kind)
-        if is_all(given[one], 0):
-            return _plain(np.zeros(CHANNELS[kind]))
-        if is_constant(given[one]):
-            return affine(given[other], given[one], 0.0)
-    return None
-
-
-def _simpler_quotient(_kind: str, given: dict[str, Input]) -> Input | None:
-    if not is_constant(given["in2"]) or np.any(np.asarray(given["in2"]) == 0):
+def _simpler_affine(category: str, kind: str, given: dict[str, Input]) -> Input | None:
+    """A picture times constants and plus constants; an input that a neutral number is added to or multiplied by."""
+    if category in ("add", "multiply"):
+        for one, other in (("in1", "in2"), ("in2", "in1")):
+            if is_all(given[one], float(category == "multiply")):
+                return _as_wide(given[other], kind)
+            if category == "multiply" and is_all(given[one], 0):
+                return _plain(np.zeros(CHANNELS[kind]))
+    varying = [name for name, value in given.items() if not is_constant(value)]
+    if len(varying) > 1 or (category, varying[0]) not in _AFFINE:
         return None
-    return affine(given["in1"], 1 / np.asarray(given["in2"]), 0.0)
+    constants = {name: np.asarray(value) for name, value in given.items() if name != varying[0]}
+    with np.errstate(all="ignore"):
+        factor, offset = _AFFINE[category, varying[0]](constants)
+    is_finite = np.isfinite(factor).all() and np.isfinite(offset).all()
+    return affine(given[varying[0]], factor, offset) if is_finite else None
 
 
-def _simpler_sum(kind: str, given: dict[str, Input]) -> Input | None:
-    for one, other in (("in1", "in2"), ("in2", "in1")):
-        if is_all(given[one], 0):
-            return _as_wide(given[other], kind)
-        if is_constant(given[one]):
-            return affine(given[other], 1.0, given[one])
-    return None
+def _remapped(c: Mapping[str, NDArray]) -> tuple[Any, Any]:
+    factor = (c["outhigh"] - c["outlow"]) / (c["inhigh"] - c["inlow"])
+    return factor, c["outlow"] - c["inlow"] * factor
 
 
-def _simpler_difference(_kind: str, given: dict[str, Input]) -> Input | None:
-    if is_constant(given["in2"]):
-        return affine(given["in1"], 1.0, -np.asarray(given["in2"]))
-    return affine(given["in2"], -1.0, given["in1"]) if is_constant(given["in1"]) else None
-
-
-def _simpler_remap(_kind: str, given: dict[str, Input]) -> Input | None:
-    if not all(is_constant(value) for name, value in given.items() if name != "in"):
-        return None
-    low, high, to_low, to_high = (np.asarray(given[name]) for name in ("inlow", "inhigh", "outlow", "outhigh"))
-    if np.any(low == high):
-        return None
-    factor = (to_high - to_low) / (high - low)
-    return affine(given["in"], factor, to_low - low * factor)
+# Factor and offset of the only input that is not constant, by category and that input.
+_AFFINE: dict[tuple[str, str], Callable[[Mapping[str, NDArray]], tuple[Any, Any]]] = {
+    ("multiply", "in1"): lambda c: (c["in2"], 0.0),
+    ("multiply", "in2"): lambda c: (c["in1"], 0.0),
+    ("divide", "in1"): lambda c: (1 / c["in2"], 0.0),
+    ("add", "in1"): lambda c: (1.0, c["in2"]),
+    ("add", "in2"): lambda c: (1.0, c["in1"]),
+    ("subtract", "in1"): lambda c: (1.0, -c["in2"]),
+    ("subtract", "in2"): lambda c: (-1.0, c["in1"]),
+    ("invert", "in"): lambda c: (-1.0, c["amount"]),
+    ("remap", "in"): _remapped,
+}
 
 
 def _simpler_mix(kind: str, given: dict[str, Input]) -> Input | None:
@@ -391,14 +386,11 @@ def _simpler_mix(kind: str, given: dict[str, Input]) -> Input | None:
     return _as_wide(given["bg"], kind) if same(given["bg"], given["fg"]) else None
 
 
-def _simpler_choice(compare: Callable[[float, float], bool]) -> Callable[[str, dict[str, Input]], Input | None]:
-    def simpler(kind: str, given: dict[str, Input]) -> Input | None:
-        first, second = given["value1"], given["value2"]
-        if isinstance(first, (int, float)) and isinstance(second, (int, float)):
-            return _as_wide(given["in1" if compare(first, second) else "in2"], kind)
-        return None
-
-    return simpler
+def _simpler_choice(compare: Callable[[float, float], bool], kind: str, given: dict[str, Input]) -> Input | None:
+    first, second = given["value1"], given["value2"]
+    if isinstance(first, (int, float)) and isinstance(second, (int, float)):
+        return _as_wide(given["in1" if compare(first, second) else "in2"], kind)
+    return None
 
 
 def _simpler_part(_kind: str, given: dict[str, Input]) -> Input | None:
@@ -440,18 +432,13 @@ def _as_wide(given: Input, kind: str) -> Input:
 _SIMPLER: dict[str, Callable[[str, dict[str, Input]], Input | None]] = {
     "constant": lambda _, given: given["value"],
     "dot": lambda _, given: given["in"],
-    "multiply": _simpler_product,
-    "divide": _simpler_quotient,
-    "add": _simpler_sum,
-    "subtract": _simpler_difference,
-    "invert": lambda _, given: affine(given["in"], -1.0, given["amount"]) if is_constant(given["amount"]) else None,
-    "remap": _simpler_remap,
     "mix": _simpler_mix,
     "power": lambda kind, given: _as_wide(given["in1"], kind) if is_all(given["in2"], 1) else None,
-    "ifgreater": _simpler_choice(lambda a, b: a > b),
-    "ifgreatereq": _simpler_choice(lambda a, b: a >= b),
-    "ifequal": _simpler_choice(lambda a, b: a == b),
+    "ifgreater": partial(_simpler_choice, operator.gt),
+    "ifgreatereq": partial(_simpler_choice, operator.ge),
+    "ifequal": partial(_simpler_choice, operator.eq),
     "extract": _simpler_part,
     "convert": _simpler_conversion,
     "combine3": _simpler_combination,
+    **{category: partial(_simpler_affine, category) for category, _ in _AFFINE},
 }

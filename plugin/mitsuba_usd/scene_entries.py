@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -12,13 +13,12 @@ from mitsuba_subdivision.progress import counted
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.variants import SceneNode
 
-from .bsdfs import Bsdfs, interior, rgb
+from .bsdfs import bsdf, interior, radiance, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .emitters import emitter, one_environment
-from .limit_surfaces import Surfaces
-from .shapes import LoadedShapes, as_polygons, polygon_mesh, subdivision
+from .sensors import RESERVED
+from .shapes import LoadedShapes, Surfaces, as_polygons, polygon_mesh, subdivision
 from .stage_warnings import StageWarnings
-from .studio_defaults import RESERVED
 from .textures import Textures
 
 
@@ -44,36 +44,29 @@ class SceneEntries:
     ) -> None:
         self._contents, self._notes = contents, notes
         self._textures = Textures(notes, needed, texture_size)
-        self._bsdfs = Bsdfs(self._textures, notes)
         self._parameters, self._surfaces, self._triangles = parameters, surfaces, triangles or {}
-        self._loaded, self._has_clear_lamps = loaded, has_clear_lamps
+        self._loaded = loaded
         # Entries of BSDFs that are the same for all shapes, by material.
         self._shared: dict[int, str] = {}
         self.scene: SceneNode = {"type": "scene"}
-        self._add_all()
-
-    def _add_all(self) -> None:
-        contents = self._contents
-        materials = dict.fromkeys(each.material for each in contents.all_shapes if each.material is not None)
-        self._textures.read(each for number in materials for each in contents.materials[number].textures())
+        used = dict.fromkeys(shape.material for shape in contents.all_shapes if shape.material is not None)
+        self._textures.read(texture for number in used for texture in contents.materials[number].textures())
         for shape in counted(contents.shapes, "Shapes"):
             entry = self._shape(shape)
             if entry is not None:
                 self._add(shape.name, entry)
         groups: list[str | None] = []
-        for number, shapes_of_group in enumerate(contents.groups):
-            shapes = {
-                f"shape_{i}": made for i, each in enumerate(shapes_of_group) if (made := self._shape(each)) is not None
-            }
+        for number, group in enumerate(contents.groups):
+            shapes = {f"shape_{i}": made for i, shape in enumerate(group) if (made := self._shape(shape)) is not None}
             groups.append(self._add(f"group_{number}", {"type": "shapegroup", **shapes}) if shapes else None)
-        for each in contents.instances:
-            group = groups[each.group]
-            if group is not None:
-                to_world = mi.ScalarTransform4f(each.to_world.tolist())
-                self._add(each.name, {"type": "instance", "group": {"type": "ref", "id": group}, "to_world": to_world})
-        for light in one_environment(contents.lights, self._notes):
+        for instance in contents.instances:
+            if groups[instance.group] is not None:
+                entry = {"type": "instance", "group": {"type": "ref", "id": groups[instance.group]}}
+                entry["to_world"] = mi.ScalarTransform4f(instance.to_world.tolist())
+                self._add(instance.name, entry)
+        for light in one_environment(contents.lights, notes):
             entry = emitter(light, contents.up, self._textures)
-            is_clear = self._has_clear_lamps and "emitter" in entry
+            is_clear = has_clear_lamps and "emitter" in entry
             self._add(light.name, {**entry, "bsdf": {"type": "null"}} if is_clear else entry)
 
     def _add(self, name: str, entry: Any) -> str:
@@ -89,10 +82,10 @@ class SceneEntries:
     def _shape(self, shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None if it cannot be used, with a warning."""
         material = None if shape.material is None else self._contents.materials[shape.material]
-        radiance = None if shape.radiance is None else rgb(shape.radiance)
-        if radiance is None and material is not None:
-            radiance = self._bsdfs.radiance(material)
-        area = None if radiance is None else {"type": "area", "radiance": radiance}
+        shining = None if shape.radiance is None else rgb(shape.radiance)
+        if shining is None and material is not None:
+            shining = radiance(material, self._textures, self._notes)
+        area = None if shining is None else {"type": "area", "radiance": shining}
         try:
             return self._made(shape, material, area)
         except SchemeError as error:
@@ -105,28 +98,21 @@ class SceneEntries:
     def _made(
         self, shape: ShapeContents, material: MaterialContents | None, area: SceneNode | None
     ) -> SceneNode | mi.Object:
+        make = partial(bsdf, material, shape, self._textures, self._notes)
         if self._loaded is not None:
-            return self._loaded.object_of(
-                shape, material, lambda: self._bsdf(shape, is_shared=False), area, self._notes
-            )
-        if shape.cage.scheme is None:
-            return {**polygon_mesh(shape).entry(self._bsdf(shape), area), **interior(material)}
-        parameters = {**self._parameters_of(shape), **interior(material)}
-        return subdivision(shape, self._surfaces, self._bsdf(shape), area, parameters, self._notes)
-
-    def _parameters_of(self, shape: ShapeContents) -> SceneNode:
-        if shape not in self._triangles:
-            return self._parameters
-        others = {name: value for name, value in self._parameters.items() if name != "tessellation_rate"}
-        return {**others, **self._triangles[shape]}
-
-    def _bsdf(self, shape: ShapeContents, is_shared: bool = True) -> SceneNode:
+            return self._loaded.object_of(shape, material, make, area, self._notes)
         number = shape.material
-        if number is None:
-            return self._bsdfs.display(shape)
-        material = self._contents.materials[number]
-        if material.primvars() or not is_shared:
-            return self._bsdfs.surface(material, shape)
-        if number not in self._shared:
-            self._shared[number] = self._add(material.name, self._bsdfs.surface(material, shape))
-        return {"type": "ref", "id": self._shared[number]}
+        if material is None or number is None or material.primvars():
+            entry = make()
+        else:
+            if number not in self._shared:
+                self._shared[number] = self._add(material.name, make())
+            entry = {"type": "ref", "id": self._shared[number]}
+        if shape.cage.scheme is None:
+            return {**polygon_mesh(shape).entry(entry, area), **interior(material)}
+        parameters = self._parameters
+        if shape in self._triangles:
+            others = {name: value for name, value in parameters.items() if name != "tessellation_rate"}
+            parameters = {**others, **self._triangles[shape]}
+        parameters = {**parameters, **interior(material)}
+        return subdivision(shape, self._surfaces, entry, area, parameters, self._notes)

@@ -1,4 +1,4 @@
-"""A USD camera as a sensor of Mitsuba."""
+"""A USD camera as a sensor of Mitsuba; and camera, lights and backdrop of a studio for a stage that lacks them."""
 
 from __future__ import annotations
 
@@ -6,82 +6,136 @@ import math
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision.studio import sampler
+from mitsuba_subdivision.studio import DEFAULT_SIZE, LIGHTS, Look, View, sampler, studio
 from mitsuba_subdivision.variants import SceneNode
+from numpy.typing import NDArray
 
-from .contents import CameraContents
+from .bsdfs import integrator, rgb
+from .contents import CameraContents, SceneContents
+from .emitters import are_lamps_in_the_way
 from .stage_warnings import StageWarnings
 
 _LEAST_NEAR = 1e-6
 # What a single scene leaves out of a camera.
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
+# Of pictures by a stage's camera.
+WIDTH = 640
+_LIGHTS = (*LIGHTS, "ambient_light")
+RESERVED = ("integrator", "sensor", *_LIGHTS, "ground")
+# Half the least size of what the studio is set up around, as a part of its place: a single point has no size.
+_LEAST_SIZE = 1e-6
 
 
 def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: StageWarnings) -> SceneNode:
     """A sensor whose film is the camera's aperture, fitted to the size (width, height) in pixels."""
     width, height = size
-    wide, high = film_window(camera, width / height)
-    matrix = camera.to_world @ np.diag([-1.0, 1, -1, 1])
+    wide, high = _film_window(camera, width / height)
     near = max(camera.near, _LEAST_NEAR)
     if camera.shutter[0] < camera.shutter[1]:
         notes.add(NO_BLUR, camera.name)
-    common: SceneNode = {
-        "near_clip": near,
-        "far_clip": max(camera.far, 2 * near),
-        "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"},
-        "sampler": sampler(spp),
-    }
+    film = {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"}
+    clip = {"near_clip": near, "far_clip": max(camera.far, 2 * near)}
+    common: SceneNode = {**clip, "film": film, "sampler": sampler(spp)}
     if not camera.is_perspective:
         matrix = camera.to_world.copy()
         matrix[:3, 3] += matrix[:3, :2] @ camera.offset
         matrix = matrix @ np.diag([-wide / 2, wide / 2, -1, 1])
         return {"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix.tolist()), **common}
-    common["to_world"] = mi.ScalarTransform4f(matrix.tolist())
-    if camera.lens_radius > 0:
-        # A thin lens has no principal point: the film is a window of a larger one, whose middle is on the axis.
-        sides = zip(size, camera.offset, (wide, high), strict=True)
-        halves = [round(2 * pixels * offset / length) for pixels, offset, length in sides]
-        full = width + abs(halves[0]), height + abs(halves[1])
-        window = {
-            "width": full[0],
-            "height": full[1],
-            "crop_width": width,
-            "crop_height": height,
-            "crop_offset_x": max(halves[0], 0),
-            "crop_offset_y": max(-halves[1], 0),
-        }
-        return {
-            "type": "thinlens",
-            "aperture_radius": camera.lens_radius,
-            "focus_distance": camera.focus_distance,
-            **common,
-            **_field_of_view(wide * full[0] / width, camera),
-            "film": {**common["film"], **(window if any(halves) else {})},
-        }
-    return {
-        "type": "perspective",
+    common["to_world"] = mi.ScalarTransform4f((camera.to_world @ np.diag([-1.0, 1, -1, 1])).tolist())
+    if camera.lens_radius == 0:
         # Of the film's sides; down is positive.
-        "principal_point_offset_x": camera.offset[0] / wide,
-        "principal_point_offset_y": -camera.offset[1] / high,
-        **common,
-        **_field_of_view(wide, camera),
-    }
+        x, y = camera.offset[0] / wide, -camera.offset[1] / high
+        offset = {"principal_point_offset_x": x, "principal_point_offset_y": y}
+        return {"type": "perspective", **offset, **common, **_field_of_view(wide, camera)}
+    # A thin lens has no principal point: the film is a window of a larger one, whose middle is on the axis.
+    sides = zip(size, camera.offset, (wide, high), strict=True)
+    halves = [round(2 * pixels * offset / length) for pixels, offset, length in sides]
+    full = width + abs(halves[0]), height + abs(halves[1])
+    if any(halves):
+        crop = {"crop_width": width, "crop_height": height}
+        crop |= {"crop_offset_x": max(halves[0], 0), "crop_offset_y": max(-halves[1], 0)}
+        common["film"] = {**film, "width": full[0], "height": full[1], **crop}
+    lens = {"aperture_radius": camera.lens_radius, "focus_distance": camera.focus_distance}
+    return {"type": "thinlens", **lens, **common, **_field_of_view(wide * full[0] / width, camera)}
 
 
-def film_window(camera: CameraContents, aspect_ratio: float) -> tuple[float, float]:
+def _film_window(camera: CameraContents, aspect_ratio: float) -> tuple[float, float]:
     """Width and height of the film of a camera, in its units, as its ``conform_policy`` fits the aperture to a picture.
 
     By default, more is seen where the picture is wider or higher than the aperture.
     """
-    own, of_height = camera.aperture[0], camera.aperture[1] * aspect_ratio
+    wide, of_height = camera.aperture[0], camera.aperture[1] * aspect_ratio
     wide = {
-        "expandAperture": max(own, of_height),
-        "cropAperture": min(own, of_height),
+        "expandAperture": max(wide, of_height),
+        "cropAperture": min(wide, of_height),
         "adjustApertureWidth": of_height,
-        "adjustApertureHeight": own,
+        "adjustApertureHeight": wide,
     }[camera.conform_policy]
     return wide, wide / aspect_ratio
 
 
 def _field_of_view(wide: float, camera: CameraContents) -> SceneNode:
     return {"fov": math.degrees(2 * math.atan(wide / (2 * camera.focal_length))), "fov_axis": "x"}
+
+
+def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
+    """Size of the film for a stage: 640 pixels wide and as high as the camera's aperture asks for, if none is given."""
+    if look.size is not None:
+        return look.size
+    if contents.resolution is not None:
+        width, height = contents.resolution
+        return width, height
+    if contents.camera is None:
+        return DEFAULT_SIZE
+    wide, high = contents.camera.aperture
+    return WIDTH, max(1, round(WIDTH * high / wide))
+
+
+def angles_for(contents: SceneContents, look: Look) -> View:
+    """View direction of a stage's camera, for the studio, whose lights turn with the camera."""
+    if contents.camera is None:
+        return look.view
+    back = contents.camera.to_world[:3, 2]
+    right, behind, above = back if contents.up == "z" else (back[0], -back[2], back[1])
+    azimuth = math.degrees(math.atan2(right, -behind))
+    return azimuth, math.degrees(math.asin(np.clip(above, -1, 1)))
+
+
+def with_studio_defaults(
+    contents: SceneContents,
+    points: NDArray[np.float64],  # (n, 3) float64: in the world, that the studio is set up around
+    is_lit: bool,  # Whether the stage has lights
+    look: Look,
+    notes: StageWarnings,
+    name: str,  # Of the stage, with which messages begin
+) -> SceneNode:
+    """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene."""
+    camera, size = contents.camera, size_for(contents, look)
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+    if (bounds[0] == bounds[1]).all():
+        bounds += np.array([[-1], [1]]) * _LEAST_SIZE * (1 + np.abs(bounds).max())
+    view = angles_for(contents, look)
+    entries = studio(bounds, up=contents.up, view=view, size=size, spp=look.spp, points=points, name=name)
+    has_clear_lamps = are_lamps_in_the_way(contents.lights, points)
+    scene = {"integrator": integrator(contents.materials, entries["integrator"], has_clear_lamps=has_clear_lamps)}
+    scene["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
+    if is_lit:
+        return scene
+    for light in _LIGHTS:
+        if light in entries:
+            # The stage's own camera may be so far away that lights of a studio would be in its picture.
+            is_near = camera is not None and entries[light]["type"] == "rectangle"
+            scene[light] = _distant_light(entries[light], bounds.mean(axis=0)) if is_near else entries[light]
+    if camera is None and "ground" in entries:
+        scene["ground"] = entries["ground"]
+    return scene
+
+
+def _distant_light(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
+    """A distant light with the irradiance of a rectangle light that faces the target."""
+    matrix = np.array(light["to_world"].matrix, dtype=np.float64)
+    towards = target - matrix[:3, 3]
+    distance = np.linalg.norm(towards)
+    area = 4 * np.linalg.norm(np.cross(matrix[:3, 0], matrix[:3, 1]))
+    irradiance = np.array(light["emitter"]["radiance"]["value"]) * area / distance**2
+    return {"type": "directional", "direction": (towards / distance).tolist(), "irradiance": rgb(irradiance)}

@@ -1,33 +1,141 @@
 """Shapes of a stage as shapes of Mitsuba: limit surfaces as the shape ``subdivision``, polygons as meshes.
 
-Entries of a scene, or objects that are kept from frame to frame.
+Entries of a scene, or objects that are kept from frame to frame. Cages that are equal share one limit surface.
 """
 
 from __future__ import annotations
 
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageWarning, same, same_topology
+from mitsuba_subdivision.cage import (
+    Attribute,
+    CageContents,
+    CageError,
+    CageWarning,
+    ControlCage,
+    same,
+    same_topology,
+)
 from mitsuba_subdivision.mesh import IntArray, ragged
-from mitsuba_subdivision.studio import PolygonMesh, points_at, set_parameters
+from mitsuba_subdivision.progress import counted
+from mitsuba_subdivision.schemes import SchemeError
+from mitsuba_subdivision.studio import PolygonMesh, box_corners, frame_table, points_at, set_parameters
+from mitsuba_subdivision.surface import LimitSurface
+from mitsuba_subdivision.tessellation import VertexTable
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .bsdfs import interior
-from .contents import MaterialContents, ShapeContents
-from .limit_surfaces import Surfaces
+from .contents import MaterialContents, SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 
+# From so many faces on, control points stand for the surface, which lies among them and near them: a sphere with 64
+# faces around is smaller than its cage by a six-hundredth of its radius.
+DENSE = 2_000
+_NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
 # Fields of a shape that may differ between frames that share an object: a shape can move, and materials are compared
 # themselves.
 _MOVABLE = frozenset({"cage", "to_world", "material"})
 Loaded = tuple[ShapeContents, MaterialContents | None, mi.Object]
+
+
+@dataclass(frozen=True, eq=False)
+class CachedSurface:
+    """A limit surface with the warnings about its cage."""
+
+    contents: CageContents
+    surface: LimitSurface
+    warnings: list[str]
+
+    @cached_property
+    def properties(self) -> SceneNode:
+        """Properties of the shape ``subdivision`` that describe the cage."""
+        return self.surface.cage.as_properties(mi)
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        return self.points_of(self.surface.cage.positions)
+
+    def points_of(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points on or around the surface of these control points."""
+        return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
+
+    @cached_property
+    def _frame_table(self) -> VertexTable | None:
+        return frame_table(self.surface) if self.surface.cage.face_count < DENSE else None
+
+    @cached_property
+    def _used(self) -> IntArray:
+        """Vertices of faces that are not holes."""
+        cage = self.surface.cage
+        is_shown = np.isin(np.arange(cage.face_count), cage.holes, invert=True)
+        return np.unique(cage.face_vertices[np.repeat(is_shown, cage.face_sizes)])
+
+
+class Surfaces:
+    """Caches limit surfaces: the left and the right bishop, black or white, share one."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, ...], list[CachedSurface]] = {}
+        # Of shapes whose control points may be others at other times.
+        self._of_shape: dict[tuple[str, int | None], CachedSurface] = {}
+
+    def of(self, contents: CageContents) -> CachedSurface:
+        """The surface of a cage, without warnings.
+
+        Raises CageError if the cage is invalid. Raises SchemeError if the scheme cannot subdivide it.
+        """
+        key = len(contents.positions), len(contents.face_sizes), zlib.crc32(contents.positions.tobytes())
+        alike = self._known.setdefault(key, [])
+        for known in alike:
+            if same(known.contents, contents):
+                return known
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", CageWarning)
+            surface = LimitSurface(ControlCage.from_arrays(**contents.as_arguments()))
+        alike.append(CachedSurface(contents, surface, [str(warning.message) for warning in caught]))
+        return alike[-1]
+
+    def points(self, contents: SceneContents) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` in the world, all over limit surfaces or around them, and corners of polygons.
+
+        Of groups, there are the corners of their boxes. Where only control points differ from those of an earlier
+        call, weights are made once.
+        """
+        of_shapes = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
+        boxes = []
+        for group in contents.groups:
+            inside = np.concatenate([_NO_POINTS, *map(self._points_of, group)])
+            boxes.append(box_corners(np.stack([inside.min(axis=0), inside.max(axis=0)])) if len(inside) else inside)
+        of_instances = [points_at(boxes[instance.group], instance.to_world) for instance in contents.instances]
+        points = np.concatenate([_NO_POINTS, *of_shapes, *of_instances])
+        return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+    def _points_of(self, shape: ShapeContents) -> NDArray[np.float64]:
+        cage, key = shape.cage, (shape.name, shape.material)
+        if cage.scheme is None:
+            return points_at(cage.positions, shape.to_world)
+        known = self._of_shape.get(key)
+        if known is None or not same_topology(known.contents, cage):
+            try:
+                known = self._of_shape[key] = self.of(cage)
+            except SchemeError:
+                # Shown as polygons.
+                return points_at(cage.positions, shape.to_world)
+            except CageError:
+                # Entries are made of it later, with the error.
+                return _NO_POINTS
+        is_same = np.array_equal(known.contents.positions, cage.positions)
+        points = known.points if is_same else known.points_of(np.asarray(cage.positions, dtype=np.float64))
+        return points_at(points, shape.to_world)
 
 
 def subdivision(
@@ -40,13 +148,15 @@ def subdivision(
 ) -> SceneNode:
     """A limit surface. Raises CageError for an invalid cage, SchemeError if the scheme cannot subdivide it."""
     # Validated here, so that messages name the prim.
-    surfaces.note_warnings(shape, notes)
+    surface = surfaces.of(shape.cage)
+    for message in surface.warnings:
+        notes.add_message(message.replace(surface.contents.source.name, shape.cage.source.name), shape.name)
     # Any, as the stubs call it an object.
     tensor: Any = mi.TensorXu
     shown = shape.shown_faces
     return {
         "type": "subdivision",
-        **surfaces.properties(shape.cage),
+        **surface.properties,
         "cage_name": shape.cage.source.name,
         **({} if shown is None else {"shown_faces": tensor(shown.astype(np.uint32))}),
         **parameters,
@@ -71,7 +181,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
     data: dict[str, Attribute] = dict(cage.attributes)
     if cage.texcoords is not None:
         data["texcoords"] = cage.texcoords
-    if normals is not None or any(each.interpolation == "face_varying" for each in data.values()):
+    if normals is not None or any(attribute.interpolation == "face_varying" for attribute in data.values()):
         # Every corner of a face is a vertex of its own.
         vertex, triangles = cage.face_vertices, corners
     else:
@@ -119,7 +229,7 @@ class LoadedShapes:
         """Begin the next frame, and free objects that the last one did not use."""
         self._before, self._now, self._counts, self.surfaces = self._now, {}, Counter(), Surfaces()
         materials = [material for _, material, _ in self._before.values()]
-        self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is each for each in materials)]
+        self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is material for material in materials)]
 
     def object_of(
         self,
@@ -137,26 +247,43 @@ class LoadedShapes:
         # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
-        known = self._before.get(key)
-        is_alike = known is not None and _differs_by_position(known, shape, material)
-        if known is None or not is_alike or (shape.cage.scheme is None and _has_moved(known[0], shape)):
-            emitter = None if area is None else mi.load_dict(area)
-            if shape.cage.scheme is None:
-                media = [mi.load_dict(each) for each in interior(material).values()]
-                made = polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter, *media)
-            else:
-                # Validated before its BSDF is made, so that warnings about the cage name the prim.
-                parameters = {**self._parameters, **interior(material)}
-                entry = subdivision(shape, self.surfaces, None, emitter, parameters, notes)
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", CageWarning)
-                    made = mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})
-            known = shape, material, made
-        elif _has_moved(known[0], shape):
-            _move(known[2], shape)
+        known, is_alike, has_moved = self._before.get(key), False, False
+        if known is not None:
+            before = known[0]
+            is_alike = same(before, shape, _MOVABLE) and same(known[1], material)
+            is_alike &= same_topology(before.cage, shape.cage)
+            is_there = np.array_equal(before.to_world, shape.to_world)
+            has_moved = not (is_there and np.array_equal(before.cage.positions, shape.cage.positions))
+        if known is None or not is_alike or (shape.cage.scheme is None and has_moved):
+            known = shape, material, self._loaded(shape, material, bsdf, area, notes)
+        elif has_moved:
+            positions = np.asarray(shape.cage.positions, dtype=np.float64)
+            if not np.isfinite(positions).all():
+                raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
+            to_world = mi.ScalarTransform4f(shape.to_world.tolist())
+            set_parameters(known[2], {"control_points": positions, "to_world": to_world})
             known = shape, known[1], known[2]
         self._now[key] = known
         return known[2]
+
+    def _loaded(
+        self,
+        shape: ShapeContents,
+        material: MaterialContents | None,
+        bsdf: Callable[[], SceneNode],
+        area: SceneNode | None,
+        notes: StageWarnings,
+    ) -> mi.Object:
+        emitter = None if area is None else mi.load_dict(area)
+        if shape.cage.scheme is None:
+            media = [mi.load_dict(medium) for medium in interior(material).values()]
+            return polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter, *media)
+        # Validated before its BSDF is made, so that warnings about the cage name the prim.
+        parameters = {**self._parameters, **interior(material)}
+        entry = subdivision(shape, self.surfaces, None, emitter, parameters, notes)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CageWarning)
+            return mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})
 
     def _bsdf(self, material: MaterialContents | None, entry: Callable[[], SceneNode]) -> mi.BSDF:
         """The BSDF of a material, shared by all its shapes unless it reads their attributes."""
@@ -167,22 +294,3 @@ class LoadedShapes:
                 return loaded
         self._bsdfs.append((material, mi.load_dict(entry())))
         return self._bsdfs[-1][1]
-
-
-def _differs_by_position(known: Loaded, shape: ShapeContents, material: MaterialContents | None) -> bool:
-    """Whether two shapes are equal except for transforms and control points."""
-    return same(known[0], shape, _MOVABLE) and same(known[1], material) and same_topology(known[0].cage, shape.cage)
-
-
-def _has_moved(before: ShapeContents, shape: ShapeContents) -> bool:
-    return not (
-        np.array_equal(before.cage.positions, shape.cage.positions) and np.array_equal(before.to_world, shape.to_world)
-    )
-
-
-def _move(loaded: mi.Object, shape: ShapeContents) -> None:
-    positions = np.asarray(shape.cage.positions, dtype=np.float64)
-    if not np.isfinite(positions).all():
-        raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
-    to_world = mi.ScalarTransform4f(shape.to_world.tolist())
-    set_parameters(loaded, {"control_points": positions, "to_world": to_world})

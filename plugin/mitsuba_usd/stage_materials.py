@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.cage import same
 from mitsuba_subdivision.files import value_at
 from numpy.typing import NDArray
+from pxr import Usd, UsdShade
 
 from . import surface_models
 from .contents import Input, MaterialContents, PrimvarContents, TextureContents
 from .materialx_layers import MISSING, has_materialx
 from .stage_networks import NetworkReader, note_unknown_inputs, path_of, source_of
 from .stage_warnings import StageWarnings
-from .surface_models import MODELS, PREVIEW, left_out
-
-if TYPE_CHECKING:
-    from pxr import Usd, UsdShade
+from .surface_models import LEFT_OUT, MODELS, PREVIEW, left_out
 
 SURFACE = "UsdPreviewSurface"
 # Inputs of the nodes of its networks.
@@ -44,8 +42,6 @@ class MaterialReader:
 
     def bound(self, prim: Usd.Prim) -> int | None:
         """Number of the material bound to a prim; None if there is none or it is not supported."""
-        from pxr import UsdShade
-
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
             material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
             number = self.number(material) if material else None
@@ -54,7 +50,7 @@ class MaterialReader:
         return None
 
     def number(self, material: UsdShade.Material) -> int | None:
-        """Number of a material; None if it is not supported."""
+        """Number of a material; None if it is not supported. Materials that differ by their names only have one."""
         path = str(material.GetPath())
         if path not in self._numbers:
             try:
@@ -63,24 +59,20 @@ class MaterialReader:
                 what = "materials whose inputs have other types than their model's are ignored"
                 self._notes.add(f"{what}, and display colours are used", path)
                 contents = None
-            self._numbers[path] = None if contents is None else self._numbered(contents)
+            self._numbers[path] = None
+            if contents is not None:
+                known = (n for n, other in enumerate(self.materials) if same(other, contents, frozenset({"name"})))
+                self._numbers[path] = next(known, len(self.materials))
+                self.materials += [contents] if self._numbers[path] == len(self.materials) else []
         return self._numbers[path]
-
-    def _numbered(self, contents: MaterialContents) -> int:
-        """Number of a material; materials that differ by their names only have one."""
-        for number, known in enumerate(self.materials):
-            if same(known, contents, frozenset({"name"})):
-                return number
-        self.materials.append(contents)
-        return len(self.materials) - 1
 
     def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()
-        found = [each for context in ("mtlx", "") if (each := material.ComputeSurfaceSource(context)[0])]
-        read = next((each for each in map(self._surface, found) if each is not None), None)
+        surfaces = [surface for context in ("mtlx", "") if (surface := material.ComputeSurfaceSource(context)[0])]
+        read = next((inputs for inputs in map(self._surface, surfaces) if inputs is not None), None)
         if read is None:
-            kinds = ", ".join(f'"{each.GetShaderId() or "of files"}"' for each in found)
-            what = f"surface shaders {kinds}" if found else "materials without a surface shader"
+            kinds = ", ".join(f'"{surface.GetShaderId() or "of files"}"' for surface in surfaces)
+            what = f"surface shaders {kinds}" if surfaces else "materials without a surface shader"
             self._notes.add(f"{what} are ignored, and display colours are used; expected {', '.join(MODELS)}", path)
             return None
         if material.ComputeVolumeSource()[0]:
@@ -98,18 +90,21 @@ class MaterialReader:
         kind = surface.GetShaderId() or ""
         if kind == SURFACE:
             # Occlusion is what a path tracer computes itself.
-            note_unknown_inputs(surface, {*PREVIEW, "normal", "occlusion", *MODELS[SURFACE].left}, self._notes)
-            inputs = {name: self._input(surface, name) for name in (*PREVIEW, "normal", *MODELS[SURFACE].left)}
-            # The only word among numbers.
-            inputs = {name: each for name, each in inputs.items() if name == "opacityMode" or not isinstance(each, str)}
-            return SURFACE, {**PREVIEW, **{name: each for name, each in inputs.items() if each is not None}}
-        if not kind.startswith("ND_") or not any(f"_{each}_" in kind for each in MODELS):
+            note_unknown_inputs(surface, {*PREVIEW, "normal", "occlusion", *LEFT_OUT[SURFACE]}, self._notes)
+            inputs = dict(PREVIEW)
+            for name in (*PREVIEW, "normal", *LEFT_OUT[SURFACE]):
+                value = self._input(surface, name)
+                # The mode of opacity is the only word among numbers.
+                if value is not None and (name == "opacityMode" or not isinstance(value, str)):
+                    inputs[name] = value
+            return SURFACE, inputs
+        if not kind.startswith("ND_") or not any(f"_{model}_" in kind for model in MODELS):
             return None
         if not has_materialx():
             self._notes.add(MISSING, surface.GetPath())
             return None
-        model, inputs_or_none = self._networks.inputs(surface)
-        return (model, inputs_or_none) if model in MODELS else None
+        read = self._networks.inputs(surface)
+        return read if read[0] in MODELS else None
 
     def _input(self, shader: UsdShade.Shader, name: str) -> Input | None:
         """Value or source of an input; None if there is none."""
@@ -128,8 +123,6 @@ class MaterialReader:
 
     def _source(self, shader: UsdShade.Shader, name: str) -> tuple[UsdShade.Shader | None, Any]:
         """The shader that an input is connected to and the name of its output; or None and the input's value."""
-        from pxr import UsdShade
-
         attribute = source_of(shader.GetInput(name), self._notes)
         if attribute is None:
             return None, None
@@ -146,17 +139,17 @@ class MaterialReader:
 
     def _four(self, shader: UsdShade.Shader, name: str, usual: tuple[float, ...]) -> list[float]:
         """Value of an input of four numbers."""
-        found = np.asarray(self._value(shader, name, usual), dtype=np.float64)
-        if found.shape != (4,):
-            raise TypeError(f"{name} is {found.tolist()}; expected four numbers")
-        return found.tolist()
+        numbers = np.asarray(self._value(shader, name, usual), dtype=np.float64)
+        if numbers.shape != (4,):
+            raise TypeError(f"{name} is {numbers.tolist()}; expected four numbers")
+        return numbers.tolist()
 
     def _word(self, shader: UsdShade.Shader, name: str, known: Collection[str], usual: str) -> str:
         """Value of an input that is one of some words; the usual one, with a note, in place of others."""
-        found = str(self._value(shader, name, usual))
-        if found in known:
-            return found
-        self._notes.add(f'{name} "{found}" of textures is ignored; expected {", ".join(known)}', shader.GetPath())
+        word = str(self._value(shader, name, usual))
+        if word in known:
+            return word
+        self._notes.add(f'{name} "{word}" of textures is ignored; expected {", ".join(known)}', shader.GetPath())
         return usual
 
     def _texture(self, shader: UsdShade.Shader, output: str) -> TextureContents | None:

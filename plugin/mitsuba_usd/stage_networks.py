@@ -10,16 +10,27 @@ import numpy as np
 from mitsuba_subdivision.files import value_at
 from mitsuba_subdivision.srgb import decoded
 from numpy.typing import NDArray
+from pxr import Usd, UsdShade
 
 from .contents import Input, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_layers import library, numbers
-from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, Values, affine, constant, evaluate, is_constant, node
+from .materialx_nodes import (
+    CHANNELS,
+    OPERATIONS,
+    SAMPLED,
+    Sampling,
+    affine,
+    constant,
+    evaluate,
+    is_constant,
+    node,
+    node_of,
+)
 from .stage_warnings import StageWarnings
 from .texture_image import UDIM
 
 if TYPE_CHECKING:
     import MaterialX
-    from pxr import Usd, UsdShade
 
 # Those of MaterialX, and of UsdUVTexture.
 _WRAPS = {
@@ -41,7 +52,7 @@ _TRIED = np.array([[0, 0], [1, 0], [0, 1], [0.37, 0.61], [-2.3, 5.7], [17.1, -3.
 
 def note_unknown_inputs(shader: UsdShade.Shader, known: Collection[str], notes: StageWarnings) -> None:
     """Note the inputs that a shader has and its definition has not."""
-    names = sorted({each.GetBaseName() for each in shader.GetInputs()} - {*known})
+    names = sorted({given.GetBaseName() for given in shader.GetInputs()} - {*known})
     if names:
         what = f"inputs that {shader.GetShaderId()} does not have are ignored"
         notes.add(what, f"{', '.join(names)} of {shader.GetPath()}")
@@ -49,19 +60,19 @@ def note_unknown_inputs(shader: UsdShade.Shader, known: Collection[str], notes: 
 
 def source_of(given: UsdShade.Input, notes: StageWarnings) -> Usd.Attribute | None:
     """The attribute that has the value of an input, or the output that computes it; None if there is none."""
-    found = given.GetValueProducingAttributes() if given else []
+    attributes = given.GetValueProducingAttributes() if given else []
+    if attributes:
+        return attributes[0]
     attribute = given.GetAttr() if given else None
-    if not found and attribute:
+    if attribute:
         stage = attribute.GetStage()
         if not all(stage.GetPropertyAtPath(path) for path in attribute.GetConnections()):
             notes.add("connections of inputs to what is not there are ignored", attribute.GetPath())
-    return found[0] if found else None
+    return None
 
 
 def path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
     """Path of the file that is the value of an attribute; "" for none."""
-    from pxr import UsdShade
-
     if asset.resolvedPath or UDIM not in asset.path:
         return str(asset.resolvedPath or asset.path)
     # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
@@ -80,18 +91,12 @@ class NetworkReader:
     def inputs(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]]:
         """Name of the model of a surface, and all its inputs but the vectors of the surface that are its own."""
         definition = library().getNodeDef(shader.GetShaderId())
-        found = {}
         self._note_unknown_inputs(shader, definition)
-        for each in definition.getActiveInputs():
-            value = self._input(shader, each)
-            if value is not None:
-                found[each.getName()] = value
-        return definition.getNodeString(), found
+        inputs = {given.getName(): self._input(shader, given) for given in definition.getActiveInputs()}
+        return definition.getNodeString(), {name: value for name, value in inputs.items() if value is not None}
 
     def _input(self, shader: UsdShade.Shader, declared: MaterialX.Input) -> Input | None:
         """An input of a shader; None for a vector of the surface."""
-        from pxr import UsdShade
-
         attribute = source_of(shader.GetInput(declared.getName()), self._notes)
         if attribute is None:
             return self._usual(declared)
@@ -119,8 +124,6 @@ class NetworkReader:
 
     def _file(self, attribute: Usd.Attribute, asset: Any) -> TextureContents:
         """A file as a picture of four channels that is everywhere."""
-        from pxr import UsdShade
-
         path = path_of(asset, attribute, self._time)
         given = UsdShade.Shader(attribute.GetPrim()).GetInput(_COLOR_SPACE)
         named = value_at(given.GetAttr(), self._time) if given else None
@@ -146,11 +149,11 @@ class NetworkReader:
                 self._leave(f'"{name or shader.GetPrim().GetTypeName()}"', path)
             else:
                 self._note_unknown_inputs(shader, definition)
-                self._known[key] = self._made(definition, output, lambda each: self._input(shader, each), path)
+                self._known[key] = self._made(definition, output, lambda given: self._input(shader, given), path)
         return self._known[key]
 
     def _note_unknown_inputs(self, shader: UsdShade.Shader, definition: MaterialX.NodeDef) -> None:
-        known = {each.getName() for each in definition.getActiveInputs()}
+        known = {given.getName() for given in definition.getActiveInputs()}
         # Of the shader of USD, which the definition lacks.
         note_unknown_inputs(shader, known | ({_COLOR_SPACE} if "wrapS" in known else set()), self._notes)
 
@@ -167,41 +170,36 @@ class NetworkReader:
         """What a node computes of its inputs: an expression of primitive nodes."""
         import MaterialX
 
-        category, outputs = definition.getNodeString(), definition.getActiveOutputs()
-        names = [each.getName() for each in outputs]
-        kind = outputs[names.index(output)].getType() if output in names else definition.getType()
-        declared = definition.getActiveInputs()
-        has_sets = category in ("texcoord", "geomcolor")
-        if has_sets and any(input_of(each) != 0 for each in declared if each.getName() == "index"):
+        category = definition.getNodeString()
+        kinds = {port.getName(): port.getType() for port in definition.getActiveOutputs()}
+        kind = kinds.get(output, definition.getType())
+        inputs = {declared.getName(): input_of(declared) for declared in definition.getActiveInputs()}
+        if category in ("texcoord", "geomcolor") and inputs.get("index", 0) != 0:
             self._notes.add(f"index of {category} is ignored; the first set of the mesh is used", prim)
         if category == "texcoord":
             return NodeContents("texcoord", "vector2", {"name": "st"})
         implementation = definition.getImplementation()
         is_known = category in OPERATIONS or category in SAMPLED or category in _SPECIAL
         if isinstance(implementation, MaterialX.NodeGraph) and not is_known:
-            return self._expanded(implementation, output, {each.getName(): input_of(each) for each in declared}, prim)
-        # Slopes are those along texture coordinates.
-        unused = {"texcoord"} if category == "heighttonormal" else set()
-        for where in (input_of(each) for each in declared if each.getName() in unused):
+            return self._expanded(implementation, output, inputs, prim)
+        if category == "heighttonormal" and "texcoord" in inputs:
+            where = inputs.pop("texcoord")
             if not isinstance(where, NodeContents) or where.category != "texcoord":
                 self._notes.add(f"texcoord of {category} is ignored; slopes are along those of the mesh", prim)
-        given = {each.getName(): input_of(each) for each in declared if each.getName() not in unused}
         if category in _SPECIAL:
-            return _SPECIAL[category](self, kind, given, prim)
-        if kind not in CHANNELS or not is_known or any(value is None for value in given.values()):
+            return _SPECIAL[category](self, kind, inputs, prim)
+        there = {name: value for name, value in inputs.items() if value is not None}
+        if kind not in CHANNELS or not is_known or len(there) < len(inputs):
             self._leave(f'"{category}"', prim)
-            return next((value for name, value in given.items() if name.startswith("in") and value is not None), 0.0)
-        if self._size(given) > _MOST_NODES:
+            return next((value for name, value in there.items() if name.startswith("in")), 0.0)
+        # Nodes of inputs, counted as often as they are read.
+        size = sum(self._sizes.get(id(value), 1) for value in there.values() if not is_constant(value))
+        if size > _MOST_NODES:
             self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", prim)
             return 0.0
-        there = {name: value for name, value in given.items() if value is not None}
-        made = node(category, kind, **{"in_" if name == "in" else name: value for name, value in there.items()})
-        self._sizes[id(made)] = 1 + self._size(given)
+        made = node_of(category, kind, there)
+        self._sizes[id(made)] = 1 + size
         return made
-
-    def _size(self, given: dict[str, Any]) -> int:
-        """Nodes of inputs, counted as often as they are read."""
-        return sum(self._sizes.get(id(each), 1) for each in given.values() if not is_constant(each))
 
     def _expanded(
         self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], prim: object
@@ -219,12 +217,12 @@ class NetworkReader:
             if key not in made:
                 inner = graph.getNode(name)
                 definition = inner.getNodeDef("", True)
-                made[key] = self._made(definition, key[1] or "out", lambda each: of_input(inner, each), prim)
+                made[key] = self._made(definition, key[1] or "out", lambda given: of_input(inner, given), prim)
             return made[key]
 
         def of_input(inner: MaterialX.Node, declared: MaterialX.Input) -> Input | None:
-            own = inner.getInput(declared.getName())
-            return self._usual(declared) if own is None else of_port(own)
+            port = inner.getInput(declared.getName())
+            return self._usual(declared) if port is None else of_port(port)
 
         return of_port(graph.getOutput(output) or graph.getOutputs()[0])
 
@@ -260,12 +258,11 @@ class NetworkReader:
             return replace(texture, to_uv=matrix)
         if isinstance(where, PrimvarContents):
             return replace(texture, texcoords=where.name)
-        found = leaves(where)
-        names = {str(each.inputs["name"]) for each in found if isinstance(each, NodeContents)}
-        if len(names) == 1 and all(isinstance(each, NodeContents) for each in found):
-            matrix_or_none = _affine_map(where)
-            if matrix_or_none is not None:
-                return replace(texture, to_uv=matrix_or_none, texcoords=names.pop())
+        names = {str(leaf.inputs["name"]) if isinstance(leaf, NodeContents) else None for leaf in leaves(where)}
+        if len(names) == 1 and None not in names:
+            to_uv = _affine_map(where)
+            if to_uv is not None:
+                return replace(texture, to_uv=to_uv, texcoords=str(names.pop()))
         return NodeContents("image", kind, {"file": texture, "texcoord": where})
 
     def _attribute(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
@@ -310,24 +307,11 @@ _SPECIAL: dict[str, Callable[..., Input | None]] = {
 }
 
 
-class _Trial:
-    """A few points of texture coordinates."""
-
-    def texcoords(self) -> Values:
-        return _TRIED
-
-    def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
-        raise NotImplementedError
-
-    def gradient(self, values: Values) -> Values:
-        return np.zeros((len(values), 2))
-
-
 def _affine_map(where: Input) -> NDArray[np.float64] | None:
     """Matrix ``(3, 3)`` of an affine function of texture coordinates; None if it is no such function."""
-    found = np.broadcast_to(evaluate(where, _Trial()), _TRIED.shape).astype(np.float64)
+    points = np.broadcast_to(evaluate(where, Sampling(_TRIED)), _TRIED.shape).astype(np.float64)
     matrix = np.eye(3)
-    matrix[:2, 2] = found[0]
-    matrix[:2, 0], matrix[:2, 1] = found[1] - found[0], found[2] - found[0]
-    error = np.abs(_TRIED @ matrix[:2, :2].T + matrix[:2, 2] - found).max()
-    return matrix if error <= 1e-4 * max(1.0, np.abs(found).max()) else None
+    matrix[:2, 2] = points[0]
+    matrix[:2, 0], matrix[:2, 1] = points[1] - points[0], points[2] - points[0]
+    error = np.abs(_TRIED @ matrix[:2, :2].T + matrix[:2, 2] - points).max()
+    return matrix if error <= 1e-4 * max(1.0, np.abs(points).max()) else None

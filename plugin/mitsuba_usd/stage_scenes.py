@@ -2,50 +2,48 @@
 
 from __future__ import annotations
 
-import math
-import warnings
-import weakref
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, product
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision.cage import CageError, CageWarning, in_digits, same, warn
+from mitsuba_subdivision.cage import CageError, in_digits, same
+from mitsuba_subdivision.files import require_usd
 from mitsuba_subdivision.progress import timed
 from mitsuba_subdivision.studio import (
+    DEFAULT_SPP,
+    DEFAULT_VIEW,
     MOST_SEGMENTS,
     FrameFiles,
     LoadedScene,
     Look,
+    StillPicture,
     View,
     load_quietly,
     outline_for,
     set_parameters,
     shading_for,
     variant_in_use,
+    with_meshes,
 )
-from mitsuba_subdivision.variants import SceneNode
+from mitsuba_subdivision.variants import SceneNode, variant_set
 from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .limit_surfaces import Surfaces
-from .materialx_layers import library
-from .rates import is_chosen, segments_of, triangles_for_picture, with_rate
+from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
 from .scene_entries import SceneEntries
-from .sensors import NO_BLUR, sensor
-from .shapes import LoadedShapes
-from .stage_walk import is_still, open_checked, read_open_camera, read_open_stage
+from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
+from .shapes import LoadedShapes, Surfaces
 from .stage_warnings import StageWarnings
-from .studio_defaults import angles_for, size_for, with_studio_defaults
-from .texture_detail import texels_for_pictures
 
 if TYPE_CHECKING:
-    from pxr import Usd
+    from .stage_walk import StageReader
 
 # What differs between contents where only the camera does.
 _OF_CAMERA = frozenset({"camera", "resolution"})
@@ -109,6 +107,9 @@ class StageScenes:
         path = self._path if self._files is None or number is None else self._files.file(number)
         time = self._time if self._files is None or number is None else self._files.time(number)
         if self._reader is None or (self._files is not None and self._files.are_many):
+            require_usd(f'"{path}"')
+            from .stage_walk import StageReader
+
             self._reader = StageReader(path, self._camera, warned=self._warned)
         contents = self._reader.at(None if time is None else time + delay)
         if mi.Float is not float:
@@ -298,64 +299,81 @@ def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
     return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}
 
 
-class StageReader:
-    """Reads a stage at several times.
+def usd_scene(
+    path: str | Path,
+    mi: ModuleType | str,
+    *,
+    time: float | None = None,
+    camera: str | None = None,
+    size: tuple[int, int] | None = None,
+    spp: int = DEFAULT_SPP,
+    view: View = DEFAULT_VIEW,
+    texture_size: int | None = None,
+    **parameters: Any,
+) -> SceneNode:
+    """A whole USD file as a dictionary for ``mi.load_dict``.
 
-    Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
+    Meshes become limit surfaces, or polygons where they are not to be subdivided; with their transforms, instances,
+    materials, lights and the camera. Where the stage has no lights or no camera, it gets those of the studio.
 
-    Raises OSError if the file cannot be read.
+    Parameters
+    ----------
+    path : str or Path
+        A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
+    mi : module or str
+        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb". The scene
+        is for this variant.
+    time : float, optional
+        Time code. By default, each value is the one that does not depend on time, or else its first sample.
+    camera : str, optional
+        Path of the camera, such as "/World/camera". By default that of the stage's render settings, or its first one.
+    size : (width, height), optional
+        Of the film, in pixels. By default what the stage's render settings say, or 640 pixels wide and as high as the
+        camera's aperture asks for.
+    spp : int
+        Samples per pixel.
+    view : str or (azimuth, elevation)
+        View of the studio's camera, if the stage has no camera.
+    texture_size : int, optional
+        Pixels along the sides of the textures of materials at most; each tile of a UDIM texture is such a texture.
+        Textures that are finer than this camera shows are halved in any case.
+    **parameters
+        Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
+        exact where ``shading="auto"`` is; elsewhere a line on standard error says why. Triangles are as few as the
+        picture shows, about 4 million at most. With exact shading, outlines are a tenth of a pixel away from the
+        surface as this camera sees them; outside groups, triangles adapt to that. Otherwise all triangles are a 32nd of
+        a pixel away, with 8 segments on each edge at most.
+
+    Returns
+    -------
+    dict
+        Entries have the names of their prims: "/World/car" is "World_car".
+
+    Raises
+    ------
+    CageError
+        If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing is visible.
+    ValueError
+        If the time, the size, the samples or the texture size are none, or ``mi`` is no variant.
+    OSError
+        If the file cannot be read.
+
+    Warns
+    -----
+    CageWarning
+        About everything that is ignored or unusable, once for each kind.
+
+    Examples
+    --------
+    >>> import mitsuba_subdivision as msub
+    >>> import mitsuba as mi
+    >>> mi.set_variant("llvm_ad_rgb")
+    >>> scene = mi.load_dict(msub.usd_scene("kitchen.usda", mi))  # doctest: +SKIP
+    >>> mi.util.write_bitmap("kitchen.png", mi.render(scene))  # doctest: +SKIP
     """
-
-    def __init__(
-        self,
-        path: str | Path,
-        camera: str | None = None,  # As of `read_stage`
-        warned: set[str] | None = None,  # Warnings about other files, without their names; those about this are added
-    ) -> None:
-        with Path(path).open("rb"):
-            pass  # So that a missing file is an OSError, as for other formats.
-        self._path, self._camera = path, camera
-        self._stage: Usd.Stage | None = None
-        # The first contents, and, from the second time on, whether they stay but for the camera.
-        self._first: SceneContents | None = None
-        self._is_still: bool | None = None
-        self._warned = set() if warned is None else warned
-        # It takes a dozen megabytes, which no scene needs.
-        weakref.finalize(self, library.cache_clear)
-
-    def at(self, time: float | None = None) -> SceneContents:
-        """Contents of the stage at a time code; see `read_stage`. Raises ValueError if the time is not finite."""
-        if time is not None and not math.isfinite(time):
-            raise ValueError(f'"{self._path}": time {time}; expected a finite number, a time code')
-        code = None if time is None else float(time)
-        caught: list[warnings.WarningMessage] = []
-        try:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", CageWarning)
-                return self._contents(f'"{self._path}"', code)
-        finally:
-            for each in caught:
-                self._pass_on(each)
-
-    def _pass_on(self, warning: warnings.WarningMessage) -> None:
-        """Give a warning that was caught, if it is not one of the cage's that has been given."""
-        if not issubclass(warning.category, CageWarning):
-            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-            return
-        message = str(warning.message)
-        what = message.replace(str(self._path), "")
-        if what not in self._warned:
-            self._warned.add(what)
-            warn(message)
-
-    def _contents(self, name: str, time: float | None) -> SceneContents:
-        self._stage = self._stage or open_checked(self._path)
-        if self._first is not None and self._is_still is None:
-            self._is_still = is_still(self._stage)
-        if self._first is None or not self._is_still:
-            contents = read_open_stage(self._stage, name, time, self._camera)
-            # Kept only where it may serve.
-            self._first = contents if self._is_still is None else None
-            return contents
-        camera, resolution = read_open_camera(self._stage, name, time, self._camera)
-        return replace(self._first, camera=camera, resolution=resolution)
+    if texture_size is not None and texture_size < 1:
+        raise ValueError(f"texture_size {texture_size}; expected 1 or more")
+    with variant_set(mi):
+        look = Look(view, size, spp, texture_size=texture_size)
+        source = StageScenes(path, look, parameters, time=time, camera=camera)
+        return with_meshes(StillPicture(source).scene)

@@ -8,13 +8,12 @@ library of MaterialX 1.39 has them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents
-from .materialx_nodes import constant, is_all, is_constant, node
+from .materialx_nodes import constant, is_all, is_constant, node, node_of
 
 Given = Callable[[str], Input]
 WHITE, BLACK = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
@@ -50,30 +49,18 @@ NEUTRAL: dict[str, Input] = {
 }
 
 
-class Model(NamedTuple):
-    """The map from a model's inputs to those of `NEUTRAL`, and the names of inputs without a counterpart."""
-
-    inputs: Callable[[Given], dict[str, Input]]
-    left: tuple[str, ...]
-
-
 def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialContents:
     """A material of a model, with all inputs that the model needs; ``normal`` is in tangent space, from -1 to 1."""
-    found = {
-        key: value
-        for key, value in MODELS[model].inputs(lambda input_name: given.get(input_name, 0.0)).items()
-        if not (is_constant(value) and value == NEUTRAL[key])
-    }
+    shared = MODELS[model](lambda input_name: given.get(input_name, 0.0))
+    inputs = {key: value for key, value in shared.items() if not (is_constant(value) and value == NEUTRAL[key])}
     normal = given.get("normal", given.get("geometry_normal", 0.0))
-    if not is_constant(normal):
-        found["normal"] = normal
-    return MaterialContents(name, found)
+    return MaterialContents(name, inputs if is_constant(normal) else {**inputs, "normal": normal})
 
 
 def left_out(model: str, given: Mapping[str, Input]) -> list[str]:
     """Inputs of a material that have no place in `NEUTRAL` and are not neutral."""
     neutral = {"transmission_scatter": BLACK}
-    return [name for name in MODELS[model].left if name in given and given[name] != neutral.get(name, 0.0)]
+    return [name for name in LEFT_OUT[model] if name in given and given[name] != neutral.get(name, 0.0)]
 
 
 def standard_surface(i: Given) -> dict[str, Input]:
@@ -330,17 +317,24 @@ def _colors_of_depth(color: Input, depth: Input) -> dict[str, Input]:
     return {"transmission_color": color} if depth == 0 else {"depth_color": color, "depth": depth}
 
 
-MODELS: dict[str, Model] = {
-    "standard_surface": Model(standard_surface, (
+# Maps from a model's inputs to those of `NEUTRAL`, and the names of inputs without a counterpart.
+MODELS: dict[str, Callable[[Given], dict[str, Input]]] = {
+    "standard_surface": standard_surface,
+    "open_pbr_surface": open_pbr_surface,
+    "UsdPreviewSurface": preview_surface,
+    "gltf_pbr": gltf_pbr,
+}
+LEFT_OUT: dict[str, tuple[str, ...]] = {
+    "standard_surface": (
         "diffuse_roughness", "transmission_scatter", "transmission_scatter_anisotropy", "transmission_dispersion",
         "transmission_extra_roughness", "coat_anisotropy", "thin_film_thickness",
-    )),
-    "open_pbr_surface": Model(open_pbr_surface, (
+    ),
+    "open_pbr_surface": (
         "base_diffuse_roughness", "transmission_scatter", "transmission_scatter_anisotropy",
         "transmission_dispersion_scale", "coat_roughness_anisotropy", "thin_film_weight",
-    )),
-    "UsdPreviewSurface": Model(preview_surface, ("displacement",)),
-    "gltf_pbr": Model(gltf_pbr, ("iridescence", "dispersion")),
+    ),
+    "UsdPreviewSurface": ("displacement",),
+    "gltf_pbr": ("iridescence", "dispersion"),
 }  # fmt: skip
 # What inputs of UsdPreviewSurface are where they are not authored.
 PREVIEW: dict[str, Input] = {
@@ -362,9 +356,8 @@ PREVIEW: dict[str, Input] = {
 def with_shape(given: Input, values: Mapping[str, list[float]]) -> Input:
     """An expression with the attributes that a mesh has as constants."""
     if isinstance(given, PrimvarContents):
-        found = values.get(given.name, given.fallback)
-        return found[0] if len(found) == 1 else found
+        value = values.get(given.name, given.fallback)
+        return value[0] if len(value) == 1 else value
     if not isinstance(given, NodeContents) or given.category == "texcoord":
         return given
-    inputs = {"in_" if name == "in" else name: with_shape(each, values) for name, each in given.inputs.items()}
-    return node(given.category, given.type, **inputs)
+    return node_of(given.category, given.type, {name: with_shape(part, values) for name, part in given.inputs.items()})

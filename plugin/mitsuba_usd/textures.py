@@ -1,10 +1,10 @@
-"""Pictures of materials and lights as Mitsuba's bitmaps."""
+"""Pictures of materials and lights, and expressions of pictures and texture coordinates, as Mitsuba's bitmaps."""
 
 from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,14 +13,22 @@ import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from .baking import Baked, baked
-from .contents import NodeContents, TextureContents, leaves
-from .materialx_nodes import affine
+from .contents import NodeContents, TextureContents, leaves, parts
+from .materialx_nodes import Sampling, Values, affine, evaluate
 from .stage_warnings import StageWarnings
 from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
 # From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
 _V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
+# Pixels along the unit square of what has no picture, and of what has large ones, many times.
+LEAST_PROCEDURAL, MOST = 1024, 4096
+_PIXELS_AT_ONCE = 1 << 20
+# Values (h, w, k) of a picture's channel, and the transform (3, 3) from texture coordinates to those of the picture.
+Picture = tuple[Values, NDArray[np.float64]]
+# Values (h, w, k) of an expression over a part of the plane of texture coordinates, the uppermost row first; the
+# transform (3, 3) from texture coordinates, whose v points up, to those of the picture, from 0 to 1; and Mitsuba's name
+# of how it continues.
+Baked = tuple[NDArray[np.float32], NDArray[np.float64], str]
 
 
 class Textures:
@@ -42,24 +50,24 @@ class Textures:
 
     def read(self, uses: Iterable[TextureContents]) -> None:
         """Read the pictures of textures on all processors."""
-        first = {key: each for each in uses if (key := _key(each.file, each)) not in self._pictures}
+        first = {key: use for use in uses if (key := _key(use.file, use)) not in self._pictures}
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = pool.map(self._read, [file for file, _ in first], first.values())
-            for key, picture in zip(first, found, strict=True):
+            pictures = pool.map(self._read, [file for file, _ in first], first.values())
+            for key, picture in zip(first, pictures, strict=True):
                 self._keep(key, picture)
 
     def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
         """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
         most = None if is_radiance else 1.0
         if isinstance(given, NodeContents):
-            found = self._baked(given)
-            values = found.values[..., :3]
+            values, to_uv, wrap = self._baked(given)
+            values = values[..., :3]
             if values.shape[2] == 1:
                 values = np.repeat(values, 3, axis=2)
             elif values.shape[2] == 2:
                 # Red and green.
                 values = np.pad(values, ((0, 0), (0, 0), (0, 1)))
-            return self._bitmap(np.clip(values, 0, most), found.to_uv, found.wrap, is_raw=False)
+            return self._bitmap(np.clip(values, 0, most), to_uv, wrap, is_raw=False)
         picture = self._picture(given.file, given)
         if picture is None:
             numbers = np.broadcast_to(np.asarray(given.fallback)[given.channels], (3,))
@@ -69,8 +77,8 @@ class Textures:
     def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read."""
         if isinstance(given, NodeContents):
-            found = self._baked(given)
-            return self._bitmap(found.values[..., :1], found.to_uv, found.wrap, is_raw=True)
+            values, to_uv, wrap = self._baked(given)
+            return self._bitmap(values[..., :1], to_uv, wrap, is_raw=True)
         picture = self._picture(given.file, given)
         if picture is None:
             return float(given.fallback[given.channels[0]])
@@ -79,8 +87,8 @@ class Textures:
     def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
         if isinstance(given, NodeContents):
-            found = self._baked(given)
-            return self._bitmap((found.values + 1) / 2, found.to_uv, found.wrap, is_raw=True)
+            values, to_uv, wrap = self._baked(given)
+            return self._bitmap((values + 1) / 2, to_uv, wrap, is_raw=True)
         picture = self._picture(given.file, given)
         halved = affine(given, 0.5, 0.5)
         return None if picture is None or halved is None else self._plain(halved, picture, is_raw=True)
@@ -88,12 +96,11 @@ class Textures:
     def mean(self, given: TextureContents | NodeContents) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
         if isinstance(given, NodeContents):
-            values: NDArray = self._baked(given).values
+            values: NDArray = self._baked(given)[0]
+        elif (source := self._source(given)) is not None:
+            values = source[0]
         else:
-            found = self._source(given)
-            if found is None:
-                return np.asarray(given.fallback)[given.channels]
-            values = found[0]
+            return np.asarray(given.fallback)[given.channels]
         return np.asarray(values.mean(axis=(0, 1), dtype=np.float64))
 
     def _baked(self, expression: NodeContents) -> Baked:
@@ -101,13 +108,13 @@ class Textures:
         if id(expression) not in self._expressions:
             # Kept with the expression, so that no other has its identity.
             try:
-                found = baked(expression, self._source)
+                values = baked(expression, self._source)
             except (ValueError, IndexError):
                 what = f'expressions of "{expression.category}" with values of other types are ignored; 0.5 is used'
-                files = [each.file for each in leaves(expression) if isinstance(each, TextureContents)]
+                files = [source.file for source in leaves(expression) if isinstance(source, TextureContents)]
                 self._notes.add(what, ", ".join(files))
-                found = Baked(np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat")
-            self._expressions[id(expression)] = expression, found
+                values = np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat"
+            self._expressions[id(expression)] = expression, values
         return self._expressions[id(expression)][1]
 
     def _source(self, texture: TextureContents) -> tuple[NDArray, NDArray[np.float64]] | None:
@@ -126,7 +133,7 @@ class Textures:
         """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
         to_uv, pixels, channels = picture.to_uv @ texture.to_uv, picture.pixels, texture.channels
         is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
-        is_same = all(texture.scale[each] == 1 and texture.bias[each] == 0 for each in channels)
+        is_same = all(texture.scale[k] == 1 and texture.bias[k] == 0 for k in channels)
         if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
             return self._bitmap(_values(picture, texture), to_uv, texture.wrap, is_raw)
         key = texture.file, texture.channel, is_decoded
@@ -147,13 +154,13 @@ class Textures:
             self._keep(key, self._read(path, use))
         return self._pictures[key]
 
-    def _keep(self, key: tuple[str, str | None], found: TextureImage | Exception) -> None:
-        if isinstance(found, Exception):
+    def _keep(self, key: tuple[str, str | None], picture: TextureImage | Exception) -> None:
+        if isinstance(picture, Exception):
             # Python's own text of a missing file repeats its path, with a number.
-            said = (isinstance(found, OSError) and found.strerror) or str(found).strip()
-            reason = said.splitlines()[-1] if said else type(found).__name__
+            said = (isinstance(picture, OSError) and picture.strerror) or str(picture).strip()
+            reason = said.splitlines()[-1] if said else type(picture).__name__
             self._notes.add("images that cannot be read are replaced by their fallback", f"{key[0]}: {reason}")
-        self._pictures[key] = None if isinstance(found, Exception) else found
+        self._pictures[key] = None if isinstance(picture, Exception) else picture
 
     def _read(self, path: str, use: TextureContents | None) -> TextureImage | Exception:
         try:
@@ -197,3 +204,110 @@ def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
     if len(channels) == 1 and channels[0] < 3:
         return pixels[..., :1]
     return with_alpha(pixels)[..., channels]
+
+
+def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]) -> Baked:
+    """Values of an expression; where there is no picture of a texture, its fallback is taken.
+
+    Where all pictures lie in one place of the plane, at the resolution of the largest; else over the unit square, which
+    repeats.
+    """
+    sources = leaves(expression)
+    textures = [source for source in sources if isinstance(source, TextureContents)]
+    pictures = {id(texture): picture_of(texture) for texture in textures}
+    maps = [picture[1] @ texture.to_uv for texture in textures if (picture := pictures[id(texture)]) is not None]
+    sizes = [picture[0].shape[:2] for picture in pictures.values() if picture is not None]
+    wraps = {texture.wrap for texture in textures}
+    is_direct = len(textures) == len(sources) and not samples_elsewhere(expression)
+    if is_direct and maps and len(wraps) == 1 and all(np.allclose(matrix, maps[0]) for matrix in maps):
+        height, width = np.max(sizes, axis=0)
+        grid = _Grid((int(height), int(width)), maps[0], pictures, is_shared=True)
+        return _filled(expression, grid), maps[0], wraps.pop()
+    wanted = [LEAST_PROCEDURAL] if not is_direct or not sizes else []
+    for size, to_uv in zip(sizes, maps, strict=True):
+        wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
+    edge = min(max(wanted, default=1), MOST)
+    wrap = "repeat" if textures else _procedural_wrap(expression)
+    return _filled(expression, _Grid((edge, edge), np.eye(3), pictures, is_shared=False)), np.eye(3), wrap
+
+
+def _filled(expression: NodeContents, grid: _Grid) -> NDArray[np.float32]:
+    """Values at all pixels, some rows at a time, as an expression has many arrays at once."""
+    count = grid.height if "heighttonormal" in _categories(expression) else max(1, _PIXELS_AT_ONCE // grid.width)
+    parts = []
+    for first in range(0, grid.height, count):
+        grid.choose_rows(np.arange(first, min(first + count, grid.height)))
+        values = evaluate(expression, grid)
+        parts.append(np.broadcast_to(values, (len(grid.rows), grid.width, values.shape[-1])).astype(np.float32))
+    return np.concatenate(parts)
+
+
+def _categories(expression: NodeContents) -> set[str]:
+    return {part.category for part in parts(expression) if isinstance(part, NodeContents)}
+
+
+def samples_elsewhere(expression: NodeContents) -> bool:
+    """Whether an expression computes the texture coordinates of a picture."""
+    return "image" in _categories(expression)
+
+
+def _procedural_wrap(expression: NodeContents) -> str:
+    """Only ramps do not repeat: they continue with their last value."""
+    names = _categories(expression)
+    is_noise = any("noise" in name or "fractal" in name for name in names)
+    return "clamp" if names & {"ramplr", "ramptb", "splitlr", "splittb"} and not is_noise else "repeat"
+
+
+class _Grid(Sampling):
+    """Centres of pixels of some rows, in the part of the plane that all pictures share or over the unit square."""
+
+    def __init__(
+        self, size: tuple[int, int], to_uv: NDArray[np.float64], pictures: dict[int, Picture | None], is_shared: bool
+    ) -> None:
+        self.height, self.width = size
+        self._to_uv, self._pictures, self._is_shared = to_uv, pictures, is_shared
+
+    def choose_rows(self, rows: NDArray[np.int64]) -> None:
+        u = (np.arange(self.width) + 0.5) / self.width
+        self.rows, self.texcoords = rows, np.stack(np.meshgrid(u, 1 - (rows + 0.5) / self.height), axis=-1)
+
+    def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
+        picture = self._pictures[id(texture)]
+        if picture is None:
+            return np.asarray(texture.fallback, dtype=np.float32)[texture.channels]
+        values, to_uv = picture
+        if texcoords is None and self._is_shared:
+            if values.shape[:2] == (self.height, self.width):
+                return values[self.rows]
+            return _looked_up(values, self.texcoords, "clamp")
+        matrix = to_uv @ texture.to_uv
+        points = self.texcoords if texcoords is None else texcoords
+        return _looked_up(values, points @ matrix[:2, :2].T + matrix[:2, 2], texture.wrap)
+
+    def gradient(self, values: Values) -> Values:
+        if values.ndim < 3:
+            return np.zeros(2)
+        height = values[..., 0]
+        dv, du = np.gradient(height) if min(height.shape) > 1 else (np.zeros_like(height), np.zeros_like(height))
+        return np.stack([du * self.width, -dv * self.height], axis=-1) @ self._to_uv[:2, :2]
+
+
+def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
+    """Bilinear interpolation at ``(..., 2)``, whose v points up."""
+    height, width = values.shape[:2]
+    x, y = uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5
+    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    s, t = (x - column)[..., None].astype(np.float32), (y - row)[..., None].astype(np.float32)
+    columns = [_wrapped(column + i, width, wrap) for i in (0, 1)]
+    rows = [_wrapped(row + j, height, wrap) for j in (0, 1)]
+    upper, lower = (values[line, columns[0]] * (1 - s) + values[line, columns[1]] * s for line in rows)
+    return upper * (1 - t) + lower * t
+
+
+def _wrapped(index: NDArray[np.int64], count: int, wrap: str) -> NDArray[np.int64]:
+    if wrap == "repeat":
+        return index % count
+    if wrap == "mirror":
+        index = index % (2 * count)
+        return np.minimum(index, 2 * count - 1 - index)
+    return np.clip(index, 0, count - 1)

@@ -103,7 +103,7 @@ def _cages(path):
         if not path.suffix.startswith(".usd"):
             yield ControlCage.from_file(path)
             return
-        from mitsuba_usd.stage_scenes import StageReader
+        from mitsuba_usd.stage_walk import StageReader
 
         reader = StageReader(path, None)
         contents = reader.at(None)

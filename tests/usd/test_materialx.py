@@ -10,11 +10,10 @@ import pytest
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_usd.materialx_layers import library
-from mitsuba_usd.stage_scenes import StageReader
+from mitsuba_usd.stage_walk import StageReader
+from pxr import Sdf
 from usd.stages import SQUARE, bound, camera, mesh, moved, prim, shader, told, write
 
-pytest.importorskip("MaterialX")
-Sdf = pytest.importorskip("pxr.Sdf")
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
 RED_SQUARE = mesh("square", SQUARE, bound("Looks/Red"))

@@ -1,14 +1,13 @@
 """What MaterialX nodes compute, against values by hand and a second implementation of the noises."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mitsuba_usd import baking
-from mitsuba_usd.baking import _procedural_wrap, baked
+from mitsuba_usd import textures
 from mitsuba_usd.contents import NodeContents, TextureContents, leaves
-from mitsuba_usd.materialx_nodes import evaluate, node, operation
+from mitsuba_usd.materialx_nodes import Sampling, evaluate, node, operation
+from mitsuba_usd.textures import _procedural_wrap, baked
 
 UV = NodeContents("texcoord", "vector2", {"name": "st"})
 
@@ -20,7 +19,7 @@ def picture(channel="rgb", name="a.png", to_uv=None, wrap="repeat"):
 
 def at(points):
     """What an expression is evaluated at: texture coordinates."""
-    return SimpleNamespace(texcoords=lambda: np.asarray(points, dtype=float))
+    return Sampling(np.asarray(points, dtype=float))
 
 
 GREY = [0.2, 0.5, 0.7]
@@ -169,14 +168,14 @@ def source(pixels):
 
 def test_pictures_of_one_place_are_joined_there(monkeypatch):
     """At the resolution of the larger one, in the place where both lie, some rows at a time."""
-    monkeypatch.setattr(baking, "_PIXELS_AT_ONCE", 18)
+    monkeypatch.setattr(textures, "_PIXELS_AT_ONCE", 18)
     random = np.random.default_rng(4)
     pixels = {"a.png": random.random((4, 6, 3)), "b.png": np.full((2, 3, 1), 0.25)}
     tiled = [[2, 0, 0.5], [0, 3, 0], [0, 0, 1]]
     expression = node("mix", "color3", bg=picture(to_uv=tiled), fg=[1.0, 0.0, 0.0], mix=picture("r", "b.png", tiled))
-    found = baked(expression, source(pixels))
-    np.testing.assert_allclose(found.to_uv, tiled)
-    np.testing.assert_allclose(found.values, pixels["a.png"] * 0.75 + [0.25, 0, 0], atol=1e-6)
+    values, to_uv, _ = baked(expression, source(pixels))
+    np.testing.assert_allclose(to_uv, tiled)
+    np.testing.assert_allclose(values, pixels["a.png"] * 0.75 + [0.25, 0, 0], atol=1e-6)
 
 
 def test_what_lies_in_several_places_is_computed_over_the_unit_square(monkeypatch):
@@ -184,31 +183,31 @@ def test_what_lies_in_several_places_is_computed_over_the_unit_square(monkeypatc
     pixels = {"a.png": np.array([[[1.0], [0.0]], [[0.0], [1.0]]])}
     often = np.diag([2.0, 1.0, 1.0])
     expression = node("multiply", "float", in1=picture("r"), in2=picture("r", to_uv=often))
-    found = baked(expression, source(pixels))
-    assert (found.values.shape, found.wrap) == ((4, 4, 1), "repeat")
+    values, _, wrap = baked(expression, source(pixels))
+    assert (values.shape, wrap) == ((4, 4, 1), "repeat")
     # Bilinear between the centres of texels.
     one, two = np.array([0.75, 0.75, 0.25, 0.25]), np.array([1, 0, 1, 0])
-    np.testing.assert_allclose(found.values[0, :, 0][1:3], (one * two)[1:3], atol=0.3)
-    monkeypatch.setattr(baking, "MOST", 16)
+    np.testing.assert_allclose(values[0, :, 0][1:3], (one * two)[1:3], atol=0.3)
+    monkeypatch.setattr(textures, "MOST", 16)
     large = picture("r", to_uv=np.diag([1e6, 1e6, 1.0]))
-    assert baked(node("add", "float", in1=large, in2=picture("r")), source(pixels)).values.shape[:2] == (16, 16)
+    assert baked(node("add", "float", in1=large, in2=picture("r")), source(pixels))[0].shape[:2] == (16, 16)
 
 
 def test_heights_become_normals(monkeypatch):
     """A plane of slope 1 along u: the scale of the filter is 1 / 16."""
-    monkeypatch.setattr(baking, "LEAST_PROCEDURAL", 64)
+    monkeypatch.setattr(textures, "LEAST_PROCEDURAL", 64)
     height = np.broadcast_to((np.arange(64) + 0.5) / 64, (64, 64))[..., None]
     for repeats in (1, 2):
         # A picture that is repeated is steeper.
         tiled = picture("r", to_uv=np.diag([repeats, 1.0, 1.0]))
         expression = NodeContents("heighttonormal", "vector3", {"in": tiled, "scale": 16.0})
-        found = baked(expression, source({"a.png": height})).values
+        found = baked(expression, source({"a.png": height}))[0]
         expected = np.array([-repeats, 0, 1]) / np.sqrt(1 + repeats**2)
         np.testing.assert_allclose(found[32, 32] * 2 - 1, expected, atol=1e-3)
     one = node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
     varying = node("multiply", "float", in1=picture("r"), in2=one)
     expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
-    found = baked(expression, source({"a.png": height})).values
+    found = baked(expression, source({"a.png": height}))[0]
     np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
 
 
@@ -218,7 +217,7 @@ def test_lookups_of_a_linear_image_are_linear(np_rng):
     values = (2 * x + 3 * y).astype(np.float64)[..., None]
     column, row = np_rng.uniform(0, [6, 4], (50, 2)).T
     uv = np.stack([(column + 0.5) / 7, 1 - (row + 0.5) / 5], axis=1)
-    found = baking._looked_up(values, uv, "clamp")
+    found = textures._looked_up(values, uv, "clamp")
     np.testing.assert_allclose(found[:, 0], 2 * column + 3 * row, rtol=0, atol=1e-5)
 
 

@@ -17,8 +17,8 @@ from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGL
 from mitsuba_usd import copies
 from mitsuba_usd.contents import InstanceContents, ShapeContents
 from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
-from mitsuba_usd.limit_surfaces import DENSE, Surfaces
-from mitsuba_usd.rates import segments_of, triangles_for_picture
+from mitsuba_usd.picture_detail import segments_of, triangles_for_picture
+from mitsuba_usd.shapes import DENSE, Surfaces, subdivision
 from mitsuba_usd.stage_warnings import StageWarnings
 from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
 
@@ -153,12 +153,14 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
         assert surfaces.of(one) is surfaces.of(other)
         assert surfaces.of(one) is not surfaces.of(moved)
         assert surfaces.of(replace(one, scheme="doo_sabin")) is not surfaces.of(one)
-    for each in (one, other, moved):
+    entries = []
+    for cage in (one, other, moved):
         notes = StageWarnings()
-        surfaces.note_warnings(ShapeContents(each.source.name, each, np.eye(4)), notes)
-        with pytest.warns(CageWarning, match=f"^{each.source.name}: 1 of 9 vertices"):
+        shape = ShapeContents(cage.source.name, cage, np.eye(4))
+        entries.append(subdivision(shape, surfaces, None, None, {}, notes))
+        with pytest.warns(CageWarning, match=f"^{cage.source.name}: 1 of 9 vertices"):
             notes.warn("stage")
-    first, second, third = (surfaces.properties(each) for each in (one, other, moved))
+    first, second, third = entries
     assert first["face_vertices"] is second["face_vertices"]
     assert not np.array_equal(np.array(first["positions"]), np.array(third["positions"]))
 

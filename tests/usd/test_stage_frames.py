@@ -15,14 +15,13 @@ from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turnt
 from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_usd import shapes, stage_scenes
-from mitsuba_usd.limit_surfaces import Surfaces
 from mitsuba_usd.scene_entries import SceneEntries
-from mitsuba_usd.stage_scenes import StageReader, StageScenes
-from mitsuba_usd.stage_walk import is_still, open_checked
+from mitsuba_usd.shapes import Surfaces
+from mitsuba_usd.stage_scenes import StageScenes
+from mitsuba_usd.stage_walk import StageReader, _StageWalk, is_still, open_checked
 from usd.moving_stages import BARE, CAMERA, FLOOR, INSTANCES, LAMP, LAMP_MOVES, MOVING, STILL, WHOLE, placed, write
 from usd.stages import CUBE, FACES, POINTS, POLYGONS, SQUARE, moved, prim, told
 
-pytest.importorskip("pxr")
 scalar = pytest.mark.usefixtures("variant_scalar_rgb")
 both_variants = pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
 
@@ -120,7 +119,7 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
 @scalar
 def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, monkeypatch):
     """On a rig, with its focal length and its focus."""
-    made = [recorded(monkeypatch, stage_scenes, name) for name in ("SceneEntries", "read_open_stage")]
+    made = [recorded(monkeypatch, stage_scenes, "SceneEntries"), recorded(monkeypatch, _StageWalk, "contents")]
     focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
     lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"
     rig = prim("Xform", "rig", RIG, CAMERA.replace("float focalLength = 35", lens))

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_usd import surface_models
-from mitsuba_usd.bsdfs import Bsdfs, interior
+from mitsuba_usd.bsdfs import bsdf, interior
 from mitsuba_usd.contents import ShapeContents, TextureContents
 from mitsuba_usd.materialx_layers import library, numbers
 from mitsuba_usd.materialx_nodes import node
 from mitsuba_usd.stage_warnings import StageWarnings
-from mitsuba_usd.surface_models import MODELS, PREVIEW, conductor, conductor_reflectance
+from mitsuba_usd.surface_models import LEFT_OUT, MODELS, PREVIEW, conductor, conductor_reflectance
 from mitsuba_usd.textures import Textures
 from usd.stages import told
 
-pytest.importorskip("MaterialX")
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
 MATERIALX = ("standard_surface", "open_pbr_surface", "gltf_pbr")
@@ -43,7 +42,7 @@ def entry(material):
     notes = StageWarnings()
     cage = CageContents(np.zeros((3, 3)), np.array([3]), np.arange(3))
     shape = ShapeContents("/shape", cage, np.eye(4))
-    return Bsdfs(Textures(notes), notes).surface(material, shape), notes
+    return bsdf(material, shape, Textures(notes), notes), notes
 
 
 def bsdf_of(model, **given):
@@ -263,8 +262,8 @@ def test_the_strength_of_reflections_is_an_index_of_refraction():
     """Half of 0.04 head-on, and what a specular workflow says."""
     half = bsdf_of("standard_surface", specular=0.5)
     strong = bsdf_of("UsdPreviewSurface", useSpecularWorkflow=1.0, specularColor=[0.2] * 3, metallic=1.0)
-    for bsdf, expected in ((half, 0.02), (strong, 0.2)):
-        assert ((bsdf["eta"] - 1) / (bsdf["eta"] + 1)) ** 2 == pytest.approx(expected)
+    for found, expected in ((half, 0.02), (strong, 0.2)):
+        assert ((found["eta"] - 1) / (found["eta"] + 1)) ** 2 == pytest.approx(expected)
     assert strong["metallic"] == 0
 
 
@@ -334,9 +333,9 @@ def test_every_input_of_every_model_is_taken_or_told():
             read.add(key)
             return {"alpha_mode": 2.0, "opacityMode": "", "thickness": 1.0}.get(key, 0.5)
 
-        MODELS[model].inputs(given)
-        MODELS[model].inputs(lambda key, given=given: 1.0 if key == "useSpecularWorkflow" else given(key))
+        MODELS[model](given)
+        MODELS[model](lambda key, given=given: 1.0 if key == "useSpecularWorkflow" else given(key))
         declared = {each.getName() for each in library().getNodeDef(f"ND_{model}_surfaceshader").getActiveInputs()}
         assert read <= declared | {"attenuation_distance"}
-        missing = declared - read - set(MODELS[model].left) - silent
+        missing = declared - read - set(LEFT_OUT[model]) - silent
         assert missing <= {"alpha_cutoff", "thin_film_thickness"}, (model, missing)

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage.contents import Attribute, CageContents
-from mitsuba_usd.baking import Baked
 from mitsuba_usd.contents import InstanceContents, MaterialContents, NodeContents, ShapeContents, TextureContents
+from mitsuba_usd.picture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_usd.stage_warnings import StageWarnings
-from mitsuba_usd.texture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_usd.texture_image import halvings, read_texture_image, reduced
 from mitsuba_usd.textures import Textures
 from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
@@ -170,7 +169,7 @@ def test_a_jpeg_of_many_pixels_is_no_attack(tmp_path, monkeypatch):
 
 def test_two_components_are_red_and_green(monkeypatch):
     values = np.random.default_rng(1).random((4, 4, 2)).astype(np.float32)
-    monkeypatch.setattr("mitsuba_usd.textures.baked", lambda *_: Baked(values, np.eye(3), "repeat"))
+    monkeypatch.setattr("mitsuba_usd.textures.baked", lambda *_: (values, np.eye(3), "repeat"))
     given = NodeContents("texcoord", "vector2", {"name": "st"})
     found = np.array(Textures(StageWarnings()).color(given)["bitmap"])
     np.testing.assert_array_equal(found, np.pad(values, ((0, 0), (0, 0), (0, 1))))

@@ -10,7 +10,6 @@ import pytest
 from mitsuba_usd import stage_warnings
 from usd.stages import CUBE, POLYGONS, bound, material, mesh, prim, shader, subset, texture, told, write
 
-pytest.importorskip("pxr")
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 POINTS, COUNTS, VERTICES = CUBE.splitlines()
 

@@ -14,13 +14,12 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_usd import materialx_layers, stage_meshes
-from mitsuba_usd.stage_walk import read_stage
+from mitsuba_usd.stage_walk import StageReader
 from mitsuba_usd.texture_image import read_texture_image
 from scipy.spatial import cKDTree
 from usd import stages
 from usd.stages import CUBE, POLYGONS, SQUARE, bound, camera, material, mesh, moved, prim, shader, subset, texture, told
 
-pytest.importorskip("pxr")
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
 # The largest light is 5 units wide at a distance of 7: what its sides send comes from farther away, and at an angle.
@@ -232,7 +231,7 @@ def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
             + material(lines("color3f inputs:diffuseColor", "float inputs:roughness"))
             + mesh("parts", CUBE, part)
         )
-        return read_stage(stage(text, head=NAMED))
+        return StageReader(stage(text, head=NAMED)).at()
 
     plain, *others = map(contents, ("default", "samples", "both"))
     assert {shape.name for shape in plain.shapes} == {"/cube", "/parts"}
@@ -244,7 +243,7 @@ def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
     """USD looks for the times of its samples for ever."""
     move = moved(translate="").replace(" = \n", ".timeSamples = { 1: (0, 0, 3), 2: (0, 0, 4) }\n", 1)
     (tmp_path / "layer.usda").write_text(f"#usda 1.0\n( timeCodesPerSecond = 24 )\n{mesh('cube', CUBE, move)}")
-    (shape,) = read_stage(stage("", head="subLayers = [@layer.usda@]\n    timeCodesPerSecond = 0")).shapes
+    (shape,) = StageReader(stage("", head="subLayers = [@layer.usda@]\n    timeCodesPerSecond = 0")).at().shapes
     np.testing.assert_array_equal(shape.to_world[:3, 3], [0, 0, 3])
 
 
@@ -253,7 +252,7 @@ def test_velocities_of_meshes_are_told_between_samples(stage, time):
     points, _, faces = CUBE.partition("\n")
     samples = "timeSamples = {{ 1: {0}, 2: {0} }}".format(points.partition(" = ")[2])
     path = stage(mesh("cube", f"point3f[] points.{samples}", faces, f"vector3f[] velocities.{samples}"))
-    _, messages = told(read_stage, path, time)
+    _, messages = told(StageReader(path).at, time)
     is_told = ["velocities of meshes are ignored; their points are interpolated" in each for each in messages]
     assert is_told == [True] * (time in (1.5, 3))
 
@@ -350,7 +349,7 @@ def test_a_mesh_of_several_materials_is_read_once_for_the_primvars_they_need(sta
     names = ["paint_0", "paint_1"]
     subsets = [subset([number], name, f"part_{number}") for number, name in enumerate(names)]
     paints = [material(f"color3f inputs:diffuseColor = (1, {k}, 0)", name=name) for k, name in enumerate(names)]
-    shapes = read_stage(stage("".join(paints) + mesh("cube", CUBE, *subsets))).shapes
+    shapes = StageReader(stage("".join(paints) + mesh("cube", CUBE, *subsets))).at().shapes
     plain, *painted = shapes
     assert painted[0].cage is painted[1].cage is not plain.cage
     assert [each.shown_faces.tolist() for each in shapes] == [[2, 3, 4, 5], [0], [1]]
@@ -729,7 +728,7 @@ LIGHT_KINDS += [("SphereLight", 1, "point", [0.5]), ("CylinderLight", 0, "cylind
 def test_lights_are_as_large_as_usd_says_and_shine_everywhere(stage, schema, is_point, kind, size):
     """Where nothing else is said; spheres are points where the stage says so."""
     path = stage(light(schema, f"bool treatAsPoint = {is_point}", apis=["ShapingAPI", "ShadowAPI"]))
-    contents, messages = told(read_stage, path)
+    contents, messages = told(StageReader(path).at)
     assert ([(each.kind, each.size) for each in contents.lights], messages) == ([(kind, size)], [])
 
 
@@ -909,7 +908,9 @@ def test_render_settings_turn_off_blur(stage, name):
     view = camera("float fStop = 2", "float focusDistance = 7", shutter) + mesh("cube", CUBE)
     blurs = name == "disableDepthOfField"
     for value, is_off in (("false", [False, False]), ("true", [not blurs, blurs])):
-        found = read_stage(stage(settings(RESOLUTION, f"uniform bool {name} = {value}") + view, head=NAMED)).camera
+        found = (
+            StageReader(stage(settings(RESOLUTION, f"uniform bool {name} = {value}") + view, head=NAMED)).at().camera
+        )
         assert [found.shutter == [0, 0], found.lens_radius == 0] == is_off
 
 
@@ -947,7 +948,7 @@ def test_what_the_frame_does_not_follow_is_told_once(scene, line, message):
 def test_render_settings_that_the_stage_does_not_name_are_told(stage, head):
     path = stage(settings(RESOLUTION) + CAMERA + mesh("cube", CUBE), head=head)
     with pytest.warns(CageWarning, match=r"render settings are those that .* all others are ignored \(/settings\)"):
-        assert read_stage(path).resolution is None
+        assert StageReader(path).at().resolution is None
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import CageWarning
 from mitsuba_subdivision.files.usd_reader import read_usd
-from mitsuba_usd.stage_scenes import StageReader
+from mitsuba_usd.stage_walk import StageReader
 from usd import stages
 from usd.stages import moved, prim
-
-pytest.importorskip("pxr")
 
 # UsdSkel computes in float32, of lengths up to 8.
 FLOAT32 = 5e-6

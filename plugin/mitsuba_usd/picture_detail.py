@@ -1,0 +1,157 @@
+"""What a picture shows: triangles of limit surfaces that suffice for it, and pixels of textures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from mitsuba_subdivision.cage import CageContents, CageError, ControlCage
+from mitsuba_subdivision.mesh import IntArray, ragged
+from mitsuba_subdivision.schemes import SchemeError
+from mitsuba_subdivision.studio import (
+    MOST_SEGMENTS,
+    MOST_TRIANGLES,
+    box_corners,
+    highest_rate,
+    outline_for,
+    pixels_of_boxes,
+    segments_for,
+    triangles_for,
+)
+from mitsuba_subdivision.variants import SceneNode
+from numpy.typing import NDArray
+
+from .contents import NodeContents, SceneContents, ShapeContents, TextureContents, leaves
+from .shapes import Surfaces
+from .textures import samples_elsewhere
+
+# Texels for each pixel: filters see details of half a pixel, and glass magnifies.
+TEXELS_PER_PIXEL = 2.0
+# Edges of a mesh that count: a few may have collapsed in the texture. Of these, so many are measured.
+_MOST_EDGES, _MOST_SAMPLES = 0.95, 20_000
+
+
+def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:
+    """Parameters of every limit surface, with as many segments on each edge as most triangles allow by default."""
+    if is_chosen(parameters):
+        return parameters
+    corners = sum(int(shape.cage.face_sizes.sum()) for shape in contents.all_shapes if shape.cage.scheme is not None)
+    # A quadrilateral has four corners, and two triangles for each square of the rate.
+    most = math.sqrt(2 * MOST_TRIANGLES / max(corners, 1))
+    return {**parameters, "tessellation_rate": int(np.clip(most, 1, MOST_SEGMENTS))}
+
+
+def is_chosen(parameters: dict[str, Any]) -> bool:
+    """Whether the parameters of limit surfaces determine their tessellation."""
+    return bool({"tessellation_rate", "tessellation"} & parameters.keys())
+
+
+def triangles_for_picture(
+    contents: SceneContents,
+    segments: Mapping[ShapeContents, IntArray],  # dict of (n,) int array by shape: see `segments_of`
+    outline: SceneNode,  # Of the sensor; see `outline_for`
+    parameters: dict[str, Any],  # Of every limit surface: the shading, and how many segments there are at most
+    *,
+    follows_sensor: bool = True,  # Whether the scene is rendered by this sensor only
+) -> dict[ShapeContents, dict[str, Any]]:
+    """Parameters of limit surfaces with the fewest triangles whose facets do not show in an image.
+
+    With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
+    Cages that cannot be used are missing.
+    """
+    most = parameters["tessellation_rate"]
+    needed = {shape: int(segments[shape].max()) for shape in contents.all_shapes if shape in segments}
+    chosen: dict[ShapeContents, dict[str, Any]] = {
+        shape: {"tessellation_rate": min(rate, most)} for shape, rate in needed.items()
+    }
+    if needed and parameters["shading"] == "exact" and follows_sensor and "displacement" not in parameters:
+        corners = {shape: int(shape.cage.face_sizes.sum()) for shape in needed}
+        highest = highest_rate(np.array([*needed.values()]), np.array([*corners.values()]))
+        for shape in contents.shapes:
+            if shape in needed:
+                chosen[shape] = triangles_for(needed[shape], corners[shape], most, outline, highest)
+    return chosen
+
+
+def segments_of(
+    contents: SceneContents, surfaces: Surfaces, outline: SceneNode, near_clip: float, shading: str
+) -> dict[ShapeContents, IntArray]:
+    """Segments on each edge of limit surfaces that a picture needs, at most `FINEST_RATE`; see `segments_for`.
+
+    An array ``(n,)`` for the copies of each shape, in the order of ``contents.placed_shapes``. Cages that cannot be
+    used are missing.
+    """
+    of_shape: dict[ShapeContents, list[NDArray[np.float64]]] = {}
+    for shape, to_world in contents.placed_shapes:
+        if shape.cage.scheme is not None:
+            of_shape.setdefault(shape, []).append(to_world)
+    of_cage: dict[ControlCage, list[ShapeContents]] = {}
+    for shape in of_shape:
+        with suppress(CageError, SchemeError):
+            of_cage.setdefault(surfaces.of(shape.cage).surface.cage, []).append(shape)
+    needed: dict[ShapeContents, IntArray] = {}
+    for cage, alike in of_cage.items():
+        copies = np.concatenate([of_shape[shape] for shape in alike])
+        counts = [len(of_shape[shape]) for shape in alike]
+        segments = np.split(segments_for(cage, copies, outline, near_clip, shading), np.cumsum(counts)[:-1])
+        needed |= dict(zip(alike, segments, strict=True))
+    return needed
+
+
+def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
+    """Pixels along the sides of textures that pictures by sensors show at most, by file; of tiles, along those of each.
+
+    Files of which the detail is unknown are missing, or have no bound.
+    """
+    seen = [(outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
+    matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}
+    for shape, to_world in contents.placed_shapes:
+        if shape.material is not None:
+            matrices.setdefault(shape, []).append(to_world)
+    needed: dict[str, float] = {}
+    for shape, copies in matrices.items():
+        texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape.cage, np.stack(copies), seen)
+        inputs = contents.materials[shape.material or 0].inputs.values()
+        # Where pictures are read at computed coordinates, the detail is unknown.
+        known = [given for given in inputs if not (isinstance(given, NodeContents) and samples_elsewhere(given))]
+        for texture in (leaf for given in known for leaf in leaves(given)):
+            if isinstance(texture, TextureContents):
+                # Pictures along a unit of texture coordinates.
+                repeats = np.linalg.norm(texture.to_uv[:2, :2], axis=0).max()
+                most = texels / repeats if repeats > 0 else np.inf
+                needed[texture.file] = max(most, needed.get(texture.file, 0.0))
+    return needed
+
+
+def _pixels_of_texcoords(
+    cage: CageContents,
+    to_world: NDArray[np.float64],  # (n, 4, 4): of copies
+    seen: Sequence[tuple[SceneNode, float]],
+) -> float:
+    """Pixels that a unit of texture coordinates takes at most, for most edges of copies of a mesh; else no bound."""
+    texcoords = cage.texcoords
+    if texcoords is None:
+        return np.inf
+    corners = np.arange(0, len(cage.face_vertices), 1 + len(cage.face_vertices) // _MOST_SAMPLES)
+    offsets = ragged.offsets(cage.face_sizes)
+    following = np.arange(1, len(cage.face_vertices) + 1)
+    following[offsets[1:] - 1] = offsets[:-1]
+    ends = np.stack([corners, following[corners]])
+    vertices = np.asarray(cage.face_vertices)[ends]
+    index = vertices if texcoords.indices is None else np.asarray(texcoords.indices)[ends]
+    lengths, in_texture = (
+        np.linalg.norm(np.diff(np.asarray(values, dtype=np.float64)[rows], axis=0)[0], axis=1)
+        for values, rows in ((cage.positions, vertices), (texcoords.values, index))
+    )
+    there = in_texture > 0
+    if not there.any():
+        return np.inf
+    linear, shifts = to_world[:, :3, :3], to_world[:, None, :3, 3]
+    box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
+    corners_of_copies = box_corners(box) @ linear.transpose(0, 2, 1) + shifts
+    pixels = np.max([pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
+    ratio = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
+    return ratio * float((np.linalg.norm(linear, 2, axis=(1, 2)) * pixels).max())

@@ -1,0 +1,245 @@
+"""Lights of UsdLux, cameras, and render settings as plain data."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from mitsuba_subdivision.files import value_at
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom, UsdLux, UsdRender
+
+from .contents import CameraContents, LightContents
+from .stage_warnings import StageWarnings
+
+# Kind of each type, and attributes for its sizes. The schemas of lights say what they are without a value.
+_KINDS: dict[str, tuple[str, ...]] = {
+    "DistantLight": ("distant", "inputs:angle"),
+    "RectLight": ("rect", "inputs:width", "inputs:height"),
+    "DiskLight": ("disk", "inputs:radius"),
+    "SphereLight": ("sphere", "inputs:radius"),
+    "CylinderLight": ("cylinder", "inputs:length", "inputs:radius"),
+    "DomeLight": ("dome",),
+    "DomeLight_1": ("dome",),
+}
+# Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
+_POINTLIKE = 1.0
+_CONE = "inputs:shaping:cone:angle"
+# Attributes of lights that are ignored, and the values that have no effect.
+_NEUTRAL_OF_LIGHTS = {
+    "inputs:diffuse": 1,
+    "inputs:specular": 1,
+    _CONE: 90,
+    "inputs:shaping:focus": 0,
+    "inputs:shaping:ies:file": None,
+    "inputs:shadow:enable": True,
+}
+# Values of attributes that are ignored, with which they have no effect.
+_NEUTRAL_SETTINGS: dict[str, list[Any]] = {
+    "pixelAspectRatio": [1.0],
+    "dataWindowNDC": [[0, 0, 1, 1]],
+    "includedPurposes": [["default", "render"]],
+    "materialBindingPurposes": [["full", ""], ["full", "preview"]],
+    "renderingColorSpace": ["", "lin_rec709", "lin_rec709_scene"],
+}
+_NEUTRAL_EXPOSURE = {
+    "exposure": 0.0,
+    "exposure:iso": 100.0,
+    "exposure:time": 1.0,
+    "exposure:fStop": 1.0,
+    "exposure:responsivity": 1.0,
+}
+# The schema's fallback of clippingRange.
+_CLIPPING_RANGE = (1.0, 1e6)
+# Of aspectRatioConformPolicy, as `sensors.film_window` has them.
+_CONFORM_POLICIES = ("expandAperture", "cropAperture", "adjustApertureWidth", "adjustApertureHeight")
+# Apertures and focal lengths are in tenths of the world's unit.
+_TENTHS = 0.1
+
+
+def read_light(
+    prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
+) -> LightContents | None:
+    """Read a light with a transform ``(4, 4)`` for column vectors; None if its kind is not supported."""
+    path, given = prim.GetPath(), str(prim.GetTypeName())
+    if given not in _KINDS:
+        notes.add(f"lights of type {given} are ignored; expected one of {', '.join(_KINDS)}", path)
+        return None
+    _note_ignored(prim, time, notes)
+    kind, *sizes = _KINDS[given]
+    size = [float(value_at(prim.GetAttribute(name), time)) for name in sizes]
+    if kind == "distant" and size[0] > _POINTLIKE:
+        notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
+    is_point = bool(kind == "sphere" and _value(prim, "treatAsPoint", time, False))
+    angle = float(_value(prim, _CONE, time, 90.0))
+    if kind == "sphere" and 0 <= angle < 90:
+        size += [angle, float(_value(prim, "inputs:shaping:cone:softness", time, 0.0))]
+        if not is_point and size[0] > 0:
+            notes.add("sphere lights with a cone have a radius of 0, and sharp shadows", path)
+        kind = "spot"
+    elif is_point:
+        kind = "point"
+    return LightContents(
+        str(path),
+        kind,
+        to_world,
+        read_emission(prim, time).tolist(),
+        bool(_value(prim, "inputs:normalize", time, False)),
+        size,
+        _texture(prim, time, notes) if kind in ("rect", "dome") else None,
+        str(_value(prim, "poleAxis", time, "scene")).lower() if given == "DomeLight_1" else "y",
+    )
+
+
+def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
+    """``color * intensity * 2**exposure`` of a light, ``(3,)``, with its colour temperature."""
+    light = UsdLux.LightAPI(prim)
+    color = np.array(value_at(light.GetColorAttr(), time), dtype=np.float64)
+    if value_at(light.GetEnableColorTemperatureAttr(), time):
+        color *= np.array(UsdLux.BlackbodyTemperatureAsRgb(value_at(light.GetColorTemperatureAttr(), time)))
+    return color * (value_at(light.GetIntensityAttr(), time) * 2.0 ** value_at(light.GetExposureAttr(), time))
+
+
+def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
+    value = value_at(prim.GetAttribute(name), time)
+    return usual if value is None else value
+
+
+def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> None:
+    for name, neutral in _NEUTRAL_OF_LIGHTS.items():
+        value = _value(prim, name, time, neutral)
+        is_cone_kept = name == _CONE and (value >= neutral or prim.GetTypeName() == "SphereLight")
+        if value != neutral and not is_cone_kept:
+            notes.add(
+                f"{name} of lights is ignored; lights illuminate all materials, in all directions", prim.GetPath()
+            )
+    for name, what in (("light:filters", "light filters"), ("portals", "portals")):
+        relationship = prim.GetRelationship(name)
+        if relationship and relationship.GetTargets():
+            notes.add(f"{what} are ignored", prim.GetPath())
+    for link in ("lightLink", "shadowLink"):
+        root = prim.GetAttribute(f"collection:{link}:includeRoot")
+        excludes = prim.GetRelationship(f"collection:{link}:excludes")
+        if (root and root.Get() is False) or (excludes and excludes.GetTargets()):
+            notes.add("light and shadow links are ignored; lights illuminate all shapes", prim.GetPath())
+
+
+def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | None:
+    asset = _value(prim, "inputs:texture:file", time, None)
+    if asset is None or not asset.path:
+        return None
+    layout = _value(prim, "inputs:texture:format", time, "automatic")
+    if layout not in ("automatic", "latlong"):
+        notes.add(f'dome textures of format "{layout}" are ignored; expected latlong', prim.GetPath())
+        return None
+    return str(asset.resolvedPath or asset.path)
+
+
+class FrameSettings(NamedTuple):
+    """What the render settings of a stage say about the picture's frame."""
+
+    resolution: list[int] | None = None
+    camera: str | None = None  # Its path
+    conform_policy: str = _CONFORM_POLICIES[0]
+    has_motion_blur: bool = True
+    has_depth_of_field: bool = True
+
+
+def read_settings(stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings) -> FrameSettings:
+    """Read the render settings that a stage names."""
+    settings = UsdRender.Settings.GetStageRenderSettings(stage)
+    if not settings:
+        others = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
+        if others or stage.HasAuthoredMetadata("renderSettingsPrimPath"):
+            what = "render settings are those that renderSettingsPrimPath of the stage names; all others are ignored"
+            notes.add(what, ", ".join(others) or str(stage.GetMetadata("renderSettingsPrimPath")))
+        return FrameSettings()
+    prim = settings.GetPrim()
+    path = prim.GetPath()
+
+    def value(name: str) -> Any:
+        return value_at(prim.GetAttribute(name), time)
+
+    for name, neutral in _NEUTRAL_SETTINGS.items():
+        authored = prim.GetAttribute(name).HasAuthoredValue()
+        if authored and not any(np.array_equal(np.asarray(value(name)), usual) for usual in neutral):
+            notes.add(f"{name} of render settings is ignored", path)
+    if settings.GetProductsRel().GetForwardedTargets():
+        notes.add("render products are ignored; the picture is that of the render settings", path)
+    size = np.asarray(value("resolution"))
+    is_size = size.dtype.kind == "i" and size.shape == (2,) and bool((size > 0).all())
+    if not is_size:
+        notes.add("a resolution of render settings that is not two numbers above 0 is ignored", path)
+    policy = str(value("aspectRatioConformPolicy"))
+    if policy not in _CONFORM_POLICIES:
+        notes.add(f'aspectRatioConformPolicy "{policy}" is ignored; {_CONFORM_POLICIES[0]} is used', path)
+        policy = _CONFORM_POLICIES[0]
+    targets = settings.GetCameraRel().GetForwardedTargets()
+    return FrameSettings(
+        size.tolist() if is_size else None,
+        str(targets[0]) if targets else None,
+        policy,
+        not (value("disableMotionBlur") or value("instantaneousShutter")),
+        not value("disableDepthOfField"),
+    )
+
+
+def read_camera(
+    camera: UsdGeom.Camera,
+    # (4, 4) float64: for column vectors. Scales are left out, as USD's own frustum of a camera has none.
+    to_world: NDArray[np.float64],
+    time: Usd.TimeCode,
+    settings: FrameSettings,
+    notes: StageWarnings,
+) -> CameraContents:
+    """Read a camera."""
+    x, y, z = to_world[:3, :3].T
+    forward = -z / np.linalg.norm(z)
+    up = y - forward * (forward @ y)
+    up /= np.linalg.norm(up)
+    right = np.cross(forward, up)
+    if right @ x < 0:
+        notes.add("reflections in the transforms of cameras are ignored", camera.GetPath())
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = np.stack([right, up, -forward], axis=1), to_world[:3, 3]
+
+    def number(attribute: Usd.Attribute) -> float:
+        return float(value_at(attribute, time))
+
+    projection = str(value_at(camera.GetProjectionAttr(), time))
+    if projection not in ("perspective", "orthographic"):
+        notes.add(f'the projection "{projection}" of cameras is ignored, and perspective is used', camera.GetPath())
+    is_perspective = projection != "orthographic"
+    unit = 1.0 if is_perspective else _TENTHS
+    aperture = [number(camera.GetHorizontalApertureAttr()), number(camera.GetVerticalApertureAttr())]
+    offset = [number(camera.GetHorizontalApertureOffsetAttr()), number(camera.GetVerticalApertureOffsetAttr())]
+    near, far = value_at(camera.GetClippingRangeAttr(), time)
+    if not near <= far:
+        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", camera.GetPath())
+        near, far = _CLIPPING_RANGE
+    focal_length, f_stop = number(camera.GetFocalLengthAttr()), number(camera.GetFStopAttr())
+    focus = number(camera.GetFocusDistanceAttr())
+    has_lens = is_perspective and f_stop > 0 and focus > 0 and settings.has_depth_of_field
+    if is_perspective and f_stop > 0 >= focus:
+        notes.add("fStop of cameras without a focusDistance above 0 is ignored", camera.GetPath())
+    for name, neutral in _NEUTRAL_EXPOSURE.items():
+        attribute = camera.GetPrim().GetAttribute(name)
+        if attribute and value_at(attribute, time) != neutral:
+            notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", camera.GetPath())
+    if value_at(camera.GetClippingPlanesAttr(), time):
+        notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
+    shutter = (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr())
+    return CameraContents(
+        str(camera.GetPath()),
+        rigid,
+        is_perspective,
+        [unit * length for length in aperture],
+        [unit * length for length in offset],
+        focal_length,
+        float(near),
+        float(far),
+        _TENTHS * focal_length / (2 * f_stop) if has_lens else 0.0,
+        focus if has_lens else 0.0,
+        [number(attribute) for attribute in shutter] if settings.has_motion_blur else [0.0, 0.0],
+        settings.conform_policy,
+    )
