@@ -4,7 +4,7 @@ from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from mitsuba_subdivision.tessellation.quad_grid import QuadGrid
-from mitsuba_subdivision.tessellation.triangle_grid import TriangleGrid
+from mitsuba_subdivision.tessellation.uniform_grid import TriangleGrid
 from patches.closed_cages import SURFACES, cage_of
 
 # Odd and even, each more than once: from here on they differ in numbers only.

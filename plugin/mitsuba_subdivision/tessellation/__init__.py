@@ -1,8 +1,8 @@
 """Tessellation of patches into triangles: sample locations, shared vertices, and the polynomials on which they lie.
 
 `uniform_table` and `adaptive_table` both build a `VertexTable`: a vertex is a point on a polynomial, whose coefficients
-are the weights of a class of patches times the control points of one patch. Their grids (`Grid`) number and locate
-vertices and triangles.
+are the weights of a class of patches times the control points of one patch. Their grids (`UniformGrid`,
+`AdaptiveGrid`) number and locate vertices and triangles.
 
 This package, `kernels` and `shapes` distinguish five kinds of points:
 

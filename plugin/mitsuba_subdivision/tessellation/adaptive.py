@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,7 @@ class AdaptiveGrid:
         """See `UniformGrid.cut`."""
         return replace(self, topology=topology)
 
-    def vertices_of(self, other: AdaptiveGrid) -> IntArray:
+    def vertices_of(self, other: Any) -> IntArray:
         """See `UniformGrid.vertices_of`."""
         vertices = np.empty(self.vertex_count, dtype=np.int64)
         vertices[self._sample_vertices()] = other._sample_vertices()

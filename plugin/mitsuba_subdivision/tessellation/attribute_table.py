@@ -32,8 +32,8 @@ class AttributeLayout:
     find_triangles: Callable[[], NDArray[np.uint32]]  # Computes `triangles` on demand
     # For each channel layout, the function that evaluates a channel at the vertices: ``(n, k)`` float64
     evaluate: tuple[Callable[[Channel], FloatArray], ...] = ()
-    # Computes the locations of split vertices, on the vertices' sides of seams, as `Grid.locations`. None without
-    # seams.
+    # Computes the locations of split vertices, on the vertices' sides of seams; see `UniformGrid.locations`. None
+    # without seams.
     locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
 
     @cached_property

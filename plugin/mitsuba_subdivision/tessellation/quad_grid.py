@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -35,28 +34,12 @@ class QuadGrid(UniformGrid):
         return self.rate % 2 == 1
 
     @property
-    def _inner_counts(self) -> IntArray:
-        """``(n_f,)`` vertices strictly inside each face."""
+    def inner_counts(self) -> IntArray:
+        """See `UniformGrid`."""
         sizes = self.topology.face_sizes
         # At rate 1, the grids of a polygon's corners have no inner samples, and only the centre is left.
         per_corner = self.half**2 if self.is_odd else self.half * (self.half - 1)
         return np.where(sizes == 4, (self.rate - 1) ** 2, sizes * per_corner + (sizes > 0))
-
-    def _inner_start(self, faces: IntArray) -> IntArray:
-        """Number of the first vertex inside each of the faces."""
-        if self.topology.common_size == 4:
-            return self.inner_begin + faces.astype(np.int64) * (self.rate - 1) ** 2
-        return self.inner_begin + self._inner_counts_before[faces]
-
-    @cached_property
-    def _inner_counts_before(self) -> IntArray:
-        """``(n_f,)`` vertices strictly inside the faces before each one."""
-        return ragged.starts(self._inner_counts)
-
-    @cached_property
-    def vertex_count(self) -> int:
-        """Vertices of the tessellation."""
-        return self.inner_begin + int(self._inner_counts.sum())
 
     def quad_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """Vertices of quadrilaterals: ``(e, rate + 1, rate + 1)``, indexed ``[:, v, u]``."""
@@ -64,7 +47,7 @@ class QuadGrid(UniformGrid):
         # Faces are the last axis, so that NumPy's inner loops are long.
         numbers = np.empty((r + 1, r + 1, len(faces)), dtype=np.uint32)
         inner = np.arange((r - 1) ** 2, dtype=np.uint32).reshape(r - 1, r - 1)
-        np.add(inner[..., None], self._inner_start(faces).astype(np.uint32), out=numbers[1:-1, 1:-1])
+        np.add(inner[..., None], self.inner_start(faces).astype(np.uint32), out=numbers[1:-1, 1:-1])
         corners = np.add.outer(np.arange(4, dtype=np.int32), t.face_offsets[faces])
         # Each side ends where the next one begins.
         sides = self.along(corners, np.arange(r)).transpose(0, 2, 1)
@@ -93,7 +76,7 @@ class QuadGrid(UniformGrid):
 
     def centre_vertices(self, corners: IntArray) -> IntArray:
         """Vertex at the centre of each corner's polygon: ``(e,)``."""
-        return self._inner_start(self.topology.face[corners])
+        return self.inner_start(self.topology.face[corners])
 
     def _corner_start(self, corners: IntArray) -> IntArray:
         """First vertex inside the grid of each polygon corner. The polygon's centre comes before all grids."""
@@ -105,7 +88,7 @@ class QuadGrid(UniformGrid):
         t, inside = self.topology, self.half - 1
         face = t.face[corners]
         # Spokes come after the centre and all grids.
-        return self._inner_start(face) + 1 + t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
+        return self.inner_start(face) + 1 + t.face_sizes[face] * inside**2 + (corners - t.face_offsets[face]) * inside
 
     @cached_property
     def triangle_counts(self) -> IntArray:
@@ -166,36 +149,14 @@ class QuadGrid(UniformGrid):
             parts.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
         return np.concatenate(parts, axis=1)
 
-    def element(self) -> NDArray[np.uint32]:
-        """``(m,)`` face of each triangle."""
-        counts = self.triangle_counts
-        # `repeat` is faster with a scalar.
-        repeats = counts[0] if (counts == counts[0]).all() else counts
-        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
-
     def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
-        """Grids of patches, see `UniformGrid.layout`: one for a quadrilateral, one at each corner of others."""
-        is_quad = self.topology.face_sizes[self.topology.face[corners[0]]] == 4
-        return self._quad_layout(corners) if is_quad else self.corner_layout(corners)
-
-    def _quad_layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
-        t, count = self.topology, self.rate + 1
-        index = np.arange(count**2).reshape(count, count)
-        uv = _lattice(count, 1, self.rate)
-        inner = index[1:-1, 1:-1].ravel()
-        parts = []
-        face = t.face[corners]
-        turns = corners - t.face_offsets[face]
-        # Inner vertices are numbered from the face's first corner, whichever corner the patch begins at.
-        for turn in range(4):
-            patches = np.flatnonzero(turns == turn)
-            if not len(patches):
-                continue
-            faces = face[patches]
-            turned = np.rot90(index, -turn)[1:-1, 1:-1].ravel()
-            parts.append(GridPart.of(turned, patches, self._inner_start(faces), t.face_offsets[faces], uv[inner]))
+        """See `UniformGrid`: one grid for a quadrilateral, one at each corner of others."""
+        if self.topology.face_sizes[self.topology.face[corners[0]]] != 4:
+            return self.corner_layout(corners)
+        index = np.arange((self.rate + 1) ** 2).reshape(self.rate + 1, self.rate + 1)
+        inside = [np.rot90(index, -turn)[1:-1, 1:-1].ravel() for turn in range(4)]
         sides = [index[0], index[:, -1], index[-1, ::-1], index[::-1, 0]]
-        return uv, parts + self.side_parts(corners, sides, uv[:count, 0])
+        return self.whole_layout(corners, _lattice(self.rate + 1, 1, self.rate), inside, sides)
 
     def corner_layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
         """Grids of patches that lie at single corners of elements, which are all quadrilaterals or all not.
@@ -205,28 +166,20 @@ class QuadGrid(UniformGrid):
         t, count = self.topology, self.half + 1
         previous = t.prev[corners]
         is_quad = t.face_sizes[t.face[corners[0]]] == 4
-        owns_edge = np.flatnonzero(self.owns_edge[corners])
-        owns_previous = np.flatnonzero(self.owns_edge[previous])
-        owns_vertex = np.flatnonzero(self.owns_vertex[corners])
-
         # The element's centre is an additional sample after the grid. For an even rate, some samples of the grid are
         # evaluated otherwise: the last row, with the midpoint of the preceding edge, by the preceding corner's patch,
         # and the last sample of the grid is the centre itself.
         uv = np.concatenate([_lattice(count, 2, self.rate), [[1.0, 1.0]]])
         index = np.arange(count**2).reshape(count, count)
-        edge = index[0, 1:]
         # Along the preceding edge, vertex numbers increase towards the corner.
-        back = index[self._inside, 0][::-1]
-        before_corner = self.edge_start(previous[owns_previous]) + (self.rate - 1 - len(back))
-        parts = [
-            self.edge_part(owns_edge, corners[owns_edge], edge, uv[edge]),
-            GridPart.of(back, owns_previous, before_corner, corners[owns_previous], uv[back]),
-            self.vertex_part(owns_vertex, corners[owns_vertex], index[0, :1]),
-        ]
+        back, at_back = index[self._inside, 0][::-1], np.flatnonzero(self.owns_edge[previous])
+        first = self.edge_start(previous[at_back]) + (self.rate - 1 - len(back))
+        parts = self.side_parts(corners, index[0], uv[:count, 0])
+        parts.append(GridPart(back, at_back, first, corners[at_back], uv[back]))
         parts += self._parts_inside_quads(corners, uv) if is_quad else self._parts_inside_polygons(corners, uv)
         if is_quad:
             # The centre has parameters of 1 in a patch, and of 1/2 in the quadrilateral.
-            parts = [replace(part, uv=part.uv / 2) for part in parts]
+            parts = [part._replace(uv=part.uv / 2) for part in parts]
         return uv, parts
 
     @property
@@ -242,11 +195,11 @@ class QuadGrid(UniformGrid):
         first = np.flatnonzero(t.face_offsets[t.face[corners]] == corners)
         grid, spoke, centre = index[self._inside, self._inside].ravel(), index[self._inside, -1], np.array([count**2])
         parts = [
-            GridPart.of(grid, patches, self._corner_start(corners), corners, uv[grid]),
-            GridPart.of(centre, first, self.centre_vertices(corners[first]), corners[first], uv[centre]),
+            GridPart(grid, patches, self._corner_start(corners), corners, uv[grid]),
+            GridPart(centre, first, self.centre_vertices(corners[first]), corners[first], uv[centre]),
         ]
         if not self.is_odd:
-            parts.append(GridPart.of(spoke, patches, self._spoke_start(corners), corners, uv[spoke]))
+            parts.append(GridPart(spoke, patches, self._spoke_start(corners), corners, uv[spoke]))
         return parts
 
     def _parts_inside_quads(self, corners: IntArray, uv: FloatArray) -> list[GridPart]:
@@ -266,12 +219,12 @@ class QuadGrid(UniformGrid):
             for row in np.flatnonzero(np.bincount(y)):
                 along = np.flatnonzero(y == row)
                 along = along[np.argsort(x[along])]
-                first = self._inner_start(face[patches]) + (row - 1) * (r - 1) + x[along[0]] - 1
-                parts.append(GridPart.of(samples[along], patches, first, corners[patches], uv[samples[along]]))
+                first = self.inner_start(face[patches]) + (row - 1) * (r - 1) + x[along[0]] - 1
+                parts.append(GridPart(samples[along], patches, first, corners[patches], uv[samples[along]]))
         if not self.is_odd:
             centre, patches = index[-1, -1:], np.flatnonzero(turns == 0)
-            first = self._inner_start(face[patches]) + (self.half - 1) * r
-            parts.append(GridPart.of(centre, patches, first, corners[patches], uv[centre]))
+            first = self.inner_start(face[patches]) + (self.half - 1) * r
+            parts.append(GridPart(centre, patches, first, corners[patches], uv[centre]))
         return parts
 
 

@@ -15,7 +15,7 @@ from ..patches import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .memory import require_memory
 from .quad_grid import QuadGrid
-from .uniform_grid import GridPart, UniformGrid
+from .uniform_grid import GridPart, TriangleGrid, UniformGrid
 from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
 from .vertex_table import VertexTable
 
@@ -35,40 +35,26 @@ def uniform_table(
     Raises ValueError if the rate is no integer, below 1, or so high that there are more than MOST_VERTICES vertices.
     Raises MemoryError if the tessellation would not fit into memory.
     """
+    checked = checked_rate(rate)
 
     def make() -> VertexTable:
-        grid = _checked_grid(patches, rate)
+        grid = (QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid)(patches.elements, checked)
+        if grid.vertex_count > MOST_VERTICES:
+            raise ValueError(
+                f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, "
+                "whose triangles fit into a buffer"
+            )
+        require_memory(patches, grid)
         count = control_count or patches.topology.vertex_count
         control = np.arange(count) if control_of_vertex is None else control_of_vertex
         controls, refinement = patches.control_rows(control, count)
         polynomials, copies = _polynomials(patches, grid), _copies(patches, grid, control)
         return VertexTable(count, patches.patch_count, grid, polynomials, controls, copies, refinement)
 
-    return _TABLES.get((patches, checked_rate(rate), Content(control_of_vertex), control_count), make)
+    return _TABLES.get((patches, checked, Content(control_of_vertex), control_count), make)
 
 
 _TABLES: Shared[VertexTable] = Shared()
-
-
-def _checked_grid(patches: PatchTable, rate: int) -> UniformGrid:
-    """The grid over the patches' elements, after a check that the tessellation fits into buffers and memory."""
-    checked = checked_rate(rate)
-    grid = _grid(patches, checked)
-    if grid.vertex_count > MOST_VERTICES:
-        raise ValueError(
-            f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
-            "triangles fit into a buffer"
-        )
-    require_memory(patches, grid)
-    return grid
-
-
-def _grid(patches: PatchTable, rate: int) -> UniformGrid:
-    if patches.scheme.domain.corner_count == 4:
-        return QuadGrid(patches.elements, rate)
-    from .triangle_grid import TriangleGrid
-
-    return TriangleGrid(patches.elements, rate)
 
 
 def checked_rate(rate: int, name: str = "tessellation rate") -> int:

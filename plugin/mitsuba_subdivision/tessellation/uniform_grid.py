@@ -1,4 +1,4 @@
-"""Numbering of uniform tessellations: the common base of grids over squares and over triangles.
+"""Numbering of uniform tessellations: the common base of grids over squares and over triangles, and that of triangles.
 
 The two elements at an edge share the samples on it, so there are no cracks. Corners of the elements are numbered first,
 then samples inside edges, then samples inside elements. The samples inside an edge, and those inside an element, have
@@ -7,14 +7,14 @@ consecutive numbers.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 
@@ -22,8 +22,7 @@ from ..schemes.domain import FloatArray
 VERTICES_AT_ONCE = 1 << 16
 
 
-@dataclass(frozen=True, eq=False)
-class GridPart:
+class GridPart(NamedTuple):
     """A part of the grids of several patches, such as their inside or one of their sides.
 
     In every patch, the samples of the part are consecutive vertices. Where patches share samples, at corners and along
@@ -31,24 +30,10 @@ class GridPart:
     """
 
     samples: IntArray  # (S,) int64: indices into the parameters of `UniformGrid.layout`
-    patches: IntArray  # (P,) int32: patches in ascending order
-    # (P,) uint32: vertex of the first sample in each patch; sample ``samples[i]`` is vertex ``first_vertex + i``
-    first_vertex: IntArray
-    corners: IntArray  # (P,) int32: a corner of each patch's element, not always the one at which the patch begins
+    patches: IntArray  # (P,): patches in ascending order
+    first_vertex: IntArray  # (P,): vertex of the first sample in each patch; ``samples[i]`` is ``first_vertex + i``
+    corners: IntArray  # (P,): a corner of each patch's element, not always the one at which the patch begins
     uv: FloatArray  # (S, 2) float64: parameters of the samples, starting at `corners`
-
-    @classmethod
-    def of(
-        cls, samples: IntArray, patches: IntArray, first_vertex: IntArray, corners: IntArray, uv: FloatArray
-    ) -> GridPart:
-        """A part with arrays over patches converted to 32 bits."""
-        return cls(
-            samples,
-            patches.astype(np.int32, copy=False),
-            first_vertex.astype(np.uint32, copy=False),
-            corners.astype(np.int32, copy=False),
-            uv,
-        )
 
     @property
     def vertices(self) -> IntArray:
@@ -56,8 +41,11 @@ class GridPart:
         return self.first_vertex.astype(np.int64)[:, None] + np.arange(len(self.samples))
 
 
-class UniformGrid(ABC):
-    """Numbering of a uniform tessellation, see `Grid`."""
+class UniformGrid:
+    """Numbering of a uniform tessellation: the same for all surfaces over the same elements.
+
+    `AdaptiveGrid` has the members that `VertexTable` asks for as well.
+    """
 
     whole_size: int
     """Corners of elements that fit the domain."""
@@ -72,16 +60,15 @@ class UniformGrid(ABC):
         self.topology, self.rate = topology, rate
 
     @property
-    @abstractmethod
-    def vertex_count(self) -> int:
-        """Vertices of the tessellation."""
+    def inner_counts(self) -> IntArray:
+        """``(n_f,)`` vertices strictly inside each element."""
+        raise NotImplementedError
 
     @property
-    @abstractmethod
     def triangle_counts(self) -> IntArray:
         """``(n_f,)`` triangles of each element."""
+        raise NotImplementedError
 
-    @abstractmethod
     def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
         """The grids of the patches that begin at ``corners``, which are all whole elements or all not.
 
@@ -93,8 +80,8 @@ class UniformGrid(ABC):
             Parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in
             the order of ``corners``.
         """
+        raise NotImplementedError
 
-    @abstractmethod
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
         """Parameters at the corners of an element's triangles.
 
@@ -106,25 +93,32 @@ class UniformGrid(ABC):
             Triangles of one corner of any other element; parameters start at that corner. Some triangles may reach
             beyond u = 1, into the patch of the next corner.
         """
+        raise NotImplementedError
 
-    @abstractmethod
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
+        raise NotImplementedError
 
-    @abstractmethod
     def element(self) -> NDArray[np.uint32]:
         """``(m,)`` element of each triangle."""
+        counts = self.triangle_counts
+        # `repeat` is faster with a scalar.
+        repeats = counts[0] if (counts == counts[0]).all() else counts
+        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
 
     def at_rate(self, rate: int) -> UniformGrid:
         """A grid of another rate over the same elements."""
         return type(self)(self.topology, rate)
 
     def cut(self, topology: Topology) -> UniformGrid:
-        """See `Grid.cut`."""
+        """The same triangles over elements with the same half-edges, cut along more edges.
+
+        Vertices on a cut have a copy on each side, which is located on that side.
+        """
         return type(self)(topology, self.rate)
 
-    def vertices_of(self, other: UniformGrid) -> IntArray:
-        """See `Grid.vertices_of`."""
+    def vertices_of(self, other: Any) -> IntArray:
+        """``(vertex_count,)`` the original of each vertex in a grid of which this one is a `cut`."""
         t, steps = self.topology, np.arange(1, self.rate)
         originals = np.empty(self.vertex_count, dtype=np.int64)
         originals[self.corner_vertex[t.face_vertices]] = other.corner_vertex[other.topology.face_vertices]
@@ -133,16 +127,28 @@ class UniformGrid(ABC):
         return originals
 
     def locations(self) -> tuple[IntArray, FloatArray]:
-        """See `Grid.locations`."""
+        """Locations of the vertices on the surface.
+
+        Returns
+        -------
+        half_edge : (vertex_count,) int64
+            Corner of an element at which the parameters are (0, 0), a half-edge of `PatchTable.elements`.
+        uv : (vertex_count, 2) float64
+            Parameters. Vertices at corners of elements have (0, 0).
+        """
         t = self.topology
         half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
         is_whole = t.face_sizes == self.whole_size
         for corners in (t.face_offsets[:-1][is_whole], t.half_edges_of(~is_whole)):
-            if len(corners):
-                for part in self.layout(corners)[1]:
-                    half_edge[part.vertices] = part.corners[:, None]
-                    uv[part.vertices] = part.uv
+            for part in self.layout(corners)[1] if len(corners) else ():
+                half_edge[part.vertices] = part.corners[:, None]
+                uv[part.vertices] = part.uv
         return half_edge, uv
+
+    @cached_property
+    def vertex_count(self) -> int:
+        """Vertices of the tessellation."""
+        return self.inner_begin + int(self.inner_counts.sum())
 
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:
@@ -160,6 +166,14 @@ class UniformGrid(ABC):
     def inner_begin(self) -> int:
         """Number of the first vertex inside an element."""
         return self._corner_count + self.topology.edge_count * (self.rate - 1)
+
+    def inner_start(self, faces: IntArray) -> IntArray:
+        """Number of the first vertex inside each of the faces."""
+        return self.inner_begin + self._inner_counts_before[faces]
+
+    @cached_property
+    def _inner_counts_before(self) -> IntArray:
+        return ragged.starts(self.inner_counts)
 
     @cached_property
     def _corner_count(self) -> int:
@@ -182,10 +196,10 @@ class UniformGrid(ABC):
         # Corners are the last axis, as there are more corners than steps, and NumPy's inner loops should be long.
         numbers = np.multiply.outer(steps.astype(np.uint32), step)
         numbers += start
-        for index in np.flatnonzero(steps == 0):
-            numbers[index] = self._at_corners(corners)
-        for index in np.flatnonzero(steps == self.rate):
-            numbers[index] = self._at_corners(self.topology.next[corners])
+        if (steps == 0).any():
+            numbers[steps == 0] = self._at_corners(corners)
+        if (steps == self.rate).any():
+            numbers[steps == self.rate] = self._at_corners(self.topology.next[corners])
         return np.moveaxis(numbers, 0, -1)
 
     @cached_property
@@ -201,35 +215,125 @@ class UniformGrid(ABC):
         owns[self.topology.vertex_half_edge[self._is_used]] = True
         return owns
 
-    def edge_part(self, owners: IntArray, corners: IntArray, samples: IntArray, uv: FloatArray) -> GridPart:
-        """The part of the samples inside edges that begin at corners of the patches ``owners``."""
-        return GridPart.of(samples, owners, self.edge_start(corners), corners, uv)
-
-    def vertex_part(self, owners: IntArray, corners: IntArray, sample: IntArray) -> GridPart:
-        """The part of one sample, at corners of the patches ``owners``."""
-        return GridPart.of(sample, owners, self._at_corners(corners), corners, np.zeros((1, 2)))
-
     def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         """Vertices at corners."""
         return self.corner_vertex[self.topology.face_vertices[corners]]
 
     def side_parts(
         self,
-        corners: IntArray,  # (p,) int64: corners at which the patches begin
-        # list of (rate + 1,) int64: samples of a patch's sides, counter-clockwise from the corner
-        sides: list[IntArray],
-        along: FloatArray,  # (rate + 1,) float64: parameters of the samples along a side
+        corners: IntArray,  # (p,): corners at which the patches begin
+        samples: IntArray,  # samples of a patch from a corner along the edge that begins there
+        along: FloatArray,  # parameters of these samples along the edge
     ) -> list[GridPart]:
-        """Parts at the corners and along the sides of patches that are whole elements."""
-        parts = []
+        """The part of the samples inside edges, and that of the sample at the corners."""
         uv = np.stack([along, np.zeros_like(along)], axis=1)
+        at_edge, at_vertex = np.flatnonzero(self.owns_edge[corners]), np.flatnonzero(self.owns_vertex[corners])
+        inside, begin = corners[at_edge], corners[at_vertex]
+        return [
+            GridPart(samples[1:], at_edge, self.edge_start(inside), inside, uv[1:]),
+            GridPart(samples[:1], at_vertex, self._at_corners(begin), begin, uv[:1]),
+        ]
+
+    def whole_layout(
+        self,
+        corners: IntArray,
+        uv: FloatArray,
+        # For each corner, the samples inside the element in the order in which they are numbered from its first corner,
+        # if the patch begins at this one
+        inside: Sequence[IntArray],
+        sides: Sequence[IntArray],  # Samples along the sides of a patch, counter-clockwise
+    ) -> tuple[FloatArray, list[GridPart]]:
+        """`layout` of patches that are whole elements."""
+        t, parts = self.topology, []
+        face = t.face[corners]
+        for turn, samples in enumerate(inside):
+            patches = np.flatnonzero(corners - t.face_offsets[face] == turn)
+            if len(patches):
+                faces = face[patches]
+                parts.append(GridPart(samples, patches, self.inner_start(faces), t.face_offsets[faces], uv[inside[0]]))
+        along = np.arange(self.rate) / self.rate
         for side in sides:
-            owners = np.flatnonzero(self.owns_edge[corners])
-            parts.append(self.edge_part(owners, corners[owners], side[1:-1], uv[1:-1]))
-            owners = np.flatnonzero(self.owns_vertex[corners])
-            parts.append(self.vertex_part(owners, corners[owners], side[:1]))
-            corners = self.topology.next[corners]
-        return parts
+            parts += self.side_parts(corners, side[:-1], along)
+            corners = t.next[corners]
+        return uv, parts
+
+
+class TriangleGrid(UniformGrid):
+    """Numbering of a tessellation over unit triangles.
+
+    Each element is divided into ``rate^2`` triangles. The samples of an element are ordered by v, then by u.
+    """
+
+    whole_size = 3
+
+    @property
+    def inner_counts(self) -> IntArray:
+        """See `UniformGrid`."""
+        return np.where(self.topology.face_sizes > 0, (self.rate - 1) * (self.rate - 2) // 2, 0)
+
+    @property
+    def triangle_counts(self) -> IntArray:
+        """See `UniformGrid`."""
+        return np.where(self.topology.face_sizes > 0, self.rate**2, 0)
+
+    @cached_property
+    def _steps(self) -> tuple[IntArray, IntArray]:
+        """``(S,)`` grid indices along u and along v of each sample."""
+        v, u = np.indices((self.rate + 1, self.rate + 1)).reshape(2, -1)
+        inside = u + v <= self.rate
+        return u[inside], v[inside]
+
+    def _index(self, u: IntArray, v: IntArray) -> IntArray:
+        """The sample with given grid indices along u and v."""
+        return v * (self.rate + 1) - v * (v - 1) // 2 + u
+
+    @cached_property
+    def _sides(self) -> list[IntArray]:
+        along = np.arange(self.rate + 1)
+        back, zero = along[::-1], np.zeros_like(along)
+        return [self._index(along, zero), self._index(back, along), self._index(zero, back)]
+
+    @cached_property
+    def _inner(self) -> IntArray:
+        """Samples strictly inside an element."""
+        u, v = self._steps
+        return np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
+
+    def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
+        """See `UniformGrid`."""
+        u, v = (steps[self._inner] for steps in self._steps)
+        w = self.rate - u - v
+        inside = [self._index(u, v), self._index(v, w), self._index(w, u)]
+        return self.whole_layout(corners, np.stack(self._steps, axis=1) / self.rate, inside, self._sides)
+
+    @cached_property
+    def _cells(self) -> IntArray:
+        """``(rate^2, 3)`` samples at the corners of each triangle."""
+        u, v = self._steps
+        cells = []
+        for room, steps in ((0, ((0, 0), (1, 0), (0, 1))), (1, ((1, 0), (1, 1), (0, 1)))):
+            at = np.flatnonzero(u + v < self.rate - room)
+            cells.append(np.stack([self._index(u[at] + i, v[at] + j) for i, j in steps], axis=1))
+        return np.concatenate(cells)
+
+    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
+        """See `UniformGrid`."""
+        uv = np.stack(self._steps, axis=1) / self.rate
+        return uv[self._cells], np.empty((0, 3, 2))
+
+    def triangles(self) -> NDArray[np.uint32]:
+        """See `UniformGrid`."""
+        cells, t, steps = self._cells, self.topology, np.arange(self.rate + 1)
+        elements = np.flatnonzero(t.face_sizes)
+        triangles, begin = np.empty((len(elements), cells.size), dtype=np.uint32), 0
+        for faces in slices_of(elements, self.rate**2):
+            vertices = np.empty((len(faces), len(self._steps[0])), dtype=np.uint32)
+            vertices[:, self._inner] = self.inner_start(faces)[:, None] + np.arange(len(self._inner))
+            for corner, side in enumerate(self._sides):
+                vertices[:, side] = self.along(t.face_offsets[faces] + corner, steps)
+            np.take(vertices, cells.ravel(), axis=1, out=triangles[begin : begin + len(faces)], mode="clip")
+            begin += len(faces)
+        return triangles.reshape(-1, 3)
 
 
 def slices_of(indices: IntArray, size: int) -> Iterator[IntArray]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.located_samples import PLANE_POWERS, Polynomials, sampled_polynomials
-from ..evaluation.normals import LEAST_EXTENT, unit_normals
+from ..evaluation.normals import unit_normals
 from ..evaluation.patch_tree import patch_tree
 from ..evaluation.polynomials import monomial_values, polynomial_basis
 from ..mesh import ragged
@@ -69,15 +69,21 @@ class VertexPolynomials:
     offset: IndexArray  # (e,) int32: offset of the vertex from the first vertex of its run
     st: FloatArray  # (e, 2) float64: parameters of the vertex from the middle of the domain
 
-    def sums(self, controls: NDArray[np.uint32], points: FloatArray, row_count: int = 3) -> Iterator[VertexSums]:
-        """Evaluate points (``row_count`` 1), or points and two tangents (3), of all vertices, in runs of vertices.
+    def evaluated(
+        self,
+        controls: NDArray[np.uint32],  # `VertexTable.controls`
+        points: FloatArray,  # (n, k) float64: points that these refer to
+        *,
+        with_normals: bool = False,
+        least_extent: float = 0.0,  # As for `unit_normals`, relative to a control point; for refined control points
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Evaluate all vertices, in runs: numbers ``(n,)``, points ``(n, k)`` and, if asked for, normals ``(n, 3)``.
 
-        Coefficients are relative to a control point of each patch.
+        Normals are zero where the surface has none.
         """
-        monomials = monomial_values(self.powers, self.st)[:row_count]
+        monomials = monomial_values(self.powers, self.st)[: 3 if with_normals else 1]
         # In ascending order.
-        control_counts = self.blocks[self.block, 2]
-        first_block = 0
+        control_counts, first_block = self.blocks[self.block, 2], 0
         for weights in self.weights:
             begin, end = np.searchsorted(control_counts, [weights.shape[2], weights.shape[2] + 1]).tolist()
             step = max(1, WEIGHTS_AT_ONCE // weights[0].size)
@@ -87,19 +93,23 @@ class VertexPolynomials:
                 first_control, patch_count, _ = self.blocks[block].T
                 columns = np.arange(weights.shape[2])[:, None]
                 patch_points = points[controls[first_control + self.patch[polynomials] + patch_count * columns]]
+                # Coefficients are relative to a control point of each patch.
                 origin = patch_points[0]
                 relative = patch_points - origin
-                extent = np.abs(relative).max(axis=0)
+                extent = np.maximum(np.abs(relative).max(axis=0), least_extent * np.abs(origin)).T
                 relative = np.ascontiguousarray(relative.swapaxes(0, 1))
                 coefficients = (weights[block - first_block] @ relative).transpose(1, 2, 0)
-                polynomial_data = origin.T, extent.T, self.tangent_weights[block]
                 polynomial, vertex, entry = self._vertices(polynomials)
                 length = max(1, COEFFICIENTS_AT_ONCE // coefficients[:, :, 0].size)
                 for run in (slice(start, start + length) for start in range(0, len(vertex), length)):
-                    run_polynomial = polynomial[run]
+                    of_run = polynomial[run]
                     factors = monomials.take(entry[run], axis=2)
-                    values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(run_polynomial, axis=2))
-                    yield VertexSums(vertex[run], values, *(data[..., run_polynomial] for data in polynomial_data))
+                    values = np.einsum("dmn,mkn->dkn", factors, coefficients.take(of_run, axis=2))
+                    normals = values[1:].T
+                    if with_normals:
+                        bound = np.broadcast_to(self.tangent_weights[block[of_run]], (2, len(of_run)))
+                        normals = unit_normals(values[1:], bound, extent[:, of_run]).T
+                    yield vertex[run], values[0].T + origin[of_run], normals
             first_block += len(weights)
 
     def _vertices(self, polynomials: slice) -> tuple[IntArray, IntArray, IntArray]:
@@ -112,30 +122,6 @@ class VertexPolynomials:
         entry = ragged.ranges(self.first_entry[kind], counts)
         vertex = np.repeat(self.first_vertex[runs].astype(np.int64), counts) + self.offset[entry]
         return np.repeat(polynomial, counts), vertex, entry
-
-
-class VertexSums(NamedTuple):
-    """Evaluated vertices."""
-
-    vertex: IntArray  # (n,)
-    values: FloatArray  # (d, k, n) float64: points relative to `origin`, and tangents if evaluated
-    origin: FloatArray  # (k, n) float64: a control point of the vertex's patch
-    extent: FloatArray  # (k, n) float64: largest distance along each axis of the patch's control points from `origin`
-    tangent_weights: FloatArray  # (n,): see `VertexPolynomials`
-
-    @property
-    def points(self) -> FloatArray:
-        """``(n, k)`` float64."""
-        return (self.values[0] + self.origin).T
-
-    def normals(self, *, are_rounded: bool) -> FloatArray:
-        """``(n, 3)`` unit normals; zero where the surface has none."""
-        extent = self.extent
-        if are_rounded:
-            # Refined control points are rounded before the origin is subtracted.
-            extent = np.maximum(extent, LEAST_EXTENT[64] * np.abs(self.origin))
-        bound = np.broadcast_to(self.tangent_weights, (2, len(self.vertex)))
-        return unit_normals(self.values[1:3], bound, extent).T
 
 
 def vertex_polynomials(

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray, Topology
+from ..evaluation.normals import LEAST_EXTENT
+from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .vertex_polynomials import VertexPolynomials
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from scipy import sparse
+
+    from .adaptive import AdaptiveGrid
+    from .uniform_grid import UniformGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class VertexTable:
 
     control_count: int
     patch_count: int
-    grid: Grid  # Numbers and locates the vertices and triangles
+    grid: UniformGrid | AdaptiveGrid  # Numbers and locates the vertices and triangles
     polynomials: tuple[VertexPolynomials, ...]  # Polynomials on which the vertices lie
     # (n,) uint32: control points, or refined ones if there is a `refinement`, of the patches of all classes
     controls: NDArray[np.uint32]
@@ -62,12 +66,8 @@ class VertexTable:
         return target
 
     def locations(self) -> tuple[IntArray, FloatArray]:
-        """Location of each vertex on the surface, see `Grid.locations`."""
+        """Location of each vertex on the surface, see `UniformGrid.locations`."""
         return self.grid.locations()
-
-    def refined(self, control_points: FloatArray) -> FloatArray:
-        """``(n, k)`` points that `controls` indexes, from ``(control_count, k)`` control points of the cage."""
-        return control_points if self.refinement is None else self.refinement @ control_points
 
     def apply(
         self,
@@ -79,21 +79,28 @@ class VertexTable:
         `SurfaceSamples`.
         """
         positions, normals = (np.empty((self.vertex_count, 3)) for _ in range(2))
-        points, are_rounded = self.refined(control_points), self.refinement is not None
+        # Refined control points are rounded before another one is subtracted.
+        least_extent = 0.0 if self.refinement is None else LEAST_EXTENT[64]
         for part in self.polynomials:
-            for sums in part.sums(self.controls, points):
-                positions[sums.vertex] = sums.points
-                normals[sums.vertex] = sums.normals(are_rounded=are_rounded)
+            evaluated = part.evaluated(
+                self.controls, self._refined(control_points), with_normals=True, least_extent=least_extent
+            )
+            for vertex, points, unit_normals in evaluated:
+                positions[vertex], normals[vertex] = points, unit_normals
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
     def interpolated(self, values: FloatArray) -> FloatArray:
         """``(vertex_count, k)`` limits of ``(control_count, k)`` values at the vertices, also evaluated for copies."""
-        limits, refined_values = np.empty((self.vertex_count, values.shape[1])), self.refined(values)
+        limits = np.empty((self.vertex_count, values.shape[1]))
         for part in self.polynomials:
-            for sums in part.sums(self.controls, refined_values, 1):
-                limits[sums.vertex] = sums.points
+            for vertex, vertex_values, _ in part.evaluated(self.controls, self._refined(values)):
+                limits[vertex] = vertex_values
         return limits
+
+    def _refined(self, control_points: FloatArray) -> FloatArray:
+        """``(n, k)`` points that `controls` indexes, from ``(control_count, k)`` control points of the cage."""
+        return control_points if self.refinement is None else self.refinement @ control_points
 
 
 class VertexMatrices(NamedTuple):
@@ -112,46 +119,6 @@ class VertexMatrices(NamedTuple):
     p: sparse.csr_array
     tangent_u: sparse.csr_array
     tangent_v: sparse.csr_array
-
-
-class Grid(Protocol):
-    """Numbering of a tessellation: the same for all surfaces over the same elements."""
-
-    @property
-    def vertex_count(self) -> int:
-        """Vertices of the tessellation."""
-        ...
-
-    def triangles(self) -> NDArray[np.uint32]:
-        """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
-        ...
-
-    def element(self) -> NDArray[np.uint32]:
-        """``(m,)`` element of each triangle."""
-        ...
-
-    def locations(self) -> tuple[IntArray, FloatArray]:
-        """Locations of the vertices on the surface.
-
-        Returns
-        -------
-        half_edge : (vertex_count,) int64
-            Corner of an element at which the parameters are (0, 0), a half-edge of `PatchTable.elements`.
-        uv : (vertex_count, 2) float64
-            Parameters. Vertices at corners of elements have (0, 0).
-        """
-        ...
-
-    def cut(self, topology: Topology) -> Grid:
-        """The same triangles over elements with the same half-edges, cut along more edges.
-
-        Vertices on a cut have a copy on each side, which is located on that side.
-        """
-        ...
-
-    def vertices_of(self, other: Any) -> IntArray:
-        """``(vertex_count,)`` the original of each vertex in a grid of which this one is a `cut`."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
