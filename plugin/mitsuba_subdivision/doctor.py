@@ -63,7 +63,9 @@ class Diagnosis:
     @property
     def healthy(self) -> bool:
         """Whether everything works that the machine should support."""
-        return None not in self.versions.values() and all(found.works is not False for found in self.variants.values())
+        return None not in self.versions.values() and all(
+            report.works is not False for report in self.variants.values()
+        )
 
     def as_json(self) -> str:
         """All of it, as JSON."""
@@ -79,13 +81,13 @@ class Diagnosis:
         if self.late_llvm and self.late_llvm < lowest_version():
             late += ", whose kernels end the process: import mitsuba_subdivision before mitsuba and drjit"
         lines.append(("LLVM, Mitsuba first", late))
-        for name, found in self.variants.items():
-            if found.works:
-                exact = "works" if found.exact_shading else f"does not work: {found.exact_problem}"
-                loaded = f", LLVM {found.llvm}" if found.llvm and name.startswith("llvm") else ""
-                lines.append((name, f"works ({found.seconds:.1f} s{loaded}); exact shading {exact}"))
+        for name, report in self.variants.items():
+            if report.works:
+                exact = "works" if report.exact_shading else f"does not work: {report.exact_problem}"
+                loaded = f", LLVM {report.llvm}" if report.llvm and name.startswith("llvm") else ""
+                lines.append((name, f"works ({report.seconds:.1f} s{loaded}); exact shading {exact}"))
             else:
-                lines.append((name, f"{'not available' if found.works is None else 'FAILS'}: {found.problem}"))
+                lines.append((name, f"{'not available' if report.works is None else 'FAILS'}: {report.problem}"))
         for name, packages in self.extras.items():
             listed = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
             lines.append((f"extra {name}", listed))
@@ -143,19 +145,19 @@ def _report(variant: str) -> dict[str, Any]:
 
     from .llvm import llvm_problem, loaded_version
 
-    found = {"works": None, "llvm": loaded_version()}
+    report = {"works": None, "llvm": loaded_version()}
     if variant not in mi.variants():
-        return {**found, "problem": f"Mitsuba {mi.__version__} was compiled without it"}
+        return {**report, "problem": f"Mitsuba {mi.__version__} was compiled without it"}
     if variant.startswith("llvm") and (problem := llvm_problem()):
-        return {**found, "problem": problem}
+        return {**report, "problem": problem}
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        return {**found, "problem": "Dr.Jit finds no CUDA device or driver"}
+        return {**report, "problem": "Dr.Jit finds no CUDA device or driver"}
     mi.set_variant(variant)
     if problem := _problem(shading="vertex", tessellation_rate=2):
-        return {**found, "works": False, "problem": problem}
+        return {**report, "works": False, "problem": problem}
     # The triangles of one segment per edge lie far below the surface.
     problem = _problem(shading="exact", tessellation_rate=1)
-    return {**found, "works": True, "exact_shading": problem is None, "exact_problem": problem}
+    return {**report, "works": True, "exact_shading": problem is None, "exact_problem": problem}
 
 
 def _problem(**parameters: Any) -> str | None:
@@ -210,9 +212,9 @@ def _extras() -> dict[str, dict[str, str | None]]:
         required = importlib.metadata.requires(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
         return {}
-    found: dict[str, dict[str, str | None]] = {}
+    extras: dict[str, dict[str, str | None]] = {}
     for requirement in required:
         name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
         if name and extra and extra[1] not in _FOR_DEVELOPERS:
-            found.setdefault(extra[1], {})[name[0]] = _version(name[0])
-    return found
+            extras.setdefault(extra[1], {})[name[0]] = _version(name[0])
+    return extras

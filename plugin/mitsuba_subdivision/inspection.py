@@ -119,10 +119,10 @@ def inspect(
 
 def _edge_count(cage: ControlCage) -> int:
     """Edges, of which non-manifold ones are several in the cage's topology."""
-    t, found = cage.topology, cage.non_manifold
-    if found is None:
+    t, non_manifold = cage.topology, cage.non_manifold
+    if non_manifold is None:
         return t.edge_count
-    sides = found.edge[found.is_edge & ~found.has_one_face]
+    sides = non_manifold.edge[non_manifold.is_edge & ~non_manifold.has_one_face]
     return t.edge_count - len(sides) + len(np.unique(sides))
 
 
@@ -153,10 +153,10 @@ def _piece_count(t: Topology, half_edges: IntArray) -> int:
 
 
 def _sharp_features(cage: ControlCage) -> dict[str, int]:
-    t, tags, found = cage.topology, cage.tags, cage.non_manifold
+    t, tags, non_manifold = cage.topology, cage.tags, cage.non_manifold
     edges = tags.edges[t.edge_half_edge]
-    if found is not None:
-        edges = edges[~found.is_edge[t.edge_half_edge]]
+    if non_manifold is not None:
+        edges = edges[~non_manifold.is_edge[t.edge_half_edge]]
     return {
         "infinitely sharp edges": int((edges >= 10).sum()),
         "semi-sharp edges": int(((edges > 0) & (edges < 10)).sum()),
@@ -164,8 +164,8 @@ def _sharp_features(cage: ControlCage) -> dict[str, int]:
         "semi-sharp vertices": int(((tags.vertices > 0) & ~tags.is_corner).sum()),
         "darts": int((cage.cut_mesh.topology.vertex_rules == VertexRule.DART).sum()),
         "holes": len(cage.holes),
-        "non-manifold edges": 0 if found is None else len(np.unique(found.edge[found.is_edge])),
-        "non-manifold vertices": 0 if found is None else int(found.is_vertex.sum()),
+        "non-manifold edges": 0 if non_manifold is None else len(np.unique(non_manifold.edge[non_manifold.is_edge])),
+        "non-manifold vertices": 0 if non_manifold is None else int(non_manifold.is_vertex.sum()),
     }
 
 

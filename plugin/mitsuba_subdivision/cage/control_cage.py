@@ -428,9 +428,13 @@ class ControlCage:
         The diagonal has the number of neighbours of each vertex, and neighbours have -1. The matrix is symmetric and
         positive semi-definite; constants are in its null space. `LimitSurface.stiffness` respects lengths and angles.
         """
-        from .structure import laplacian_of
+        from scipy import sparse
 
-        return laplacian_of(self.edges, self.vertex_count)
+        start, end = self.edges[self.edges[:, 0] != self.edges[:, 1]].T
+        rows, columns = np.concatenate([start, end]), np.concatenate([end, start])
+        shape = self.vertex_count, self.vertex_count
+        adjacency = sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()
+        return sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
 
     @property
     def contents(self) -> CageContents:

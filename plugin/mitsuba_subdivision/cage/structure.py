@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,6 @@ from ..mesh.manifold import NonManifold
 from ..mesh.shared import Content, Shared
 from ..mesh.sharpness import CreaseMethod
 from .validation import read_only
-
-if TYPE_CHECKING:
-    from scipy import sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +87,11 @@ class CageStructure:
 
     @cached_property
     def triangles(self) -> IndexArray:
-        return triangles_of(self.topology)
+        t = self.topology
+        counts = t.face_sizes - 2
+        first = np.repeat(t.face_offsets[:-1], counts)
+        step = first + ragged.index_in_row(counts)
+        return read_only(t.face_vertices[np.stack([first, step + 1, step + 2], axis=1)])
 
 
 _SHARED: Shared[CageStructure] = Shared()
@@ -107,22 +107,3 @@ def edges_of(topology: Topology) -> IndexArray:
     keys = np.unique(high * topology.vertex_count + low)
     high, low = np.divmod(keys, topology.vertex_count)
     return read_only(np.stack([low, high], axis=1).astype(np.int32))
-
-
-def triangles_of(topology: Topology) -> IndexArray:
-    """Return ``(n, 3)`` int32 vertices of the triangle fans at the first vertex of each face, in order of faces."""
-    counts = topology.face_sizes - 2
-    first = np.repeat(topology.face_offsets[:-1], counts)
-    step = first + ragged.index_in_row(counts)
-    return read_only(topology.face_vertices[np.stack([first, step + 1, step + 2], axis=1)])
-
-
-def laplacian_of(edges: IndexArray, vertex_count: int) -> sparse.csr_array:
-    """Return the ``(n_v, n_v)`` Laplacian of a graph: number of neighbours on the diagonal, -1 for each neighbour."""
-    from scipy import sparse
-
-    start, end = edges[edges[:, 0] != edges[:, 1]].T
-    rows, columns = np.concatenate([start, end]), np.concatenate([end, start])
-    shape = vertex_count, vertex_count
-    adjacency = sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()
-    return sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)

@@ -288,18 +288,18 @@ def _common_mode(
     )
 
 
-def differences(expected: Topology, found: Topology) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
+def differences(expected: Topology, other: Topology) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
     """Compare two meshes, half-edge by half-edge. Meshes without differences have equal refinements.
 
-    Returns four (n_h,) bool arrays. For each half-edge of ``found``: whether it has an unexpected twin; whether it
+    Returns four (n_h,) bool arrays. For each half-edge of ``other``: whether it has an unexpected twin; whether it
     lacks the expected twin; whether its origin has another `VertexRule`; and whether the semi-sharpness of its edge or
     at its origin differs.
     """
-    is_other = expected.twin != found.twin
-    has_other_rule = expected.vertex_rules[expected.face_vertices] != found.vertex_rules[found.face_vertices]
-    is_sharper = (np.abs(_sharpness(expected) - _sharpness(found)) > MEAN_TOLERANCE).any(axis=0)
-    is_sharper |= _differs_across(expected, found)
-    return is_other & (found.twin >= 0), is_other & (expected.twin >= 0), has_other_rule, is_sharper
+    differs = expected.twin != other.twin
+    has_other_rule = expected.vertex_rules[expected.face_vertices] != other.vertex_rules[other.face_vertices]
+    is_sharper = (np.abs(_sharpness(expected) - _sharpness(other)) > MEAN_TOLERANCE).any(axis=0)
+    is_sharper |= _differs_across(expected, other)
+    return differs & (other.twin >= 0), differs & (expected.twin >= 0), has_other_rule, is_sharper
 
 
 def _sharpness(t: Topology) -> NDArray[np.float64]:
@@ -310,11 +310,11 @@ def _sharpness(t: Topology) -> NDArray[np.float64]:
     return np.stack([semi.edges, semi.edges_refined, semi.vertices[t.face_vertices]])
 
 
-def _differs_across(expected: Topology, found: Topology) -> NDArray[np.bool_]:
+def _differs_across(expected: Topology, other: Topology) -> NDArray[np.bool_]:
     """Return ``(n_h,)``: whether semi-sharp edges across cuts differ at the origin of each half-edge."""
-    expected_rows, found_rows = _rows_across(expected), _rows_across(found)
-    rows, which = np.unique(np.concatenate([expected_rows, found_rows]), axis=0, return_inverse=True)
-    signs = np.repeat([1, -1], [len(expected_rows), len(found_rows)])
+    expected_rows, other_rows = _rows_across(expected), _rows_across(other)
+    rows, which = np.unique(np.concatenate([expected_rows, other_rows]), axis=0, return_inverse=True)
+    signs = np.repeat([1, -1], [len(expected_rows), len(other_rows)])
     surplus = np.bincount(which.ravel(), signs, minlength=len(rows))
     half_edges = rows[surplus != 0, 0].astype(np.int64)
     return np.isin(expected.face_vertices, expected.face_vertices[half_edges])
