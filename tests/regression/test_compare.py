@@ -101,6 +101,14 @@ def test_false_alarms_are_as_rare_as_alpha_says(reference):
     assert 30 < failed < 120
 
 
+def test_references_of_as_few_samples_cause_no_more_false_alarms():
+    """Their own noise counts: it is half of that of the differences."""
+    limits = replace(LIMITS, alpha=0.2)
+    images = [random_image(np.random.default_rng(seed), 16) for seed in range(2000, 2120)]
+    pairs = zip(images[::2], images[1::2], strict=True)
+    assert sum(compare(*pair, ["tile"], limits).status is Status.FAIL for pair in pairs) < 24
+
+
 @pytest.mark.parametrize("rate", [2e-5, 2e-4, 2e-3, 2e-2])
 def test_rare_events_are_no_alarm(rate):
     """From events that the reference has hardly seen to those of which every tile has some in each batch.

@@ -220,14 +220,17 @@ def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound
 def test_an_outline_in_view_is_noticed(direction, np_rng):
     """Where one point and normal of a part face the sensor and others face away; and hardly where none nearly do."""
     count, samples = 400, 60
-    centre, half = np_rng.normal(size=(3, count)), 0.3 * np_rng.random((3, count))
-    axis, angle = np_rng.normal(size=(3, count)), 0.5 * np_rng.random(count)
+    centre, half = np_rng.normal(size=(3, count)), np_rng.random((3, count))
+    # Half of the parts are flat, and their points count alone.
+    axis, angle = np_rng.normal(size=(3, count)), 0.5 * np_rng.random(count) * (np_rng.random(count) < 0.5)
     axis /= np.linalg.norm(axis, axis=0)
     eye = np.array([0.0, -4, 1])
     cone = Cone(axis, np.sin(angle))
     found = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone)
 
-    points = centre + half * np_rng.uniform(-1, 1, (samples, 3, count))
+    places = np_rng.uniform(-1, 1, (samples, 3, count))
+    places[::2] = np.sign(places[::2])
+    points = centre + half * places
     across = np.cross(np_rng.normal(size=(samples, 3, count)), axis[None], axis=1)
     normals = np.cos(angle) * axis + np.sin(angle) * across / np.linalg.norm(across, axis=1, keepdims=True)
     view = points - eye[:, None] if direction is None else np.broadcast_to(direction[:, None], points.shape)
