@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import glob
 import os
 import platform
 import re
@@ -32,7 +33,6 @@ NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba
 
 _TOO_LATE = "Dr.Jit was imported first"
 _WHEEL = "karellen-llvm-core"
-_LIBRARY = r"libLLVM[-.].*so"
 _SYSTEM_FOLDERS = (
     "/usr/local/lib",
     "/usr/lib/x86_64-linux-gnu",
@@ -156,11 +156,11 @@ def best_variant() -> str:
 
 def _search() -> LlvmChoice:
     """Newest usable library of the first location that has one: the Python environment, the wheel, the system."""
-    newest_old, loader_folders = 0, os.environ.get("LD_LIBRARY_PATH", "").split(":")
+    newest_old, loader_folders = 0, map(glob.escape, filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(":")))
     for reason, libraries in (
         ("found in the Python environment", lambda: _libraries(_python_folders())),
         (f"found through {_WHEEL}", _wheel_libraries),
-        ("newest of the system", lambda: _libraries([*filter(None, loader_folders), *_SYSTEM_FOLDERS])),
+        ("newest of the system", lambda: _libraries([*loader_folders, *_SYSTEM_FOLDERS])),
     ):
         versions = [(_known_version(path), path) for path in libraries()]
         usable = [(version, path) for version, path in versions if version >= lowest_version()]
@@ -176,47 +176,31 @@ def _search() -> LlvmChoice:
 def _known_version(path: str) -> int:
     """Major version of a library by its name, or else by the library itself; 0 if it is not an LLVM library."""
     version = library_version(path)
-    if version is None:
-        try:
-            library = ctypes.CDLL(path)
-        except OSError:
-            return 0
-        if hasattr(library, "LLVMGetVersion"):
-            major = ctypes.c_uint()
-            library.LLVMGetVersion(ctypes.byref(major), None, None)
-            version = major.value
-        else:
-            # LLVM has `LLVMGetVersion` since version 16.
-            version = 15 if hasattr(library, "LLVMGetGlobalContext") else 0
-    return version
+    if version is not None:
+        return version
+    try:
+        library = ctypes.CDLL(path)
+    except OSError:
+        return 0
+    if not hasattr(library, "LLVMGetVersion"):
+        # LLVM has `LLVMGetVersion` since version 16.
+        return 15 if hasattr(library, "LLVMGetGlobalContext") else 0
+    major = ctypes.c_uint()
+    library.LLVMGetVersion(ctypes.byref(major), None, None)
+    return major.value
 
 
 def _libraries(folders: Iterable[str]) -> list[str]:
-    found = []
-    for folder in folders:
-        # A star may be at the end of the last folder but one: "/usr/lib/llvm-*/lib".
-        start, _, end = folder.partition("*")
-        parent, start = os.path.split(start)
-        roots = [f"{parent}/{name}{end}" for name in _names(parent) if name.startswith(start)] if end else [folder]
-        for root in roots:
-            paths = [os.path.join(root, name) for name in _names(root) if re.match(_LIBRARY, name)]
-            found += [path for path in paths if os.path.isfile(path)]
-    return found
-
-
-def _names(folder: str) -> list[str]:
-    """Names in a folder; none if there is no such folder."""
-    try:
-        return os.listdir(folder)
-    except OSError:
-        return []
+    """LLVM libraries in folders, whose names may have stars."""
+    paths = (path for folder in folders for path in glob.glob(f"{folder}/libLLVM[-.]*so*"))
+    return [path for path in paths if os.path.isfile(path)]
 
 
 def _wheel_libraries() -> list[str]:
     """LLVM libraries among all files of the wheel; slower than a search of the usual folders."""
     # What reads the wheel's list of files takes a third as long to import as Mitsuba.
-    installed = _WHEEL.replace("-", "_") + "-"
-    if not any(name.startswith(installed) for folder in sys.path for name in _names(folder)):
+    installed = _WHEEL.replace("-", "_")
+    if not any(glob.glob(f"{glob.escape(folder)}/{installed}-*") for folder in sys.path):
         return []
 
     import importlib.metadata
@@ -225,9 +209,10 @@ def _wheel_libraries() -> list[str]:
         files = importlib.metadata.distribution(_WHEEL).files or []
     except importlib.metadata.PackageNotFoundError:
         return []
-    paths = [file.locate() for file in files if re.match(_LIBRARY, file.name)]
+    paths = [file.locate() for file in files if re.match(r"libLLVM[-.].*so", file.name)]
     return [os.path.normpath(path) for path in paths if os.path.isfile(path)]
 
 
 def _python_folders() -> list[str]:
-    return [f"{prefix}/lib" for prefix in dict.fromkeys([sys.prefix, sys.base_prefix, site.getuserbase()])]
+    prefixes = dict.fromkeys([sys.prefix, sys.base_prefix, site.getuserbase()])
+    return [f"{glob.escape(prefix)}/lib" for prefix in prefixes]
