@@ -10,9 +10,9 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube, torus
-from mitsuba_subdivision.tessellation import Criterion, Measure, adaptive
-from mitsuba_subdivision.tessellation.tile_choice import feature_edges
-from mitsuba_subdivision.tessellation.tiles import PatchFrames
+from mitsuba_subdivision.tessellation import Criterion, Measure, adaptive_grid
+from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
+from mitsuba_subdivision.tessellation.tile_rates import feature_edges
 from patches.closed_cages import bumpy
 from tessellation.distances import distances_of_pairs
 from tessellation.test_attribute_table import EVERY_CAGE, with_seams
@@ -185,7 +185,7 @@ def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(see
             connections[ends].add(way)
             of_face[face].add(ends)
     expected = [any(len(ends) == 1 or len(connections[ends]) > 1 for ends in of_face[face]) for face in of_face]
-    np.testing.assert_array_equal(adaptive._meets_twice(frames), expected)
+    np.testing.assert_array_equal(adaptive_grid._meets_twice(frames), expected)
     assert frames.is_whole.all()
     assert any(expected)
 

@@ -15,8 +15,8 @@ from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.scheme import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation import Criterion, Measure
-from mitsuba_subdivision.tessellation.tile_choice import TileRates, _extent, _normals_to
-from mitsuba_subdivision.tessellation.tiles import PatchFrames, whole_patches
+from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames, whole_patches
+from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth

@@ -17,7 +17,7 @@ from .array_types import ArrayTypes, Float, Index, Index4, Mask
 if TYPE_CHECKING:
     from ..patches import PieceTable
     from ..tessellation import VertexTable
-    from ..tessellation.adaptive import AdaptiveGrid
+    from ..tessellation.adaptive_grid import AdaptiveGrid
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from scipy import sparse
 
-    from .adaptive import AdaptiveGrid
+    from .adaptive_grid import AdaptiveGrid
     from .uniform_grid import UniformGrid
 
 

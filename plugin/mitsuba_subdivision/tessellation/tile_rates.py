@@ -1,26 +1,22 @@
-"""Division of patches into tiles, and choice of their rates, for an error criterion."""
+"""Bounds of a criterion's limited quantity over tiles: tests for flatness, numbers of segments, and division."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.errors import warn
-from ..evaluation.divided_tile import DividedTile, part_of_tile
-from ..evaluation.patch_tree import patch_trees
+from ..evaluation.divided_tile import DividedTile
 from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
-from ..progress import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from . import HIGHEST_RATE
+from .adaptive_grid import DEEPEST, PatchFrames, Tiles, child, half_edges_around, in_patch
 from .criterion import (
     Cone,
     Criterion,
@@ -33,12 +29,7 @@ from .criterion import (
     rounded_up,
     tangent_cone,
 )
-from .memory import require_memory_for_triangles
-from .tiles import DEEPEST, PatchFrames, Tiles, child, half_edges_around, in_patch, tile_type, whole_patches
 
-# Tiles of a kind that are processed together, whose bounds stay in a core's cache; and most tiles that wait for more of
-# their kind. Both bound temporary memory; smaller numbers would take more time.
-TILES_AT_ONCE, MOST_WAITING = 1 << 10, 1 << 15
 # Most triangles of a piece, or segments on a feature edge, above which the piece is divided, because its parts have
 # tighter bounds. The limit is lower for outlines, as few of the parts may be at one.
 MOST_TRIANGLES, MOST_TRIANGLES_AT_OUTLINE = 32, 18
@@ -56,122 +47,6 @@ class Part(NamedTuple):
     kind: DividedTile
     tiles: Tiles
     values: FloatArray  # (K, 3, t) float64: control points; of pieces, Bernstein coefficients
-
-
-def choose_tiles(
-    patches: PatchTable,
-    frames: PatchFrames,  # Of ``patches``
-    control_points: FloatArray,  # (n, 3) float64
-    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
-    criterion: Criterion,
-    # Most segments along an edge of the cage, and along each ring around an extraordinary point; rounded down to a
-    # power of two
-    max_rate: int,
-    cage_name: str,  # For warnings
-) -> Tiles:
-    """Divide the patches of a cage into tiles, in the order of the elements, and choose their rates.
-
-    Raises MemoryError if the triangles would not fit into memory. Warns if ``max_rate`` is too low for the criterion,
-    unless that is for outlines.
-    """
-    points = control_points[control_of_vertex]
-    rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    features = feature_edges(patches, frames, points, criterion)
-    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
-    needed = np.concatenate([none, *_chosen(rates, _whole_patches(patches, frames, points, features))])
-    u, v = needed["origin"].T
-    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
-    tiles, most = needed.copy(), rates.most(needed)[:, None]
-    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
-    if criterion.outline is None:
-        _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
-    return tiles
-
-
-def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: int, cage_name: str) -> None:
-    """Warn if the rates of tiles are lower than needed."""
-    is_coarse = (needed["rates"] != tiles["rates"]).any(axis=1) | (needed["sides"] != tiles["sides"]).any(axis=1)
-    if not is_coarse.any():
-        return
-    coarse, t = needed[is_coarse], patches.elements
-    tile_rate = np.maximum(coarse["rates"].max(axis=1), coarse["sides"].max(axis=1)).astype(np.int64)
-    # Rates along an edge of the cage are powers of two, as tiles arise by halving.
-    rate = 1 << int((tile_rate << coarse["halvings"]).max() - 1).bit_length()
-    count, total = len(np.unique(t.face[coarse["corner"]])), int(np.count_nonzero(t.face_sizes))
-    kind, larger = "faces" if patches.scheme.element == "face" else "vertices", "a larger error"
-    warn(
-        f"{cage_name}: with a max_rate of {max_rate}, the adaptive tessellation is coarser than asked for at "
-        f"{count} of {total} {kind}, which need up to about {rate} segments along an edge; expected "
-        + (f"a max_rate of {rate}, or {larger}" if rate <= HIGHEST_RATE else larger)
-    )
-
-
-def _whole_patches(
-    patches: PatchTable,
-    frames: PatchFrames,
-    points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
-    features: NDArray[np.bool_],  # (n_h,) bool: `feature_edges`
-) -> Iterator[Part]:
-    """Iterate over all patches, each as one tile."""
-    refined = patches.refined
-    table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
-    coordinates = np.ascontiguousarray(points.T)
-    elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
-    pairs = list(zip(table.classes, elements, strict=True))
-    for patch_class, element in counted(pairs, "Tiles of patch classes"):
-        identity = np.eye(element.control_count)
-        kind, rows = part_of_tile(element, identity)
-        corners = patch_class.corners if refined is None else refined.corners(patch_class)
-        tiles = whole_patches(corners, sides_on(features, frames, corners))
-        for begin in range(0, len(corners), TILES_AT_ONCE):
-            block = slice(begin, begin + TILES_AT_ONCE)
-            controls = patch_class.controls[block].T
-            values = np.stack([axis.take(controls, mode="clip") for axis in coordinates], axis=1)
-            yield Part(kind, tiles[block], values if rows is identity else times(rows, values))
-
-
-def _chosen(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
-    """Iterate over the tiles of all patches, with their rates. Raises MemoryError if there are too many triangles."""
-    # Tiles wait by kind, as one call bounds many tiles of a kind in little more time than one of them.
-    waiting: dict[DividedTile, list[Part]] = {}
-    triangle_count = waiting_count = 0
-    for part in chain(patches, [None]):
-        if part is not None:
-            waiting.setdefault(part.kind, []).append(part)
-            waiting_count += len(part.tiles)
-            if waiting_count < MOST_WAITING:
-                continue
-        waiting_count = 0
-        while waiting:
-            # Pieces, which are all of one kind, wait until there are enough of them. Larger tiles come first, to detect
-            # too many triangles early.
-            pieces = [kind for kind in waiting if kind.is_piece]
-            others = [kind for kind in waiting if not kind.is_piece]
-            has_enough = sum(len(part.tiles) for kind in pieces for part in waiting[kind]) > TILES_AT_ONCE
-            for kind in pieces + others if has_enough or not others else others:
-                taken = _taken(waiting[kind])
-                if not waiting[kind]:
-                    del waiting[kind]
-                done, undecided = rates.decided(taken)
-                triangle_count += int(rates.triangle_counts(done).sum())
-                if kind.is_piece:
-                    # The counts of undecided tiles are upper bounds, as division makes fewer triangles.
-                    require_memory_for_triangles(triangle_count + int(rates.triangle_counts(undecided.tiles).sum()))
-                yield done
-                for divided in rates.divided(undecided) if len(undecided.tiles) else ():
-                    waiting.setdefault(divided.kind, []).append(divided)
-
-
-def _taken(parts: list[Part]) -> Part:
-    """Remove about `TILES_AT_ONCE` tiles from the end of a list of parts of one kind, and return them."""
-    taken, count = [], 0
-    while parts and count < TILES_AT_ONCE:
-        taken.append(parts.pop())
-        count += len(taken[-1].tiles)
-    if len(taken) == 1:
-        return taken[0]
-    kinds, tiles, values = zip(*taken, strict=True)
-    return Part(kinds[0], np.concatenate(tiles), np.concatenate(values, axis=2))
 
 
 @dataclass(frozen=True, eq=False)
