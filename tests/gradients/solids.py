@@ -61,7 +61,7 @@ def of_surface(surface):
 def derivatives_of_surface(surface, directions):
     """``(n, 10)`` derivatives of volume and moments by moving the control points along each of ``n`` directions."""
     each_field = [field[surface.cage.cut_mesh.vertex] for field in (surface.cage.positions, *directions)]
-    own, *moves = (SurfacePieces.build(surface.patches, field).divided() for field in each_field)
+    own, *moves = (SurfacePieces.build(surface.patches, field) for field in each_field)
     total = _integrated(own.regular, [each.regular for each in moves])
     for tips, *moved in zip(own.tips, *(each.tips for each in moves), strict=True):
         for level in range(MOST_LEVELS):

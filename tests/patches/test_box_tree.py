@@ -23,7 +23,6 @@ def test_near_boxes_are_those_no_further_than_asked(most, np_rng, monkeypatch):
 
 
 def test_boxes_of_a_grid_have_parents_that_are_cubes(np_rng):
-    """Along Morton's curve, which fills a cube of eight before it goes on."""
     lower = np.indices((8, 8, 8)).reshape(3, -1).T.astype(float)[np_rng.permutation(512)]
     levels = BoxTree.build(lower, lower + 1).levels
     for (low, high), side in zip(levels, (1, 2, 4), strict=True):

@@ -8,7 +8,7 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.patches import closest_points, polynomial_pieces
+from mitsuba_subdivision.patches import closest_points
 from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
 from patches.closed_cages import bumpy, cage_of, creased
 from patches.locations import grid_locations
@@ -22,8 +22,6 @@ COUNT = 6
 ROUNDED = 1e-13
 # Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
-# Of areas: sums over pieces in another order.
-AREA = 1e-12
 # Of parameters: the same steps, but for rounding of sums over other numbers of points.
 DESCENT = 1e-12
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
@@ -157,26 +155,14 @@ def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
     np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("name", "count", "module", "limits"),
-    [
-        ("rook", 300, closest_points, {"MOST_KEPT": 0}),
-        ("rook", 300, closest_points, {"MOST_KEPT": 100}),
-        ("mixed torus", 20, polynomial_pieces, {"MOST_PIECES": 1, "DIVISIONS": 1}),
-        ("semi-sharp ring", 20, polynomial_pieces, {"MOST_PIECES": 1, "DIVISIONS": 1}),
-    ],
-)
-def test_levels_and_divisions_that_are_made_when_needed_change_nothing(
-    name, count, module, limits, np_rng, monkeypatch
-):
-    surface = surface_named(name)
-    points = np_rng.uniform(-1.5, 3, (count, 3))
+@pytest.mark.parametrize("most", [0, 100])
+def test_levels_that_are_computed_when_needed_change_nothing(most, np_rng, monkeypatch):
+    surface = surface_named("rook")
+    points = np_rng.uniform(-1.5, 3, (300, 3))
     expected = surface.closest_point(points)
-    for limit, value in limits.items():
-        monkeypatch.setattr(module, limit, value)
+    monkeypatch.setattr(closest_points, "MOST_KEPT", most)
     later = LimitSurface(surface.cage)
     np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
-    assert later.area() == pytest.approx(surface.area(), rel=AREA)
 
 
 def points_of_pieces(pieces, which, uv):
@@ -185,7 +171,7 @@ def points_of_pieces(pieces, which, uv):
 
 def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_rng):
     """Between random pairs of points in a piece, where its box says that squared distances from a point are convex."""
-    pieces, count = surface_named("rook")._all_pieces.regular, 5000
+    pieces, count = surface_named("rook")._surface_pieces.regular, 5000
     which, boxes = np_rng.integers(0, len(pieces), count), TurnedBoxes.around(pieces)
     beside = np_rng.normal(size=(count, 3)) * np_rng.uniform(0, 0.5, (count, 1))
     points = boxes.points[which] + np.linalg.norm(boxes.halves[which], axis=1)[:, None] * beside
@@ -200,7 +186,9 @@ def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_
 
 def test_bounds_around_extraordinary_points_move_with_them():
     cage = surface_named("mixed torus").cage
-    here, there = (LimitSurface(cage.with_positions(cage.positions + away))._all_pieces.tips for away in (0.0, 64.0))
+    here, there = (
+        LimitSurface(cage.with_positions(cage.positions + away))._surface_pieces.tips for away in (0.0, 64.0)
+    )
     for one, other in zip(here, there, strict=True):
         np.testing.assert_allclose(one.reach(2), other.reach(2), rtol=1e-9)
 
@@ -208,7 +196,7 @@ def test_bounds_around_extraordinary_points_move_with_them():
 def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_points(np_rng):
     """From anywhere in a piece, also where the distance is not convex."""
     cage, count = surface_named("mixed torus").cage, 600
-    pieces = LimitSurface(cage)._all_pieces.regular
+    pieces = LimitSurface(cage)._surface_pieces.regular
     points, which, begin = np_rng.normal(size=(count, 3)) * 3, np.arange(count) % len(pieces), np_rng.random((count, 2))
     uv, squared, slope = nearest_in_pieces(pieces, which, points, begin, 1.0)
     # Nothing within a small step is nearer.
@@ -217,7 +205,7 @@ def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_p
         assert (((p - points) ** 2).sum(axis=1) >= (1 - ROUNDED) * squared).all()
     # By powers of two all products are scaled exactly.
     unit = 2.0**-20
-    scaled = LimitSurface(cage.with_positions(unit * cage.positions))._all_pieces.regular
+    scaled = LimitSurface(cage.with_positions(unit * cage.positions))._surface_pieces.regular
     np.testing.assert_array_equal(nearest_in_pieces(scaled, which, unit * points, begin, unit)[0], uv)
     # Some take shorter steps where others have taken theirs.
     parts = [nearest_in_pieces(pieces, which[at], points[at], begin[at], 1.0) for at in np.split(np.arange(count), 100)]

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import level_at_size
-from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .nearest_in_piece import ROUNDED, TurnedBoxes, nearest_in_pieces, slopes
-from .polynomial_pieces import ElementParts, PolynomialPieces, SurfacePieces, Tips, alike
+from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -36,15 +34,9 @@ SMALLEST = 2.0**-44
 NEARLY = 0.02
 # Points per run of a query, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
-# Most pairs of a point and an undivided part that are searched at once.
-MOST_TRIALS = 1 << 11
-
-_Boxed = TypeVar("_Boxed", PolynomialPieces, ElementParts)
 
 # Children of a node of `BoxTree`.
 WIDTH = 8
-# Bits per coordinate of the Morton codes by which boxes are sorted.
-CURVE_BITS = 20
 # Most pairs of a point and a box that are tested together, so that arrays stay in a processor's cache.
 MOST_PAIRS = 1 << 15
 
@@ -82,9 +74,7 @@ class ClosestPointSearch:
     def __init__(self, pieces: SurfacePieces) -> None:
         from scipy.spatial import cKDTree
 
-        if not pieces.scheme.has_convex_rules:
-            pieces = pieces.divided()
-        self._tips, self._first_levels, self._undivided = pieces.tips, _first_levels(pieces), pieces.undivided
+        self._tips, self._first_levels = pieces.tips, _first_levels(pieces)
         parts = [pieces.regular]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             parts += [tips.level(level) for level in range(first_level)]
@@ -94,9 +84,9 @@ class ClosestPointSearch:
         # Points of the surface and their locations: first the middles of `_pieces`, then points of the tips.
         known = [self._pieces.middles()]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
-            boxes.append(_boxes_around(tips, first_level))
+            reach = tips.reach(first_level)
+            boxes.append((tips.points - reach, tips.points + reach))
             known += [(tips.points, tips.half_edge, tips.offsets), tips.level(first_level).middles()]
-        boxes += [parts.box() for parts in self._undivided]
         self._tree = BoxTree.build(*map(np.concatenate, zip(*boxes, strict=True)))
         points, self._start, self._uv = map(np.concatenate, zip(*known, strict=True))
         self._known: cKDTree = cKDTree(points)
@@ -126,29 +116,7 @@ class ClosestPointSearch:
             is_tip = (leaf >= 0) & (leaf < len(tips))
             best.try_tips(point[is_tip], tips, leaf[is_tip], first_level)
             leaf = leaf - len(tips)
-        if self._undivided:
-            is_undivided = leaf >= 0
-            self._try_undivided(best, points, point[is_undivided], leaf[is_undivided])
         return best.half_edge, best.uv
-
-    def _try_undivided(self, best: _Best, points: FloatArray, point: IntArray, part: IntArray) -> None:
-        """Find the least distance in undivided parts, given as pairs of a point and a part, nearest boxes first."""
-        lower, upper = (np.concatenate(side) for side in zip(*(parts.box() for parts in self._undivided), strict=True))
-        gaps = squared_gaps(points[point], lower[part], upper[part])
-        order = np.lexsort((gaps, point))
-        is_first = np.diff(point[order], prepend=-1) != 0
-        later = order[~is_first]
-        later = later[np.argsort(gaps[later])]
-        ends = np.cumsum([len(parts) for parts in self._undivided])
-        for pairs in (order[is_first], *np.split(later, range(MOST_TRIALS, len(later), MOST_TRIALS))):
-            near = pairs[gaps[pairs] <= best.reach[point[pairs]]]
-            group = np.searchsorted(ends, part[near], side="right")
-            best.try_undivided(
-                [
-                    (point[near[group == index]], parts, part[near[group == index]] - end + len(parts))
-                    for index, (parts, end) in enumerate(zip(self._undivided, ends.tolist(), strict=True))
-                ]
-            )
 
 
 class _Best:
@@ -194,7 +162,14 @@ class _Best:
         """Find the least distance in pieces; without ``boxes``, compute those around the pieces."""
         for halving in range(MOST_CONVEX_HALVINGS + 1):
             if boxes is None:
-                point, pieces, piece = self._near(point, pieces, piece)
+                lower, upper = pieces.box()
+                gaps = squared_gaps(
+                    self._points.take(point, axis=0), lower.take(piece, axis=0), upper.take(piece, axis=0)
+                )
+                is_near = gaps <= self.reach.take(point)
+                point = point[is_near]
+                used, piece = _numbered(piece[is_near], len(pieces))
+                pieces = pieces.chosen(used)
                 boxes = TurnedBoxes.around(pieces)
             points = self._points.take(point, axis=0)
             near, squared_distance, away = boxes.near(points, piece, self.reach.take(point))
@@ -211,14 +186,6 @@ class _Best:
             used, used_index = _numbered(piece[left], len(pieces))
             pieces, boxes = pieces.chosen(used).halved(), None
             point, piece = np.tile(point[left], 4), (used_index + len(used) * np.arange(4)[:, None]).ravel()
-
-    def _near(self, point: IntArray, parts: _Boxed, part: IntArray) -> tuple[IntArray, _Boxed, IntArray]:
-        """Pairs whose axis-aligned box is within reach. Returns points, the parts in use, and indices into these."""
-        lower, upper = parts.box()
-        gaps = squared_gaps(self._points.take(point, axis=0), lower.take(part, axis=0), upper.take(part, axis=0))
-        is_near = gaps <= self.reach.take(point)
-        used, used_index = _numbered(part[is_near], len(parts))
-        return point[is_near], parts.chosen(used), used_index
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, piece: IntArray) -> NDArray[np.bool_]:
         """Whether the nearest locations so far lie in their pieces and are minima along the surface."""
@@ -253,22 +220,6 @@ class _Best:
             piece = (tip + len(tips) * np.arange(count)[:, None]).ravel()
             self.try_pieces(np.tile(point, count), pieces, piece)
 
-    def try_undivided(self, pairs: list[tuple[IntArray, ElementParts, IntArray]]) -> None:
-        """Find the least distance in undivided parts: divide those within reach, all together, until none is left."""
-        while pairs:
-            child_pairs: list[tuple[IntArray, Any, IntArray]] = []
-            for point, parts, part in pairs:
-                near_point, near_parts, near_part = self._near(point, parts, part)
-                if len(near_point):
-                    child_pairs += [(near_point, child, near_part) for child in near_parts.children()]
-            for point, pieces, piece in _joined_pairs(
-                [pair for pair in child_pairs if isinstance(pair[1], PolynomialPieces)]
-            ):
-                self.try_pieces(point, pieces, piece)
-            for point, tips, tip in _joined_pairs([pair for pair in child_pairs if isinstance(pair[1], Tips)], "patch"):
-                self.try_tips(point, tips, tip, 0)
-            pairs = _joined_pairs([pair for pair in child_pairs if isinstance(pair[1], ElementParts)], "element")
-
     def _take(
         self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
     ) -> None:
@@ -291,19 +242,6 @@ class _Best:
         self.half_edge[updated], self.uv[updated] = half_edge[candidates], uv[candidates]
 
 
-def _joined_pairs(
-    pairs: list[tuple[IntArray, Any, IntArray]], name: str | None = None
-) -> list[tuple[IntArray, Any, IntArray]]:
-    """Join the pairs of a point and a part; with ``name``, only those whose parts have equal attributes ``name``."""
-    joined = []
-    for group in alike(pairs, lambda pair: None if name is None else getattr(pair[1], name)):
-        points, parts, which = zip(*group, strict=True)
-        first = ragged.starts(np.array([len(part) for part in parts]))
-        which_joined = [index + begin for index, begin in zip(which, first.tolist(), strict=True)]
-        joined.append((np.concatenate(points), type(parts[0]).joined(parts), np.concatenate(which_joined)))
-    return joined
-
-
 def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:
     """`numpy.unique` with `return_inverse`, of indices below ``count``, in linear time."""
     is_used = np.zeros(count, dtype=bool)
@@ -322,17 +260,6 @@ def _first_levels(pieces: SurfacePieces) -> list[int]:
     return [min(kept, tips.bounded_levels) for tips in pieces.tips]
 
 
-def _boxes_around(tips: Tips, first_level: int) -> tuple[FloatArray, FloatArray]:
-    """Corners ``(t, 3)`` of boxes around tips, from level ``first_level`` on."""
-    reach = tips.reach(tips.bounded_levels)
-    lower, upper = tips.points - reach, tips.points + reach
-    for level in range(first_level, tips.bounded_levels):
-        low, high = (side.reshape(-1, len(tips), 3) for side in tips.level(level).box())
-        np.minimum(lower, low.min(axis=0), out=lower)
-        np.maximum(upper, high.max(axis=0), out=upper)
-    return lower, upper
-
-
 def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPieces, TurnedBoxes]:
     """Halve pieces until they are flat up to rounding. Returns them and boxes around them."""
     done: list[tuple[PolynomialPieces, TurnedBoxes]] = []
@@ -348,7 +275,7 @@ def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPi
 
 @dataclass(frozen=True, eq=False)
 class BoxTree:
-    """A hierarchy of axis-aligned boxes, sorted by Morton codes; ``WIDTH`` consecutive boxes share a parent."""
+    """A hierarchy of axis-aligned boxes: ``WIDTH`` boxes that are consecutive in a k-d tree share a parent."""
 
     order: IntArray  # (n,) int64: indices of the boxes in the order of the leaves
     # tuple of ((m, 3), (m, 3)) float64: lower and upper corners of the boxes of each level, the leaves first
@@ -357,7 +284,9 @@ class BoxTree:
     @classmethod
     def build(cls, lower: FloatArray, upper: FloatArray) -> BoxTree:
         """Build the hierarchy of boxes with corners ``(n, 3)``, at least one."""
-        order = np.argsort(_along_curve((lower + upper) / 2), kind="stable")
+        from scipy.spatial import cKDTree
+
+        order = cKDTree((lower + upper) / 2, leafsize=WIDTH).indices
         levels = [(lower[order], upper[order])]
         while len(levels[-1][0]) > WIDTH:
             low, high = levels[-1]
@@ -403,15 +332,3 @@ def squared_gaps(points: FloatArray, lower: FloatArray, upper: FloatArray) -> Fl
     gap = np.maximum(lower - points, points - upper)
     np.maximum(gap, 0, out=gap)
     return np.einsum("sx,sx->s", gap, gap)
-
-
-def _along_curve(points: FloatArray) -> NDArray[np.uint64]:
-    """Morton codes of points in their bounding box."""
-    low = points.min(axis=0)
-    size = max(float((points - low).max()), sys.float_info.min)
-    cell = np.minimum((points - low) / size * 2**CURVE_BITS, 2**CURVE_BITS - 1).astype(np.uint64)
-    codes = np.zeros(len(points), dtype=np.uint64)
-    for bit in range(CURVE_BITS):
-        for axis in range(3):
-            codes |= (cell[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return codes

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.polynomials import BernsteinBasis, times
 from ..mesh.connectivity import IntArray
-from ..schemes.domain import FloatArray
+from ..schemes.domain import FloatArray, ParameterDomain
 from .polynomial_pieces import PartArrays, PolynomialPieces
 
 # Most steps. Five to seven are usual, more where a point is about as far away as the surface's centre of curvature.
@@ -58,134 +58,81 @@ def nearest_in_pieces(
     not zero where the minimum lies on an edge of the piece.
     """
     runs = np.split(np.arange(len(points)), range(CHUNK, len(points), CHUNK))
-    minima = [_nearest(_Descent.begun(pieces, which[run], points[run], uv[run], size)) for run in runs]
+    minima = [_nearest(pieces, which[run], points[run], uv[run], size) for run in runs]
     uv, squared_distance, slope = map(np.concatenate, zip(*minima, strict=True))
     return uv, squared_distance, slope
 
 
-def _nearest(minima: _Descent) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _nearest(
+    pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """`nearest_in_pieces` for one run of points."""
-    descent, left = minima, np.arange(len(minima.uv))
+    uv, jet, rounded = uv.copy(), _jet(pieces, which, points, uv), ROUNDED * size
+    # Fraction of the next step that is taken; and points that have not converged.
+    part, left = np.ones(len(uv)), np.arange(len(uv))
     for _ in range(STEPS):
-        converged = descent.step()
-        if converged.any():
-            minima.put(left[converged], descent.chosen(converged))
-            descent, left = descent.chosen(~converged), left[~converged]
+        step, is_newton = _step(pieces.basis.domain, uv[left], jet[left])
+        step *= part[left, None]
+        new_uv = uv[left] + step
+        new_jet = _jet(pieces, which[left], points[left], new_uv)
+        before, after = (np.einsum("sx,sx->s", away, away) for away in (jet[left, 0], new_jet[:, 0]))
+        # Where a step would increase the distance, the next one is shortened instead.
+        improves = after <= before + rounded * (np.sqrt(before) + rounded)
+        uv[left[improves]], jet[left[improves]] = new_uv[improves], new_jet[improves]
+        part[left] = np.where(improves, 1, part[left] * SHORTER)
+        length = np.abs(step).max(axis=1, initial=0)
+        left = left[~((length < STEP_TOLERANCE) | (is_newton & improves & (length < LAST_NEWTON_STEP)))]
         if not len(left):
             break
-    else:
-        minima.put(left, descent)
-    return minima.uv, minima.squared_distance, slopes(minima.tangents, minima.difference)
+    return uv, np.einsum("sx,sx->s", jet[:, 0], jet[:, 0]), slopes(jet[:, 1:3], jet[:, 0])
 
 
-@dataclass(eq=False)
-class _Descent:
-    """State of Newton's method for several points."""
+def _step(domain: ParameterDomain, at: FloatArray, jet: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Compute the step: Newton's, along an edge where it would leave the domain, and cut at the next edge.
 
-    pieces: PolynomialPieces
-    which: IntArray  # (s,) int64: index of each point's piece
-    points: FloatArray  # (s, 3) float64
-    uv: FloatArray  # (s, 2) float64
-    part: FloatArray  # (s,) float64: fraction of the step that is taken
-    difference: FloatArray  # (s, 3) float64: from the point to the surface
-    tangents: FloatArray  # (s, 2, 3) float64
-    second: FloatArray  # (s, 3) float64: products of the difference with the second derivatives by uu, uv and vv
-    size: float  # Largest absolute coordinate, for the rounding error
+    Returns the step, (s, 2) float64, and whether it is a full Newton step.
+    """
+    normals, difference, tangents = domain.edge_normals, jet[:, 0], jet[:, 1:3]
+    gradient = np.einsum("sdx,sx->sd", tangents, difference)
+    metric = tangents @ tangents.swapaxes(1, 2)
+    a, b, c = metric[:, 0, 0], metric[:, 0, 1], metric[:, 1, 1]
+    uu, uv, vv = np.einsum("sdx,sx->ds", jet[:, 3:], difference)
+    hessian = np.stack([a + uu, b + uv, c + vv], axis=1)
+    is_newton = (hessian[:, 0] > 0) & (hessian[:, 0] * hessian[:, 2] - hessian[:, 1] ** 2 > CONVEX * a * c)
+    damped = PARALLEL * (a + c) + VANISHING
+    matrix = np.where(is_newton[:, None], hessian, np.stack([a + damped, b, c + damped], axis=1))
+    h, i, j = matrix.T
+    step = np.stack([i * gradient[:, 1] - j * gradient[:, 0], i * gradient[:, 0] - h * gradient[:, 1]], axis=1)
+    step /= (h * j - i * i)[:, None]
 
-    @classmethod
-    def begun(
-        cls, pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
-    ) -> _Descent:
-        values = _values(pieces, which, points, uv)
-        return cls(pieces, which.copy(), points.copy(), uv.copy(), np.ones(len(points)), *values, size)
-
-    @property
-    def _arrays(self) -> tuple[NDArray, ...]:
-        return self.which, self.points, self.uv, self.part, self.difference, self.tangents, self.second
-
-    def chosen(self, mask: NDArray[np.bool_]) -> _Descent:
-        which, points, uv, part, difference, tangents, second = (array[mask] for array in self._arrays)
-        return _Descent(self.pieces, which, points, uv, part, difference, tangents, second, self.size)
-
-    def put(self, indices: NDArray, other: _Descent) -> None:
-        """Set the state of the points at ``indices`` to that of ``other``."""
-        for array, new in zip(self._arrays, other._arrays, strict=True):
-            array[indices] = new
-
-    @property
-    def squared_distance(self) -> FloatArray:
-        return np.einsum("sx,sx->s", self.difference, self.difference)
-
-    def step(self) -> NDArray[np.bool_]:
-        """Take a step; where it would increase the distance, shorten the next instead. Returns which have converged."""
-        step, is_newton = self._direction()
-        step *= self.part[:, None]
-        uv = self.uv + step
-        difference, tangents, second = _values(self.pieces, self.which, self.points, uv)
-        before, after = self.squared_distance, np.einsum("sx,sx->s", difference, difference)
-        rounded = ROUNDED * self.size
-        improves = after <= before + rounded * (np.sqrt(before) + rounded)
-        if improves.all():
-            self.uv, self.difference, self.tangents, self.second = uv, difference, tangents, second
-            self.part[:] = 1
-        else:
-            for array, new in zip(
-                (self.uv, self.difference, self.tangents, self.second), (uv, difference, tangents, second), strict=True
-            ):
-                array[improves] = new[improves]
-            self.part = np.where(improves, 1, self.part * SHORTER)
-        length = np.abs(step).max(axis=1, initial=0)
-        return (length < STEP_TOLERANCE) | (is_newton & improves & (length < LAST_NEWTON_STEP))
-
-    def _direction(self) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Compute the step: Newton's, along an edge where it would leave the domain, and cut at the next edge.
-
-        Returns the step, (s, 2) float64, and whether it is a full Newton step.
-        """
-        domain = self.pieces.basis.domain
-        normals = domain.edge_normals
-        gradient = np.einsum("sdx,sx->sd", self.tangents, self.difference)
-        metric = self.tangents @ self.tangents.swapaxes(1, 2)
-        a, b, c = metric[:, 0, 0], metric[:, 0, 1], metric[:, 1, 1]
-        uu, uv, vv = self.second.T
-        hessian = np.stack([a + uu, b + uv, c + vv], axis=1)
-        is_newton = (hessian[:, 0] > 0) & (hessian[:, 0] * hessian[:, 2] - hessian[:, 1] ** 2 > CONVEX * a * c)
-        damped = PARALLEL * (a + c) + VANISHING
-        matrix = np.where(is_newton[:, None], hessian, np.stack([a + damped, b, c + damped], axis=1))
-        h, i, j = matrix.T
-        step = np.stack([i * gradient[:, 1] - j * gradient[:, 0], i * gradient[:, 0] - h * gradient[:, 1]], axis=1)
-        step /= (h * j - i * i)[:, None]
-
-        inside = np.stack(domain.edge_distances(*self.uv.T), axis=1)
-        on_edge = inside <= ON_EDGE
-        held = on_edge & (gradient @ normals.T > 0)
-        count = held.sum(axis=1)
-        # A step may leave the domain although the distance falls inwards.
-        leaves = on_edge & (step @ normals.T < 0)
-        slides = np.flatnonzero((count == 1) | ((count == 0) & leaves.any(axis=1)))
-        if len(slides):
-            edge = np.argmax(np.where(count[slides, None] == 1, held[slides], leaves[slides]), axis=1)
-            along = normals[edge] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-            square, product = along**2, along[:, 0] * along[:, 1]
-            # Hessian and first fundamental form along the edge.
-            bend, flat = (
-                square[:, 0] * form[0] + 2 * product * form[1] + square[:, 1] * form[2]
-                for form in (hessian[slides].T, (a[slides], b[slides], c[slides]))
-            )
-            is_newton[slides] = bend > CONVEX * flat
-            bend = np.where(is_newton[slides], bend, flat + damped[slides])
-            step[slides] = along * (-np.einsum("sd,sd->s", along, gradient[slides]) / bend)[:, None]
-        step[count > 1] = 0
-        out = -(step @ normals.T)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            part = np.where(out > 0, np.maximum(inside, 0) / out, np.inf).min(axis=1)
-        return step * np.minimum(part, 1)[:, None], is_newton & (part >= 1)
+    inside = np.stack(domain.edge_distances(*at.T), axis=1)
+    on_edge = inside <= ON_EDGE
+    held = on_edge & (gradient @ normals.T > 0)
+    count = held.sum(axis=1)
+    # A step may leave the domain although the distance falls inwards.
+    leaves = on_edge & (step @ normals.T < 0)
+    slides = np.flatnonzero((count == 1) | ((count == 0) & leaves.any(axis=1)))
+    if len(slides):
+        edge = np.argmax(np.where(count[slides, None] == 1, held[slides], leaves[slides]), axis=1)
+        along = normals[edge] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+        square, product = along**2, along[:, 0] * along[:, 1]
+        # Hessian and first fundamental form along the edge.
+        bend, flat = (
+            square[:, 0] * form[0] + 2 * product * form[1] + square[:, 1] * form[2]
+            for form in (hessian[slides].T, (a[slides], b[slides], c[slides]))
+        )
+        is_newton[slides] = bend > CONVEX * flat
+        bend = np.where(is_newton[slides], bend, flat + damped[slides])
+        step[slides] = along * (-np.einsum("sd,sd->s", along, gradient[slides]) / bend)[:, None]
+    step[count > 1] = 0
+    out = -(step @ normals.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.where(out > 0, np.maximum(inside, 0) / out, np.inf).min(axis=1)
+    return step * np.minimum(part, 1)[:, None], is_newton & (part >= 1)
 
 
-def _values(
-    pieces: PolynomialPieces, piece: IntArray, points: FloatArray, uv: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`_Descent.difference`, `_Descent.tangents` and `_Descent.second` at parameters."""
+def _jet(pieces: PolynomialPieces, piece: IntArray, points: FloatArray, uv: FloatArray) -> FloatArray:
+    """``(s, 6, 3)`` differences from points to the surface, and derivatives of the surface by u, v, uu, uv and vv."""
     powers, degree = pieces.basis.indices, pieces.basis.degree
     # Powers of both parameters, and their first and second derivatives.
     value = np.ones((2, len(uv), degree + 1))
@@ -201,9 +148,9 @@ def _values(
     rows = np.empty((len(uv), 6, len(powers)))
     for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
         np.multiply(along_u, along_v, out=rows[:, number])
-    jet = rows @ pieces.monomials[piece]
-    difference = jet[:, 0] + (pieces.origins[piece] - points)
-    return difference, jet[:, 1:3], np.einsum("sdx,sx->sd", jet[:, 3:], difference)
+    jet: FloatArray = rows @ pieces.monomials[piece]
+    jet[:, 0] += pieces.origins[piece] - points
+    return jet
 
 
 def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:

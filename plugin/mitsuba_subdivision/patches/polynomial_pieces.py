@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache, partial
-from operator import attrgetter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+from operator import itemgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,8 +16,7 @@ from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IntArray, Topology
 from ..progress import counted
-from ..schemes.domain import IDENTITY, AffineMap, FloatArray
-from ..schemes.scheme import Scheme
+from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 
 # Size, relative to the patch, down to which levels around extraordinary points are bounded by Bernstein coefficients,
@@ -25,9 +24,6 @@ from .patch_table import PatchTable
 TIP_SIZE = 1 / 64
 # Pieces per run when computing boxes, whose arrays stay in a processor's cache.
 RUN = 1024
-# Elements of more than MOST_PIECES pieces, along semi-sharp creases, are at first divided only DIVISIONS times.
-MOST_PIECES, DIVISIONS = 64, 3
-
 _Any = TypeVar("_Any")
 _Parts = TypeVar("_Parts", bound="PartArrays")
 
@@ -169,50 +165,15 @@ class Tips(PartArrays):
         return times(rest_rows(self.patch), np.abs(times(transition(self.patch, level), coordinates))).max(axis=0).T
 
 
-@dataclass(frozen=True, eq=False)
-class ElementParts(PartArrays):
-    """Parts of a surface with the same patch tree, not yet divided."""
-
-    element: PatchTree
-    # As in `PolynomialPieces`, but from the parameters of the part
-    half_edge: IntArray
-    matrices: FloatArray
-    offsets: FloatArray
-    # (n, K, 3) float64: control points of the one-rings. Under convex rules, a part lies within their convex hull.
-    controls: FloatArray
-
-    def box(self) -> tuple[FloatArray, FloatArray]:
-        """``(n, 3)`` opposite corners of axis-aligned boxes around the control points."""
-        return self.controls.min(axis=1), self.controls.max(axis=1)
-
-    def children(self) -> list[PolynomialPieces | Tips | ElementParts]:
-        """Children of the parts: an entry for the first children of all parts, one for the second, and so on."""
-        children: list[PolynomialPieces | Tips | ElementParts] = []
-        for domain, (child, stencils) in zip(self.element.domains, self.element.children, strict=True):
-            outward, controls = domain.inverse(), stencils @ self.controls
-            if child.piece is not None:
-                outward = outward @ child.piece.domain.inverse()
-            place = self.half_edge, self.matrices @ outward.matrix, self.matrices @ outward.offset + self.offsets
-            if child.piece is None:
-                children.append(ElementParts(child, *place, controls))
-            elif child.piece.patch is not None:
-                children.append(Tips(child.piece.patch, *place, child.piece.coordinates @ controls))
-            else:
-                form = regular_bernstein(child.scheme)
-                origins, rows = controls[:, 0], form.of_controls @ child.piece.stencils
-                relative = controls - origins[:, None]
-                children.append(PolynomialPieces(form.basis, *place, origins, rows @ relative))
-        return children
+_Placed = TypeVar("_Placed", PolynomialPieces, Tips)
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePieces:
-    """A whole surface: polynomial pieces, tips and undivided parts."""
+    """A whole surface: polynomial pieces, and tips."""
 
-    scheme: Scheme
     regular: PolynomialPieces
     tips: tuple[Tips, ...]
-    undivided: tuple[ElementParts, ...]  # Parts along semi-sharp creases that would have very many pieces
     # (n_e, 3) float64: largest absolute coordinates of the control points of each element's patches; zero for holes
     # and other faces of `PatchTable.elements` without corners
     sizes: FloatArray
@@ -223,66 +184,63 @@ class SurfacePieces:
         patches: PatchTable,
         control_points: FloatArray,  # (n_v, 3) float64: at each mesh vertex
     ) -> SurfacePieces:
-        """Divide all elements into pieces; elements of more than `MOST_PIECES` pieces only `DIVISIONS` times."""
+        """Divide all elements. Parts of all patches that have equal one-rings are divided together."""
         refined = patches.refined
         table = patches if refined is None else refined.table
         if refined is not None:
             control_points = refined.matrix @ control_points
-        form = regular_bernstein(table.scheme)
-        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.basis.indices), 3))]
-        regular, tips, undivided = [PolynomialPieces(form.basis, np.empty(0, dtype=np.int64), *empty)], [], []
-        sizes = np.zeros((len(patches.elements.face_sizes), 3))
-        elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
-        known: dict[PatchTree, FloatArray] = {}
-        pairs = zip(table.classes, elements, strict=True)
-        for patch_class, whole in counted(list(pairs), "Pieces of patch classes"):
+        form, sizes = regular_bernstein(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
+        trees = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
+        # For each tree, arrays of parts: numbers by which pieces are sorted in the end, in the order of classes and
+        # children; places as in `PolynomialPieces`; control points of the one-rings.
+        parts: list[tuple[PatchTree, tuple[NDArray, ...]]] = []
+        for number, (patch_class, tree) in enumerate(zip(table.classes, trees, strict=True)):
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
             np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
-            place_of = partial(_seen, patches, corners)
-            waiting = [(whole, IDENTITY, controls, 0)]
-            while waiting:
-                element, outward, controls, depth = waiting.pop()
-                if element.regular_count > MOST_PIECES and depth == DIVISIONS:
-                    place = place_of(outward, outward(form.basis.domain.centre))
-                    undivided.append(ElementParts(element, *place, controls))
-                    continue
-                if element.regular_count > MOST_PIECES:
-                    for domain, (child, stencils) in zip(element.domains, element.children, strict=True):
-                        waiting.append((child, outward @ domain.inverse(), stencils @ controls, depth + 1))
-                    continue
-                origins = controls[:, 0]
-                relative = controls - origins[:, None]
-                rows = element.coefficients(form.of_controls, known=known)
-                for piece_rows, *piece_domain in zip(rows, *element.regular_domains, strict=True):
-                    domain = outward @ AffineMap(*piece_domain)
-                    place = place_of(domain, domain(form.basis.domain.centre))
-                    regular.append(PolynomialPieces(form.basis, *place, origins, piece_rows @ relative))
-                for tip in element.tips:
-                    domain = outward @ tip.domain.inverse()
-                    place = place_of(domain, domain.offset)
-                    tips.append(Tips(tip.irregular_patch, *place, tip.coordinates @ controls))
-        return cls(
-            table.scheme,
-            PolynomialPieces.joined(regular),
-            tuple(map(Tips.joined, alike(tips, attrgetter("patch")))),
-            tuple(map(ElementParts.joined, alike(undivided, attrgetter("element")))),
-            sizes,
-        )
+            # A patch of the refined cage is a quarter of a whole element of the cage.
+            is_quarter = patches.is_whole[patches.elements.face[corners]] & (refined is not None)
+            matrices = np.where(is_quarter, 0.5, 1.0)[:, None, None] * np.eye(2)
+            order, offsets = np.full(len(corners), float(number)), np.zeros((len(corners), 2))
+            parts.append((tree, (order, corners.astype(np.int64), matrices, offsets, controls)))
+        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.basis.indices), 3))]
+        regular = [(np.empty(0), PolynomialPieces(form.basis, np.empty(0, dtype=np.int64), *empty))]
+        tips, child_order = [], 1.0
+        while parts:
+            children: list[tuple[PatchTree, tuple[NDArray, ...]]] = []
+            child_order /= 4
+            for group in counted(alike(parts, itemgetter(0)), "Parts of patches"):
+                tree, columns = group[0][0], zip(*(arrays for _, arrays in group), strict=True)
+                order, half_edge, matrices, offsets, controls = map(np.concatenate, columns)
+                domains = tree.domains if tree.piece is None else [tree.piece.domain]
+                places = [
+                    (half_edge, matrices @ outward.matrix, matrices @ outward.offset + offsets)
+                    for outward in (domain.inverse() for domain in domains)
+                ]
+                if tree.piece is None:
+                    for number, ((child, stencils), place) in enumerate(zip(tree.children, places, strict=True)):
+                        children.append((child, (order + number * child_order, *place, stencils @ controls)))
+                elif tree.piece.patch is not None:
+                    coordinates = tree.piece.coordinates @ controls
+                    tips.append((order, Tips(tree.piece.patch, *places[0], coordinates)))
+                else:
+                    origins, rows = controls[:, 0], form.of_controls @ tree.piece.stencils
+                    coefficients = rows @ (controls - origins[:, None])
+                    regular.append((order, PolynomialPieces(form.basis, *places[0], origins, coefficients)))
+            parts = children
+        joined = [_sorted(group) for group in alike(tips, lambda pair: pair[1].patch)]
+        joined.sort(key=lambda pair: pair[0][0])
+        all_tips = tuple(_from_nearest_corner(patches, part, part.offsets) for _, part in joined)
+        _, pieces = _sorted(regular)
+        return cls(_from_nearest_corner(patches, pieces, pieces.middles()[2]), all_tips, sizes)
 
-    def divided(self) -> SurfacePieces:
-        """The same surface without undivided parts."""
-        if not self.undivided:
-            return self
-        regular, tips, undivided = [self.regular], [*self.tips], [*self.undivided]
-        while undivided:
-            children = [child for parts in undivided for child in parts.children()]
-            regular += [child for child in children if isinstance(child, PolynomialPieces)]
-            tips += [child for child in children if isinstance(child, Tips)]
-            element_parts = [child for child in children if isinstance(child, ElementParts)]
-            undivided = [ElementParts.joined(parts) for parts in alike(element_parts, attrgetter("element"))]
-        all_tips = tuple(map(Tips.joined, alike(tips, attrgetter("patch"))))
-        return SurfacePieces(self.scheme, PolynomialPieces.joined(regular), all_tips, (), self.sizes)
+
+def _sorted(pairs: Sequence[tuple[FloatArray, _Parts]]) -> tuple[FloatArray, _Parts]:
+    """Join parts, and sort them by the numbers that come with them."""
+    numbers, parts = zip(*pairs, strict=True)
+    order = np.concatenate(numbers)
+    sort = np.argsort(order, kind="stable")
+    return order[sort], type(parts[0]).joined(parts).chosen(sort)
 
 
 def alike(parts: Iterable[_Any], key: Callable[[_Any], object]) -> list[list[_Any]]:
@@ -293,27 +251,24 @@ def alike(parts: Iterable[_Any], key: Callable[[_Any], object]) -> list[list[_An
     return list(groups.values())
 
 
-def _seen(
+def _from_nearest_corner(
     patches: PatchTable,
-    corners: IntArray,  # (p,) int: corners of elements at which the patches begin
-    domain: AffineMap,  # From the part's parameters to the patch's
-    near_uv: FloatArray,  # (2,) float64: parameters in the patch of a point whose nearest corner is chosen
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """`half_edge`, `matrices` and `offsets` of the same part of all patches of a class.
-
-    In a whole element, parameters start at the nearest corner, so that they lose no digits there.
-    """
-    half_edge, shape = corners, patches.scheme.domain
-    is_whole = patches.is_whole[patches.elements.face[corners]]
-    # A patch of the refined cage is a quarter of a whole element of the cage.
-    scale = np.where(is_whole, 0.5, 1.0) if patches.refined is not None else np.ones(len(corners))
-    if patches.refined is None and is_whole.all():
-        extents = [shape.extent(shape.rotation(turn).inverse()(near_uv)) for turn in range(shape.corner_count)]
-        turn = int(np.argmin(extents))
-        domain = shape.rotation(turn).inverse() @ domain
-        for _ in range(turn):
-            half_edge = patches.elements.next[half_edge]
-    return half_edge.astype(np.int64), scale[:, None, None] * domain.matrix, scale[:, None] * domain.offset
+    parts: _Placed,
+    near_uv: FloatArray,  # (n, 2) float64: parameters in the element of a point whose nearest corner is chosen
+) -> _Placed:
+    """Let parameters in whole elements start at the nearest corner, so that they lose no digits there."""
+    if patches.refined is not None or not len(parts):
+        return parts
+    domain, elements = patches.scheme.domain, patches.elements
+    half_edge, matrices, offsets = parts.half_edge, parts.matrices.copy(), parts.offsets.copy()
+    turns = [domain.rotation(turn).inverse() for turn in range(domain.corner_count)]
+    turn = np.argmin([domain.extent(turned(near_uv)) for turned in turns], axis=0)
+    turn[~patches.is_whole[elements.face[half_edge]]] = 0
+    for number in range(1, domain.corner_count):
+        half_edge = np.where(turn >= number, elements.next[half_edge], half_edge)
+        at, turned = turn == number, turns[number]
+        matrices[at], offsets[at] = turned.matrix @ matrices[at], turned(offsets[at])
+    return replace(parts, half_edge=half_edge, matrices=matrices, offsets=offsets)
 
 
 @dataclass(frozen=True, eq=False)

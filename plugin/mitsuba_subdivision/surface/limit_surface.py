@@ -368,7 +368,7 @@ class LimitSurface:
         if not self._areas.total > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
         half_edge, uv = patches.uniform_locations(
-            self._all_pieces, self._areas, int(count), np.random.default_rng(seed)
+            self._surface_pieces, self._areas, int(count), np.random.default_rng(seed)
         )
         samples = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
         return patches.AreaSamples(
@@ -412,21 +412,17 @@ class LimitSurface:
         return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
-    def _all_pieces(self) -> SurfacePieces:
-        return self._surface_pieces.divided()
-
-    @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
         from ..patches.polynomial_pieces import element_bounds
 
-        return element_bounds(self._all_pieces, self.patches.elements)
+        return element_bounds(self._surface_pieces, self.patches.elements)
 
     @cached_property
     def _areas(self) -> SurfaceAreas:
-        return patches.SurfaceAreas.of(self._all_pieces)
+        return patches.SurfaceAreas.of(self._surface_pieces)
 
     def _sampling_cells(self) -> SamplingCells:
-        return patches.SamplingCells.build(self._all_pieces, self._areas)
+        return patches.SamplingCells.build(self._surface_pieces, self._areas)
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
