@@ -131,20 +131,8 @@ def test_colours_at_the_cage_are_found_and_refined():
     fit.step()
 
 
-def test_sharpness_is_found_from_pictures():
-    """Of the four edges around the top, which pictures show from above."""
-    target, start = (tagged(cube(), creases=[(*edge, sharpness) for edge in TOP]) for sharpness in (1.6, 0.5))
-    rates = [(0, 0.15), (8, 0.1), (16, 0.01)]
-    options = {"sharp_edges": TOP, "highest_sharpness": 2, "sharpness_rate": rates, "regularizers": {"anchor": 100.0}}
-    views = views_of(target, tessellation_rate=16)
-    fit = made(start, views, shape={"tessellation_rate": 8}, edge_spp=4, **options).run(20)
-    np.testing.assert_allclose(fit.sharpness, 1.6, atol=0.25)
-    tags = fit.cage.tags.creases(fit.cage.topology)
-    np.testing.assert_allclose(np.sort(tags[:, 2]), np.sort(fit.sharpness), atol=1e-6)
-
-
 def test_edges_of_a_crease_have_one_sharpness():
-    """Four edges around the top and four uprights, each with a sharpness of their own."""
+    """Four edges around the top and four uprights, each with a sharpness of their own, found from pictures."""
     heights = cube().positions[cube().edges, 2]
     crease_of = np.where((heights > 0).all(axis=1), 0, np.where(heights[:, 0] != heights[:, 1], 1, -1))
     edges, crease_of = cube().edges[crease_of >= 0], crease_of[crease_of >= 0]
@@ -154,10 +142,15 @@ def test_edges_of_a_crease_have_one_sharpness():
     views = views_of(target, tessellation_rate=16)
     fit = made(start, views, shape={"tessellation_rate": 8}, sharpness_rate=0.1, edge_spp=4, **options)
     for crease in (0, 1):
-        own = 0.2 * np.flatnonzero(crease_of == crease)
-        np.testing.assert_allclose(fit.sharpness[crease_of == crease], own.mean(), rtol=1e-6)
+        given = 0.2 * np.flatnonzero(crease_of == crease)
+        np.testing.assert_allclose(fit.sharpness[crease_of == crease], given.mean(), rtol=1e-6)
+    # By default each edge is a crease.
+    alone = made(start, views, **{**options, "crease_of": None})
+    np.testing.assert_allclose(alone.sharpness, np.minimum(0.2 * np.arange(len(edges)), 2), rtol=1e-6)
     fit.run(20)
     np.testing.assert_allclose(fit.sharpness, np.array([1.6, 0.7])[crease_of], atol=0.25)
+    tags = fit.cage.tags.creases(fit.cage.topology)
+    np.testing.assert_allclose(np.sort(tags[:, 2]), np.sort(fit.sharpness), atol=1e-6)
 
 
 def assert_resumed(make, steps, checkpoint):

@@ -4,7 +4,7 @@ from decimal import Decimal
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from mitsuba_subdivision.schemes import CatmullClark, Scheme, scheme_named
+from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.domain import IDENTITY
 from patches.closed_cages import CLOSED_CAGES, polygons
 from reference.exact_samples import mesh_of
@@ -171,10 +171,3 @@ def test_corner_of_another_polygon_becomes_one_quad(name):
         corner, *others = polygons(refined)[refined.face[child]]
         assert refined.face_vertices[child] == corner == topology.face_vertices[half_edge]
         assert others == [edges[half_edge], faces[half_edge], edges[topology.prev[half_edge]]]
-
-
-def test_is_a_scheme_found_by_name():
-    found = scheme_named("catmull_clark")
-    assert isinstance(found, CatmullClark)
-    assert isinstance(found, Scheme)
-    assert (found.element, found.regular_face_size, found.regular_valence) == ("face", 4, 4)
