@@ -64,13 +64,13 @@ def interruptible(work: Callable[[], T]) -> T:
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
-    found: dict[str, Any] = {}
+    outcome: dict[str, Any] = {}
 
     def run() -> None:
         try:
-            found["result"] = work()
+            outcome["result"] = work()
         except BaseException as error:  # Raised below, in the thread that waits.
-            found["error"] = error
+            outcome["error"] = error
 
     context = contextvars.copy_context()
     thread = threading.Thread(target=lambda: context.run(run), name="work", daemon=True)
@@ -84,13 +84,13 @@ def interruptible(work: Callable[[], T]) -> T:
                 signal.signal(signal.SIGINT, handler)
     except KeyboardInterrupt:
         raise Abandoned from None
-    if "error" in found:
+    if "error" in outcome:
         try:
-            raise found["error"]
+            raise outcome["error"]
         finally:
             # The error's traceback would keep alive the objects that the work used.
-            found.clear()
-    return found["result"]
+            outcome.clear()
+    return outcome["result"]
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def with_meshes(scene: SceneNode) -> SceneNode:
         shared = given["id"] if isinstance(given, dict) and given.get("type") == "ref" else None
         if "mesh" not in entry:
             used.add(shared)
-            return {name: loaded(each) if entry["type"] == "shapegroup" else each for name, each in entry.items()}
+            return {name: loaded(part) if entry["type"] == "shapegroup" else part for name, part in entry.items()}
         if shared is None:
             bsdf = mi.load_dict(given)
         else:
@@ -115,8 +115,8 @@ def with_meshes(scene: SceneNode) -> SceneNode:
         parts = (mi.load_dict(entry[name]) if name in entry else None for name in ("emitter", "interior"))
         return entry["mesh"].loaded(bsdf, *parts)
 
-    found = {name: loaded(entry) for name, entry in scene.items()}
-    return {name: entry for name, entry in found.items() if name not in bsdfs or name in used}
+    entries = {name: loaded(entry) for name, entry in scene.items()}
+    return {name: entry for name, entry in entries.items() if name not in bsdfs or name in used}
 
 
 def points_at(points: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float64]:

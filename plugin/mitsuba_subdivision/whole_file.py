@@ -30,21 +30,18 @@ def whole_file(path: Path) -> Iterator[Path]:
     path = Path(os.path.realpath(path)) if path.is_symlink() else path
     if not path.parent.is_dir():  # Otherwise messages would name the temporary file.
         raise FileNotFoundError(f'"{path}": there is no folder "{path.parent}"')
-    beside = _beside(path)
-    _unfinished.add(beside)
-    try:
-        yield beside
-        # Wait until it is on its disk: some systems notice only then that the disk is full.
-        with beside.open("r+b") as stream:
-            os.fsync(stream.fileno())
-        beside.replace(path)
-    except (OSError, RuntimeError) as error:
-        renamed = _about(path, beside, error)
-        if renamed is error:
-            raise
-        raise renamed from error
-    finally:
-        _remove(beside)
+    with _temporary(path) as beside:
+        try:
+            yield beside
+            # Wait until it is on its disk: some systems notice only then that the disk is full.
+            with beside.open("r+b") as stream:
+                os.fsync(stream.fileno())
+            beside.replace(path)
+        except (OSError, RuntimeError) as error:
+            renamed = _about(path, beside, error)
+            if renamed is error:
+                raise
+            raise renamed from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -72,14 +69,11 @@ def require_writable(
         raise PermissionError(f'output "{path}" is protected from writing')
     if path.exists() and not path.is_file():
         return
-    probe = _beside(Path(os.path.realpath(path)))
-    _unfinished.add(probe)
-    try:
-        probe.touch()
-    except OSError as error:
-        raise type(error)(f'output "{path}": {error.strerror}') from None
-    finally:
-        _remove(probe)
+    with _temporary(Path(os.path.realpath(path))) as probe:
+        try:
+            probe.touch()
+        except OSError as error:
+            raise type(error)(f'output "{path}": {error.strerror}') from None
 
 
 def require_folder(folder: Path) -> None:
@@ -95,17 +89,21 @@ def require_folder(folder: Path) -> None:
 def remove_unfinished() -> None:
     """Remove the unfinished files of this process before it ends."""
     for beside in _unfinished.copy():
-        _remove(beside)
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
 
 
-def _remove(unfinished: Path) -> None:
-    with suppress(OSError):
-        unfinished.unlink(missing_ok=True)
-    _unfinished.discard(unfinished)
-
-
-def _beside(path: Path) -> Path:
-    return path.with_name(f".{path.stem[:_LONGEST_STEM]}.{uuid.uuid4().hex}.part{path.suffix}")
+@contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """Path of a file of its own beside another one, which is removed at the end if it is still there."""
+    beside = path.with_name(f".{path.stem[:_LONGEST_STEM]}.{uuid.uuid4().hex}.part{path.suffix}")
+    _unfinished.add(beside)
+    try:
+        yield beside
+    finally:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+        _unfinished.discard(beside)
 
 
 def _about(path: Path, beside: Path, error: Exception) -> Exception:

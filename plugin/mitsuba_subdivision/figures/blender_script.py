@@ -28,12 +28,12 @@ def main(queries, answers, level):
     bpy.context.scene.collection.objects.link(thing)
     # Quality and the use of the limit surface stay at their defaults.
     thing.modifiers.new("subdivision", "SUBSURF").levels = level
-    found = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
+    subdivided = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     with open(answers, "wb") as file:
         for name, of, attribute, width, code in (
-            ("p", found.vertices, "co", 3, "f"),
-            ("n", found.vertices, "normal", 3, "f"),
-            ("corners", found.loops, "vertex_index", 1, "i"),
+            ("p", subdivided.vertices, "co", 3, "f"),
+            ("n", subdivided.vertices, "normal", 3, "f"),
+            ("corners", subdivided.loops, "vertex_index", 1, "i"),
         ):
             read = array.array(code, bytes(4 * width * len(of)))
             of.foreach_get(attribute, read)

@@ -85,13 +85,13 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
 def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
     """Ranges of the sharpness of creases by their least values in `EDGES`."""
     ends = [*EDGES, np.inf]
-    found = {}
+    ranges = {}
     for least, end in itertools.pairwise(ends):
         values = np.unique(sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)])
         if len(values):
             ends_of_range = dict.fromkeys(f"{value:g}" for value in values[[0, -1]])
-            found[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends_of_range)
-    return found
+            ranges[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends_of_range)
+    return ranges
 
 
 def _draw_legend(axis: Axes, cage: ControlCage) -> None:

@@ -64,8 +64,8 @@ def curvature_map(surface: LimitSurface, valence: int, count: int) -> NDArray[np
 
 def _curvatures(surface: LimitSurface, uv: NDArray[np.float64], valence: int) -> tuple[NDArray[np.floating], ...]:
     """Points, Gaussian and mean curvature at parameters in each of the first elements."""
-    found = surface.evaluate(np.arange(valence)[:, None], uv, derivatives=2)
-    return found.p, np.asarray(found.gaussian_curvature), np.asarray(found.mean_curvature)
+    samples = surface.evaluate(np.arange(valence)[:, None], uv, derivatives=2)
+    return samples.p, np.asarray(samples.gaussian_curvature), np.asarray(samples.mean_curvature)
 
 
 def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]:
@@ -85,11 +85,11 @@ def draw(options: FigureOptions) -> list[Path]:
     figure, axes = panels(options, 3, len(surfaces), sharey="row")
     norm = SymLogNorm(LINEAR, vmin=-LIMIT, vmax=LIMIT)
     for (valence, surface), column in zip(surfaces.items(), axes.T, strict=True):
-        found, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
+        grids, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
         measured = largest_by_level(surface, valence)
         options.report(f"valence {valence}: {rate:.4f} per level; largest at level {LEVELS[-1]} {measured[-1]:.3g}")
-        for axis, values in zip(column, found[2:], strict=False):
-            shown = _draw_disc(axis, zip(*found[:2], values, strict=True), norm)
+        for axis, values in zip(column, grids[2:], strict=False):
+            shown = _draw_disc(axis, zip(*grids[:2], values, strict=True), norm)
         plot = column[-1]
         plot.semilogy(LEVELS, measured, "o", markersize=2, color=SERIES[1][0], label="surface")
         plot.semilogy(LEVELS, measured[-1] * rate ** (LEVELS - LEVELS[-1]), color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")

@@ -85,11 +85,11 @@ def offset_cage(cage: ControlCage, offset: float) -> ControlCage:
 def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dtype: Any) -> FloatArray:
     """Largest angle in degrees between computed and exact normal over the samples of each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
-    found = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
+    normals = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
     # Where derivatives came out parallel or zero, there is no normal. That counts as the largest error.
-    exists = np.abs(found).max(axis=1) > 0
-    angle = np.full(len(found), 180.0)
-    angle[exists] = normal_angle(found[exists], exact[exists])
+    exists = np.abs(normals).max(axis=1) > 0
+    angle = np.full(len(normals), 180.0)
+    angle[exists] = normal_angle(normals[exists], exact[exists])
     return angle.reshape(len(LEVELS), -1).max(axis=1)
 
 
@@ -120,7 +120,7 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
             tangents.append(_rows_to(0, _rows_to(0, basis) * children[child]))
         normals = []
         for _ in LEVELS:
-            normals += [_unit_normal(each * points, mpmath) for each in tangents]
+            normals += [_unit_normal(rows * points, mpmath) for rows in tangents]
             points = matrix * points
     return np.array(normals, dtype=np.float64)
 

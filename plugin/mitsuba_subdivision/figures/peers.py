@@ -38,8 +38,8 @@ def blender() -> Path | None:
 
 def _program(name: str, *more: str) -> Path | None:
     folders = filter(None, (os.environ.get(VARIABLE), os.environ.get("PATH"), *more))
-    found = shutil.which(name, path=os.pathsep.join(folders))
-    return Path(found) if found else None
+    path = shutil.which(name, path=os.pathsep.join(folders))
+    return Path(path) if path else None
 
 
 def osd_samples(
@@ -65,8 +65,8 @@ def osd_samples(
         "sub": np.zeros(element.size, dtype=np.int32),
         "uv": np.stack([u, v], axis=-1).astype(np.float64),
     }
-    found = _answers(program, [], records, ["--method", method, "--level", str(level), "--real", "float"])
-    points, along_u, along_v = (found[name].reshape(-1, 3) for name in ("p", "du", "dv"))
+    answers = _answers(program, [], records, ["--method", method, "--level", str(level), "--real", "float"])
+    points, along_u, along_v = (answers[name].reshape(-1, 3) for name in ("p", "du", "dv"))
     cross = np.cross(along_u, along_v)
     with np.errstate(invalid="ignore"):
         return points, cross / np.linalg.norm(cross, axis=1, keepdims=True)
@@ -90,10 +90,10 @@ def blender_mesh(
     # Several threads race for the last bits of points that faces share.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]
-    found = _answers(program, options, _records_of(cage), [str(level)])
-    version = ".".join(map(str, found["version"][:2]))
-    points, normals = (found[name].reshape(-1, 3) for name in ("p", "n"))
-    return points, normals, found["corners"].reshape(-1, 4), version
+    answers = _answers(program, options, _records_of(cage), [str(level)])
+    version = ".".join(map(str, answers["version"][:2]))
+    points, normals = (answers[name].reshape(-1, 3) for name in ("p", "n"))
+    return points, normals, answers["corners"].reshape(-1, 4), version
 
 
 def _answers(program: Path, before: list[str], records: dict[str, NDArray], after: list[str]) -> dict[str, NDArray]:

@@ -39,8 +39,8 @@ def draw(options: FigureOptions) -> list[Path]:
         cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
     if len(counts) != 1:
-        found = f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}"
-        raise FigureError(f"{found}; expected as many at each")
+        numbers = f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}"
+        raise FigureError(f"{numbers}; expected as many at each")
     figure, axes = panels(options, *rows_of(options, LEVELS + 1))
     for axis in axes.flat[LEVELS + 1 :]:
         axis.set_axis_off()
@@ -89,10 +89,10 @@ def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
 
 def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
     """Share of the chosen elements in the area of the limit surface."""
-    found = surface.tessellate(RATE)
-    a, b, c = found.positions[found.triangles].swapaxes(0, 1)
+    triangles = surface.tessellate(RATE)
+    a, b, c = triangles.positions[triangles.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return float(area[elements[found.element]].sum() / area.sum())
+    return float(area[elements[triangles.element]].sum() / area.sum())
 
 
 def _render_cage(

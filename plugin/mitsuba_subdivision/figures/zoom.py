@@ -154,11 +154,11 @@ def normals_by(view: TangentView, samples: Samples, evaluator: Method) -> tuple[
     Returns besides their angles to the exact normals in degrees ``(valence, s)``, and the median of those inside the
     image.
     """
-    found = np.nan_to_num(np.stack([_normals(view.surface, i, samples.uv, evaluator) for i in range(VALENCE)]))
+    normals = np.nan_to_num(np.stack([_normals(view.surface, i, samples.uv, evaluator) for i in range(VALENCE)]))
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
-    angle = np.where(found.any(axis=-1), normal_angle(found, samples.normals), 180)
+    angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
     inside = np.abs(samples.positions[..., :2]).max(axis=-1) < 1
-    return found, angle, float(np.median(angle[inside]))
+    return normals, angle, float(np.median(angle[inside]))
 
 
 def _normals(surface: LimitSurface, element: int, uv: FloatArray, evaluator: Method) -> FloatArray:

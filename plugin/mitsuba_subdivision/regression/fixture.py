@@ -114,30 +114,30 @@ class RenderRegression:
             suite_size = max(1, len(list(self.references.glob("*.exr"))))
             spp = max(1, round(spp * self.spp_scale))
             with variant_set(chosen_variant(variant) if variant else variant_for(reference)):
-                found = compare_scene(reference, scene, tiers, spp, limits, suite_size, seed)
+                comparison = compare_scene(reference, scene, tiers, spp, limits, suite_size, seed)
         except UnusableReference as problem:
             if self.update == "no":
                 pytest.fail(f"{problem}; make it with: pytest {shlex.quote(self.node.nodeid)} --render-update", False)
             write()
             pytest.fail(f"{problem}; wrote it; look at it, and run the test again", False)
-        report = self._report(found, path.stem)
-        if found.status is not Status.FAIL:
-            self.node.add_report_section("call", "render difference", str(found))
-            return found
+        report = self._report(comparison, path.stem)
+        if comparison.status is not Status.FAIL:
+            self.node.add_report_section("call", "render difference", str(comparison))
+            return comparison
         if self.update != "no":
             write()
             report += f'\nwrote the reference "{path}" again'
-        pytest.fail(f"{found}{report}", False)
+        pytest.fail(f"{comparison}{report}", False)
 
-    def _report(self, found: Comparison, name: str) -> str:
+    def _report(self, comparison: Comparison, name: str) -> str:
         """Write a report if the settings request one; returns a line with its path."""
         wanted = self.reports
-        if wanted == "none" or (wanted == "failures" and found.status is not Status.FAIL):
+        if wanted == "none" or (wanted == "failures" and comparison.status is not Status.FAIL):
             return ""
         folder = self.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
         try:
-            page = write_report(folder, found, f"{name}: {self.node.nodeid}")
-            save_image(folder / "test.exr", found.test)
+            page = write_report(folder, comparison, f"{name}: {self.node.nodeid}")
+            save_image(folder / "test.exr", comparison.test)
         except (OSError, ImageError) as error:
             return f"\n  no report: {error}"
         self.reported = True

@@ -196,16 +196,16 @@ def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray
     sensor: Any = loaded.sensor
     # The middle of the lens and of the spectrum, when the shutter opens: a probe takes no random samples.
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, mi.Point2f(0.5))
-    found = loaded.scene.ray_intersect(ray)
+    hit = loaded.scene.ray_intersect(ray)
     # Any, as the stubs have no type for an array of shapes.
-    shapes: Any = found.shape, loaded.scene.shapes_dr()
-    identity, order = (np.array(dr.reinterpret_array(mi.UInt32, each)) for each in shapes)
+    shapes: Any = hit.shape, loaded.scene.shapes_dr()
+    identity, order = (np.array(dr.reinterpret_array(mi.UInt32, pointers)) for pointers in shapes)
     shape = np.full(width * height, NOTHING, dtype=np.uint32)
-    valid = np.array(found.is_valid())
+    valid = np.array(hit.is_valid())
     for index, shape_identity in enumerate(order):
         shape[valid & (identity == shape_identity)] = index
-    vectors = (np.array(v).T.astype(np.float32).copy() for v in (found.p, found.sh_frame.n, found.uv))
-    return *vectors, np.array(found.prim_index).astype(np.uint32), shape
+    vectors = (np.array(v).T.astype(np.float32).copy() for v in (hit.p, hit.sh_frame.n, hit.uv))
+    return *vectors, np.array(hit.prim_index).astype(np.uint32), shape
 
 
 def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
@@ -220,23 +220,23 @@ def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDA
     for i in range(count):
         film_position = [(i % width + 0.5) / width, (i // width + 0.5) / height]
         ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, [0.5, 0.5])
-        found = scene.ray_intersect(ray)
-        if found.is_valid():
-            position[i], normal[i], uv[i] = found.p, found.sh_frame.n, found.uv
-            triangle[i], shape[i] = found.prim_index, shapes.index(found.shape)
+        hit = scene.ray_intersect(ray)
+        if hit.is_valid():
+            position[i], normal[i], uv[i] = hit.p, hit.sh_frame.n, hit.uv
+            triangle[i], shape[i] = hit.prim_index, shapes.index(hit.shape)
     return position, normal, uv, triangle, shape
 
 
 def _elements(scene: mi.Scene, shape: NDArray[np.uint32], triangle: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """Faces of the cage that triangles belong to, `NOTHING` for shapes without a cage."""
-    found = np.full(shape.shape, NOTHING, dtype=np.uint32)
+    faces = np.full(shape.shape, NOTHING, dtype=np.uint32)
     for index, candidate in enumerate(scene.shapes()):
         at = np.flatnonzero(shape == index)
         parameters = mi.traverse(candidate) if len(at) and candidate.is_mesh() else {}
         if ELEMENT_ATTRIBUTE in parameters:
             elements = np.array(parameters[ELEMENT_ATTRIBUTE]).astype(np.uint32)
-            found[at] = elements[triangle[at]]
-    return found
+            faces[at] = elements[triangle[at]]
+    return faces
 
 
 T = TypeVar("T")

@@ -56,14 +56,14 @@ def as_reference(
     Raises ImageError if the image is not finite.
     """
     require_finite(image)
-    limits, found = tolerances.as_dict(), image.metadata
-    metadata = {**found, "tolerances": limits}
+    limits, made_by = tolerances.as_dict(), image.metadata
+    metadata = {**made_by, "tolerances": limits}
     if scene is not None:
         # Relative to the reference, so that the working folder makes no difference.
         metadata["scene"] = Path(os.path.relpath(scene, Path(path).parent)).as_posix()
         words = [PROGRAM, "render", metadata["scene"], "-o", Path(path).name, "--reference"]
         words += ["--spp", str(sampling.spp), "--batch", str(sampling.batch), "--seed", str(sampling.seed)]
-        words += ["--variant", found["variant"], *_assignments("-D", found["parameters"])]
+        words += ["--variant", made_by["variant"], *_assignments("-D", made_by["parameters"])]
         words += _assignments("--tolerance", dict(limits.items() - Tolerances().as_dict().items()))
         metadata["command"] = shlex.join(words)
     return replace(image, name=str(path), metadata=metadata)
@@ -87,13 +87,13 @@ def load_reference(path: Path) -> Image:
 
 def sampling_of(reference: Image) -> Sampling:
     """Sampling of a reference. Raises UnusableReference if the reference does not record it."""
-    found = reference.metadata.get("sampling")
-    if reference.estimate is None or not isinstance(found, dict):
+    sampling = reference.metadata.get("sampling")
+    if reference.estimate is None or not isinstance(sampling, dict):
         raise UnusableReference(
             f'"{reference.name}" does not say how it was rendered; expected a reference, as '
             f'"{PROGRAM} render SCENE -o REFERENCE.exr --reference" writes'
         )
-    return Sampling(sum(stop - start for start, stop in found["batches"]), found["batch"], found["seed"])
+    return Sampling(sum(stop - start for start, stop in sampling["batches"]), sampling["batch"], sampling["seed"])
 
 
 def _assignments(option: str, values: Mapping[str, object]) -> list[str]:
@@ -150,14 +150,14 @@ def compare_scene(
     whole batches, of the reference's size or less.
     """
     test = render_like(reference, source, spp, seed)
-    found = compare(reference, test, tiers, tolerances, suite_size)
-    failed = [tier for tier in found.tiers if tier.status is Status.FAIL]
+    comparison = compare(reference, test, tiers, tolerances, suite_size)
+    failed = [tier for tier in comparison.tiers if tier.status is Status.FAIL]
     if [tier.name for tier in failed] != ["tile"] or test.estimate is None:
-        return found
+        return comparison
     again = render_like(reference, source, RETRY_FACTOR * int(test.estimate.count.max()), seed, second_attempt=True)
     test = replace(test, pixels=again.pixels, estimate=again.estimate, metadata={**test.metadata, "attempt": 2})
-    found = compare(reference, test, tiers, tolerances, suite_size)
-    found.notes.append(
+    comparison = compare(reference, test, tiers, tolerances, suite_size)
+    comparison.notes.append(
         f"second attempt of the tile tier, with {RETRY_FACTOR} times the samples; the first found: {failed[0].lines[0]}"
     )
-    return found
+    return comparison

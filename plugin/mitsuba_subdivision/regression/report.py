@@ -68,10 +68,10 @@ def write_index(folder: str | Path) -> Path | None:
     folder = Path(folder)
     rows = []
     for path in sorted(folder.glob(f"*/{NUMBERS}")):
-        found = json.loads(path.read_text(encoding="utf-8"))
-        tiers = ", ".join(f"{name} {tier['status']}" for name, tier in found["tiers"].items())
-        link = f'<a href="{html.escape(path.parent.name)}/{PAGE}">{html.escape(found["title"])}</a>'
-        rows.append((found["status"], f"<tr><td>{_badge(found['status'])}<td>{link}<td>{html.escape(tiers)}"))
+        report = json.loads(path.read_text(encoding="utf-8"))
+        tiers = ", ".join(f"{name} {tier['status']}" for name, tier in report["tiers"].items())
+        link = f'<a href="{html.escape(path.parent.name)}/{PAGE}">{html.escape(report["title"])}</a>'
+        rows.append((report["status"], f"<tr><td>{_badge(report['status'])}<td>{link}<td>{html.escape(tiers)}"))
     if not rows:
         return None
     rows.sort(key=lambda row: ["fail", "warn", "pass"].index(row[0]))

@@ -91,13 +91,13 @@ def _loaded_scene(source: SceneSource, parameters: Mapping[str, Any] | None, fil
         what = "is a dictionary" if isinstance(source, Mapping) else "is loaded already"
         raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene {what}")
     if isinstance(source, mi.Scene):
-        found = _filter_name(source)
-        if filter_name and found != filter_name:
+        own_filter = _filter_name(source)
+        if filter_name and own_filter != filter_name:
             raise RegressionError(
-                f'the loaded scene has the reconstruction filter "{found}"; expected "{filter_name}", which '
+                f'the loaded scene has the reconstruction filter "{own_filter}"; expected "{filter_name}", which '
                 "a scene given as a file or a dictionary gets"
             )
-        return LoadedScene(source, None, found)
+        return LoadedScene(source, None, own_filter)
     config = mi.parser.ParserConfig(str(mi.variant()))
     if isinstance(source, Mapping):
         return _instantiate(config, [mi.parser.parse_dict(config, dict(source))], None, filter_name, given)
@@ -188,9 +188,9 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
     for node in state.nodes:
         for key, value in node.props.items():
             if node.props.type(key) == mi.Properties.Type.String:
-                found = Path(str(_file_resolver().resolve(value)))
-                if value and found.is_file():
-                    files.add(found.resolve())
+                named = Path(str(_file_resolver().resolve(value)))
+                if value and named.is_file():
+                    files.add(named.resolve())
     return {
         Path(os.path.relpath(file, folder)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted(files)
@@ -252,17 +252,17 @@ def environment(variant: str) -> dict[str, str]:
     The version of this package is left out: its changes are what the tests are for.
     """
     modules = {"mitsuba": mi, "drjit": dr, "numpy": np, "scipy": scipy}
-    found = {name: module.__version__ for name, module in modules.items()} | {"processor": _processor()}
+    versions = {name: module.__version__ for name, module in modules.items()} | {"processor": _processor()}
     if variant.startswith("llvm"):
-        found["llvm"] = str(loaded_version())
-    return found
+        versions["llvm"] = str(loaded_version())
+    return versions
 
 
 def _processor() -> str:
     # Code for another processor may add in another order. On Linux, `platform` does not know the model.
     information = Path("/proc/cpuinfo")
-    found = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
-    return found or platform.processor() or platform.machine()
+    name = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
+    return name or platform.processor() or platform.machine()
 
 
 def _first_of(information: str) -> str:

@@ -146,8 +146,8 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
     numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels": int(difference[..., 0].size)}
     maps = {"paired": relative_difference(reference.paired, test.paired)}
     if largest <= tolerances.paired_relative:
-        found = "the same bits" if changed == 0 else f"relative difference up to {largest:.2g}, in {changed} pixels"
-        return TierResult("paired", Status.PASS, [found], numbers, maps=maps)
+        line = "the same bits" if changed == 0 else f"relative difference up to {largest:.2g}, in {changed} pixels"
+        return TierResult("paired", Status.PASS, [line], numbers, maps=maps)
     line = (
         f"same samples, but {changed} of {numbers['pixels']} pixels differ, by up to {largest:.3g} relative; "
         f"at most {tolerances.paired_relative:.2g} expected"
@@ -171,8 +171,8 @@ def _different_samples(reference: Image, test: Image) -> str | None:
     for image, role in ((reference, "reference"), (test, "test")):
         if "paired" not in image.metadata:
             return f"the {role} does not say with which seed its first batch was rendered"
-    wanted, found = ({key: image.metadata.get(key) for key in _SAME_SAMPLES} for image in (reference, test))
-    different = _differences(wanted, found)
+    wanted, given = ({key: image.metadata.get(key) for key in _SAME_SAMPLES} for image in (reference, test))
+    different = _differences(wanted, given)
     if different:
         return f"the samples are not the same: {'; '.join(different)}"
     if wanted["filter"] != "box":
@@ -207,17 +207,17 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     Single precision adds a bias: the standard error has a floor for that. Šidák's correction covers the tiles and
     channels of a scale, Bonferroni's the scales and the scenes of a suite, of which there are ``suite_size``.
     """
-    expected, found = reference.estimate, test.estimate
-    if expected is None or found is None:
-        return _skipped_without("tile", expected, found, "channels variance.R, .G, .B and N")
-    for estimate, role in ((expected, "reference"), (found, "test")):
+    expected, tested = reference.estimate, test.estimate
+    if expected is None or tested is None:
+        return _skipped_without("tile", expected, tested, "channels variance.R, .G, .B and N")
+    for estimate, role in ((expected, "reference"), (tested, "test")):
         if estimate.batches < 2:
             return _skipped("tile", f"the {role} has one batch only, which gives no variance")
     height, width, _ = expected.mean.shape
     scales, failing, evidence = {}, [], {}
     for scale in SCALES:
         side = scale or max(height, width)
-        z = _z_scores(expected, found, side, tolerances)
+        z = _z_scores(expected, tested, side, tolerances)
         p = 2 * norm.sf(np.abs(z))
         limit = float(-np.expm1(np.log1p(-tolerances.alpha / (len(SCALES) * suite_size)) / z.size))
         places = np.argwhere(p < limit)
@@ -236,9 +236,9 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
             smallest = (norm.logsf(np.abs(z)).min(axis=2) + np.log(2)) / -np.log(10)
             evidence[p.min() / limit] = np.repeat(np.repeat(smallest, side, axis=0), side, axis=1)[:height, :width]
 
-    pixel_z = _z_scores(expected, found, 1, tolerances)
+    pixel_z = _z_scores(expected, tested, 1, tolerances)
     strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
-    spp, reference_spp = (int(np.median(estimate.count)) for estimate in (found, expected))
+    spp, reference_spp = (int(np.median(estimate.count)) for estimate in (tested, expected))
     samples = f"{spp} samples per pixel against {reference_spp}"
     result = TierResult(
         "tile",

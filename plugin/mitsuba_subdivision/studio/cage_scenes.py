@@ -199,22 +199,22 @@ class CageScenes:
 
 def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
     """A shape for each material of a cage: "surface", "surface_2" and so on. All have the same vertices."""
-    found: SceneNode = {}
+    shapes: SceneNode = {}
     if not model.materials:
-        return found
+        return shapes
     # Any, as the stubs call it an object.
     tensor: Any = mi.TensorXu
     for name, faces in model.cage.materials.items():
         material = model.materials.get(name)
         shown = {"shown_faces": tensor(faces.astype(np.uint32))} if in_memory else {"material": name}
         emitter = None if material is None else material_emitter(material)
-        found["surface" if not found else f"surface_{len(found) + 1}"] = {
+        shapes["surface" if not shapes else f"surface_{len(shapes) + 1}"] = {
             **surface,
             **(shown if len(model.cage.materials) > 1 else {}),
             "bsdf": _material(model.cage) if material is None else material_bsdf(material, name),
             **({} if emitter is None else {"emitter": emitter}),
         }
-    return found
+    return shapes
 
 
 def _material(cage: ControlCage, checker: bool = False) -> SceneNode:

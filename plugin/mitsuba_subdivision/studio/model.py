@@ -74,11 +74,11 @@ class Model:
         by_face = self.surface.scheme.element == "face" or len(self.cage.materials) == 1
         if not (self.path and is_obj and self.cage.materials and by_face):
             return {}
-        found = read_materials(self.path)
-        missing = ", ".join(f'"{name}"' for name in self.cage.materials if name and name not in found)
-        if found and missing:
+        described = read_materials(self.path)
+        missing = ", ".join(f'"{name}"' for name in self.cage.materials if name and name not in described)
+        if described and missing:
             warn(f'"{self.path}": no material library has {shortened(missing, 200)}; their faces are grey')
-        return found
+        return described
 
     @property
     def cage(self) -> ControlCage:
@@ -165,9 +165,9 @@ class Model:
 
 def up_axis_of(path: Path) -> str:
     """Axis of a model's file that points up: "y" or "z". Raises CageError if a USD file cannot be opened."""
-    found = FORMATS.get(path.suffix.lower())
-    if found is not None and found.up is not None:
-        return found.up
+    form = FORMATS.get(path.suffix.lower())
+    if form is not None and form.up is not None:
+        return form.up
     from ..files.usd_stage import stage_up_axis
 
     return stage_up_axis(path)

@@ -75,7 +75,7 @@ def read_materials(path: Path) -> dict[str, Material]:
     Warns if there is no such library, or entries are left out.
     """
     content = path.read_bytes()
-    found: dict[str, Material] = {}
+    materials: dict[str, Material] = {}
     for names in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)\s*$", content, re.MULTILINE):
         for library in _libraries(path.parent, names.decode(errors="replace")):
             try:
@@ -83,8 +83,8 @@ def read_materials(path: Path) -> dict[str, Material]:
             except OSError:
                 warn(f'"{path}": there is no material library "{library.name}"; its materials are grey')
                 continue
-            found.update(_parsed(library, text))
-    return found
+            materials.update(_parsed(library, text))
+    return materials
 
 
 def _libraries(folder: Path, names: str) -> list[Path]:
@@ -106,13 +106,13 @@ def _without_comment(line: str) -> str:
 
 
 def _parsed(library: Path, text: str) -> dict[str, Material]:
-    found: dict[str, Material] = {}
+    materials: dict[str, Material] = {}
     material: Material = {}
     left_out: dict[str, None] = {}
     for line in text.splitlines():
         key, rest = [*_without_comment(line).split(None, 1), "", ""][:2]
         if key == "newmtl":
-            found[rest] = material = {}
+            materials[rest] = material = {}
         elif key in _NUMBERS:
             values = _leading_numbers(rest.split(), _NUMBERS[key])
             # A grey may be one number.
@@ -128,25 +128,25 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
     if left_out:
         names = shortened(", ".join(left_out), 200)
         warn(f'"{library}": {names} left out; expected {_EXPECTED}')
-    return found
+    return materials
 
 
 def _leading_numbers(words: list[str], most: int) -> list[float]:
     """The first words, as long as they are finite numbers."""
-    found: list[float] = []
+    numbers: list[float] = []
     for word in words[:most]:
         try:
-            found.append(float(word))
+            numbers.append(float(word))
         except ValueError:
             break
-        if not math.isfinite(found[-1]):
-            return found[:-1]
-    return found
+        if not math.isfinite(numbers[-1]):
+            return numbers[:-1]
+    return numbers
 
 
 def _picture(folder: Path, text: str, left_out: dict[str, None]) -> Picture:
     """The picture of a map: options and the name of a file, which may have spaces."""
-    found = Picture(folder)
+    picture = Picture(folder)
     while (option := text.split(None, 1)[0] if text else "") in _OPTIONS:
         words = text.split(None, 1 + _OPTIONS[option])[1:]
         numbers = _leading_numbers(words, _OPTIONS[option])
@@ -154,18 +154,18 @@ def _picture(folder: Path, text: str, left_out: dict[str, None]) -> Picture:
         text = "".join(text.split(None, 1 + count)[1 + count :])
         is_on = words[:1] == ["on"]
         if option in ("-s", "-o") and numbers:
-            values = found.scale if option == "-s" else found.offset
+            values = picture.scale if option == "-s" else picture.offset
             values[: len(numbers)] = numbers
         elif option == "-mm" and len(numbers) == 2:
-            found.base, found.gain = numbers
+            picture.base, picture.gain = numbers
         elif option == "-clamp":
-            found.is_clamped = is_on
+            picture.is_clamped = is_on
         elif option in ("-blendu", "-blendv"):
-            found.is_blended &= is_on
+            picture.is_blended &= is_on
         elif option not in _OPTIONS_WITHOUT_EFFECT and any(numbers or [1]):
             left_out[f'"{shortened(" ".join([option, *words[:count]]))}" of {_TEXTURE}'] = None
-    found.path = _file(folder, text)
-    return found
+    picture.path = _file(folder, text)
+    return picture
 
 
 def material_bsdf(material: Material, name: str) -> SceneNode:
@@ -202,5 +202,5 @@ def material_emitter(material: Material) -> SceneNode | None:
 
 
 def _numbers(material: Material, key: str, *default: float) -> list[float]:
-    found = material.get(key)
-    return found if isinstance(found, list) else [*default]
+    value = material.get(key)
+    return value if isinstance(value, list) else [*default]

@@ -200,6 +200,6 @@ def denoised(loaded: LoadedScene, pixels: NDArray[np.float32], seed: int = 0) ->
     integrator = mi.load_dict({"type": "aov", "aovs": _AUXILIARY})
     auxiliary = render_pixels(loaded.scene, seed, AUXILIARY_SPP, sensor=loaded.sensor_index, integrator=integrator)
     color, albedo, normal = map(np.ascontiguousarray, (pixels[..., :3], auxiliary[..., -6:-3], auxiliary[..., -3:]))
-    found = np.array(pixels)
-    found[..., :3] = mitsuba_oidn.denoise(color, albedo, normal, hdr=True, clean_aux=True)
-    return found
+    clean = np.array(pixels)
+    clean[..., :3] = mitsuba_oidn.denoise(color, albedo, normal, hdr=True, clean_aux=True)
+    return clean

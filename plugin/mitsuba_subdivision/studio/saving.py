@@ -75,24 +75,24 @@ def _readable(text: str) -> str:
 
     def shortened(tag: re.Match[str]) -> str:
         if tag[1] == "lookat":
-            return _NUMBER.sub(lambda found: f"{float(found[0]):.{DIGITS}g}", tag[0])
-        return _NUMBER.sub(lambda found: str(np.float32(float(found[0]))).removesuffix(".0"), tag[0])
+            return _NUMBER.sub(lambda match: f"{float(match[0]):.{DIGITS}g}", tag[0])
+        return _NUMBER.sub(lambda match: str(np.float32(float(match[0]))).removesuffix(".0"), tag[0])
 
     return _NUMBERS.sub(shortened, _MATRIX.sub(_placed, text))
 
 
-def _placed(found: re.Match[str]) -> str:
-    matrix = np.array(found[2].split(), dtype=np.float64).reshape(4, 4)
+def _placed(match: re.Match[str]) -> str:
+    matrix = np.array(match[2].split(), dtype=np.float64).reshape(4, 4)
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     if np.array_equal(linear, np.diag(np.diag(linear))):
-        return f"{found[1]}{_tag('scale', np.diag(linear))}\n{found[1]}{_tag('translate', origin)}"
+        return f"{match[1]}{_tag('scale', np.diag(linear))}\n{match[1]}{_tag('translate', origin)}"
     sides = np.linalg.norm(linear, axis=0)
     axes = linear / sides
     if np.abs(axes.T @ axes - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(axes) < 0:
-        return found[0]
+        return match[0]
     vectors = {"origin": origin, "target": origin + axes[:, 2], "up": axes[:, 1]}
     directions = " ".join(f'{name}="{", ".join(map(str, vector))}"' for name, vector in vectors.items())
-    return f"{found[1]}{_tag('scale', sides)}\n{found[1]}<lookat {directions}/>"
+    return f"{match[1]}{_tag('scale', sides)}\n{match[1]}<lookat {directions}/>"
 
 
 def _tag(name: str, values: NDArray[np.float64]) -> str:
@@ -117,22 +117,22 @@ class _SceneParts:
 
         Raises ValueError if something cannot be written. Raises OSError if a file cannot be written.
         """
-        found = dict(node)
+        entry = dict(node)
         if "positions" in node:
-            found = self._with_cage(name, node)
+            entry = self._with_cage(name, node)
         elif "mesh" in node:
-            found = _with_name(self._file(name, ".ply", found.pop("mesh").save), found)
+            entry = _with_name(self._file(name, ".ply", entry.pop("mesh").save), entry)
         elif "bitmap" in node:
-            found = _with_name(self._picture(name, found.pop("bitmap")), found)
-        if "filename" in found:
-            found["filename"] = _relative(Path(found["filename"]), self._path.parent)
-        for key, value in found.items():
+            entry = _with_name(self._picture(name, entry.pop("bitmap")), entry)
+        if "filename" in entry:
+            entry["filename"] = _relative(Path(entry["filename"]), self._path.parent)
+        for key, value in entry.items():
             if isinstance(value, Mapping):
-                found[key] = self.in_files(f"{name}_{key}", dict(value))
+                entry[key] = self.in_files(f"{name}_{key}", dict(value))
             elif isinstance(value, mi.Object):
                 kind = type(value).__name__
                 raise ValueError(f'"{key}" of "{name}" is an object of Mitsuba, {kind}; expected a dictionary to save')
-        return found
+        return entry
 
     def write(self) -> list[Path]:
         """Write the files that have been found."""
@@ -195,10 +195,10 @@ def _contents(entry: SceneNode) -> CageContents:
 def _suffix_for(name: str, contents: CageContents) -> str:
     """The simplest file format that preserves a cage."""
     data = {**contents.attributes, **({} if contents.texcoords is None else {"texcoords": contents.texcoords})}
-    if not contents.attributes and all(each.interpolation == "face_varying" for each in data.values()):
+    if not contents.attributes and all(values.interpolation == "face_varying" for values in data.values()):
         return ".obj"
     has_tags = any(len(tags) for tags in (contents.creases, contents.corners, contents.holes))
-    is_plain = not has_tags and all(each.interpolation == "vertex" for each in data.values())
+    is_plain = not has_tags and all(values.interpolation == "vertex" for values in data.values())
     if is_plain and all(map(ply.is_possible, contents.attributes)) and importlib.util.find_spec("plyfile"):
         return ".ply"
     first = next(iter(data))
