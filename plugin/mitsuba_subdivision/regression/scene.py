@@ -91,23 +91,44 @@ def _loaded_scene(source: SceneSource, parameters: Mapping[str, Any] | None, fil
         what = "is a dictionary" if isinstance(source, Mapping) else "is loaded already"
         raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene {what}")
     if isinstance(source, mi.Scene):
-        own_filter = _filter_name(source)
-        if filter_name and own_filter != filter_name:
+        filter_of_scene = _filter_name(source)
+        if filter_name and filter_of_scene != filter_name:
             raise RegressionError(
-                f'the loaded scene has the reconstruction filter "{own_filter}"; expected "{filter_name}", which '
+                f'the loaded scene has the reconstruction filter "{filter_of_scene}"; expected "{filter_name}", which '
                 "a scene given as a file or a dictionary gets"
             )
-        return LoadedScene(source, None, own_filter)
-    config = mi.parser.ParserConfig(str(mi.variant()))
-    if isinstance(source, Mapping):
-        return _instantiate(config, [mi.parser.parse_dict(config, dict(source))], None, filter_name, given)
-    path = Path(source)
-    if not path.is_file():
+        return LoadedScene(source, None, filter_of_scene)
+    path = None if isinstance(source, Mapping) else Path(source)
+    if path and not path.is_file():
         raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
+    config = mi.parser.ParserConfig(str(mi.variant()))
     with kept_search_folders() as resolver:
-        # As in `mi.load_file`, names in the scene are looked up in the scene's folder first.
-        resolver.prepend(str(path.resolve().parent))
-        return _instantiate(config, [mi.parser.parse_file(config, str(path), **given)], path, filter_name, given)
+        if isinstance(source, Mapping):
+            state = mi.parser.parse_dict(config, dict(source))
+        else:
+            # As in `mi.load_file`, names in the scene are looked up in the scene's folder first.
+            resolver.prepend(str(Path(source).resolve().parent))
+            state = mi.parser.parse_file(config, str(path), **given)
+        try:
+            files = _checksums(path, state) if path else {}
+            if filter_name:
+                _replace_filter(state, filter_name)
+            # Where meshes are merged, the order of the area lights depends on addresses in memory, and with the order
+            # the random numbers.
+            config.merge_meshes = False
+            # Loaded at once, shapes are numbered in any order, and with it the kernels of instances differ: they would
+            # be compiled again in some processes.
+            config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
+            mi.parser.transform_all(config, state)
+            scene = mi.parser.instantiate(config, state)
+        finally:
+            # While a half-made scene is alive, in the traceback of an error, rendering another scene crashes.
+            del state
+    if isinstance(scene, (list, tuple)):
+        (scene,) = scene
+    if not isinstance(scene, mi.Scene) or not scene.sensors():
+        raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
+    return LoadedScene(scene, path, _filter_name(scene), files, given)
 
 
 def _file_resolver() -> Any:
@@ -125,40 +146,6 @@ def kept_search_folders() -> Iterator[Any]:
         resolver.clear()
         for folder in before:
             resolver.append(folder)
-
-
-def _instantiate(
-    config: mi.parser.ParserConfig,
-    parsed: list[mi.parser.ParserState],
-    path: Path | None,
-    filter_name: str | None,
-    parameters: dict[str, str],
-) -> LoadedScene:
-    """Load a scene from a parser state, given in a list and removed from it.
-
-    So neither the caller nor the traceback of an error holds on to the state: while a half-made scene is alive,
-    rendering another scene crashes.
-    """
-    state = parsed.pop()
-    try:
-        files = _checksums(path, state) if path else {}
-        if filter_name:
-            _replace_filter(state, filter_name)
-        # Where meshes are merged, the order of the area lights depends on addresses in memory, and with the order the
-        # random numbers.
-        config.merge_meshes = False
-        # Loaded at once, shapes are numbered in any order, and with it the kernels of instances differ: they would be
-        # compiled again in some processes.
-        config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
-        mi.parser.transform_all(config, state)
-        scene = mi.parser.instantiate(config, state)
-    finally:
-        del state
-    if isinstance(scene, (list, tuple)):
-        (scene,) = scene
-    if not isinstance(scene, mi.Scene) or not scene.sensors():
-        raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
-    return LoadedScene(scene, path, _filter_name(scene), files, parameters)
 
 
 def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
