@@ -68,29 +68,19 @@ __all__ = [
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
-_MODULES = {
-    "AreaSamples": "patches",
-    "Attribute": "cage",
-    "CageError": "cage",
-    "CageRefinement": "refinement.cage_refinement",
-    "CageWarning": "cage",
-    "ClosestPoints": "patches",
-    "ControlCage": "cage",
-    "ElementBounds": "patches",
-    "LimitSurface": "surface",
-    "SchemeError": "schemes",
-    "StencilMatrices": "patches",
-    "SurfaceSamples": "surface",
-    "Tessellation": "tessellation",
-    "VertexMatrices": "tessellation",
-    "check_scheme": "evaluation.scheme_laws",
-    "limit_stencil": "evaluation.element",
-    "loss_of_views": "shapes.moving_vertices",
-    "pixel_error_for": "shapes.tessellation_parameters",
-    "register_scheme": "schemes",
-    "render_denoised": "studio",
-    "studio_scene": "studio",
-    "upload": "device_arrays",
+_NAMES = {
+    "cage": ("Attribute", "CageError", "CageWarning", "ControlCage"),
+    "device_arrays": ("upload",),
+    "evaluation.element": ("limit_stencil",),
+    "evaluation.scheme_laws": ("check_scheme",),
+    "patches": ("AreaSamples", "ClosestPoints", "ElementBounds", "StencilMatrices"),
+    "refinement.cage_refinement": ("CageRefinement",),
+    "schemes": ("SchemeError", "register_scheme"),
+    "shapes.moving_vertices": ("loss_of_views",),
+    "shapes.tessellation_parameters": ("pixel_error_for",),
+    "studio": ("render_denoised", "studio_scene"),
+    "surface": ("LimitSurface", "SurfaceSamples"),
+    "tessellation": ("Tessellation", "VertexMatrices"),
 }
 
 
@@ -121,7 +111,7 @@ def example_file(name: str) -> str:
     raise FileNotFoundError(f'there is no example "{name}", neither in {folders}')
 
 
-_deferred = deferred(__name__, _MODULES)
+_deferred = deferred(__name__, _NAMES)
 
 
 def __getattr__(name: str) -> object:

@@ -37,6 +37,6 @@ __all__ = [
     "value_at",
 ]
 
-_OF_READER = dict.fromkeys(("MeshReader", "PrimvarChoice", "reversed_order"), "usd_reader")
+_OF_READER = {"usd_reader": ("MeshReader", "PrimvarChoice", "reversed_order"), "usd_skinning": ("Skinning",)}
 # Cages of other formats do not wait for these.
-__getattr__ = deferred(__name__, dict.fromkeys(__all__, "usd_stage") | _OF_READER | {"Skinning": "usd_skinning"})
+__getattr__ = deferred(__name__, {"usd_stage": __all__, **_OF_READER})

@@ -11,4 +11,4 @@ if TYPE_CHECKING:
 
 __all__ = ["EvaluatedVertices", "VertexKernel"]
 
-__getattr__ = deferred(__name__, {"EvaluatedVertices": "vertex_kernel", "VertexKernel": "vertex_kernel"})
+__getattr__ = deferred(__name__, {"vertex_kernel": __all__})

@@ -38,4 +38,4 @@ __all__ = [
     "with_rules",
 ]
 
-__getattr__ = deferred(__name__, {kind: module for module, kind in SCHEME_CLASSES.items()})
+__getattr__ = deferred(__name__, {module: (kind,) for module, kind in SCHEME_CLASSES.items()})
