@@ -10,11 +10,11 @@ import mitsuba_subdivision
 import mitsuba_usd
 import numpy as np
 import pytest
+from documents.pages import ARCHITECTURE, read, rows_below
 from scipy import sparse
 
 PACKAGE = "mitsuba_subdivision"
 ROOT, WHOLE_FILES = (Path(package.__file__).parent for package in (mitsuba_subdivision, mitsuba_usd))
-PAGE = Path(__file__).resolve().parents[1] / "plugin" / "ARCHITECTURE.md"
 # Modules that import by names which are no constants: of modules of their own package, or of a user.
 BY_NAME = {"deferred.py", "commands/__init__.py", "schemes/scheme.py", "files/formats.py", "figures/__init__.py"}
 # Packages that may import a library that the numpy packages do without.
@@ -34,22 +34,16 @@ MAY_IMPORT = {
 KNOWN_CIRCLES = f"{PACKAGE}.shapes."
 
 
-def rows_below(mark):
-    """Cells of the table below a mark on the page."""
-    lines = PAGE.read_text(encoding="utf-8").partition(f"<!-- {mark} -->\n")[2].partition("\n\n")[0].splitlines()
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines[2:]]
-
-
 def words_in(text):
     return re.findall(r"`([\w./]+)`", text)
 
 
 def allowed_imports():
     """What each package, or module beside the packages, may import of this project."""
-    text = " ".join(PAGE.read_text(encoding="utf-8").split())
+    text = " ".join(read(ARCHITECTURE).split())
     numpy_packages = words_in(text.partition('"numpy packages" are, in this order, ')[2].partition(";")[0])
     found = {}
-    for cell, _, stated in rows_below("packages"):
+    for cell, _, stated in rows_below(ARCHITECTURE, "packages"):
         (package,) = words_in(cell)
         above = numpy_packages[: numpy_packages.index(package)] if "above" in stated else numpy_packages
         found[package] = {*words_in(stated), *(above if "numpy packages" in stated else ())}
@@ -60,7 +54,7 @@ ALLOWED = allowed_imports()
 # Imports that go up, in a public method that only calls a function above: the module, and what it may import there.
 UP = {
     (f"{PACKAGE}.{words_in(module)[0][:-3].replace('/', '.')}", f"{PACKAGE}.{words_in(target)[0]}")
-    for module, target, _ in rows_below("imports that go up")
+    for module, target, _ in rows_below(ARCHITECTURE, "imports that go up")
 }
 
 

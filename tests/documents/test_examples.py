@@ -28,6 +28,7 @@ import mitsuba as mi
 import mitsuba_subdivision
 import numpy as np
 import pytest
+from documents.pages import CONFIGURATION, GUIDE, PLUGIN, PROJECT, ROOT, quoted, read, rows_below, without_blocks
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.figures import FIGURES
@@ -36,13 +37,6 @@ from mitsuba_subdivision.files.obj_reader import read_obj
 from mitsuba_subdivision.regression.tiers import TIERS
 from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # A package that pytest needs there.
-
-ROOT = Path(__file__).resolve().parents[2]
-PLUGIN, GUIDE = ROOT / "plugin", ROOT / "plugin" / "guide"
 PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md")), PLUGIN / "CONTRIBUTING.md"]
 PAGES += sorted((ROOT / ".github").glob("*.md"))
 EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -50,9 +44,8 @@ BLOCK = re.compile(
     r"^(?: *<!-- (?P<mark>[^\n]+) -->\n)? *```(?P<language>\w*)\n(?P<text>.*?)^ *```$", flags=re.MULTILINE | re.DOTALL
 )
 MARK = re.compile(r'(in the tests: (add .+|".+" is ".+"|needs \w+|options only)|pytest|test command)?')
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-EXTRAS = PROJECT["project"]["optional-dependencies"]
-MARKERS = [line.split(":")[0] for line in PROJECT["tool"]["pytest"]["ini_options"]["markers"]]
+EXTRAS = PROJECT["optional-dependencies"]
+MARKERS = [line.split(":")[0] for line in CONFIGURATION["tool"]["pytest"]["ini_options"]["markers"]]
 OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
 DPI = 20
 # Files that the examples of a page leave, among others.
@@ -324,21 +317,11 @@ def test_every_picture_of_a_page_is_there_and_every_option_in_its_text_is_one(pa
     """Of the command line, of pytest with this package, or of a script; other tests follow the links of Markdown."""
     sources = re.findall(r'<img src="([^"]+)"', page.read_text(encoding="utf-8"))
     assert [source for source in sources if not (page.parent / source).is_file()] == []
-    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = without_blocks(page.read_text(encoding="utf-8"))
     options = {option for code in re.findall(r"`([^`]+)`", text) for option in re.findall(r"--[a-z-]+", code)}
     sources = [*PLUGIN.rglob("*.py"), *(ROOT / "tests").rglob("*.py"), ROOT / "scenes" / "export_cage.py"]
     known = {option for path in sources for option in re.findall(r'"(--[a-z-]+)"', path.read_text(encoding="utf-8"))}
     assert sorted(options - known) == []
-
-
-def rows_below(page, mark):
-    """Cells of the table that follows a comment."""
-    table = page.read_text(encoding="utf-8").split(f"<!-- {mark} -->\n")[1].split("\n\n")[0]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
-
-
-def named(cell):
-    return re.findall(r"`([^`]+)`", cell)
 
 
 @pytest.mark.parametrize(("mark", "parameters"), [("parameters", PARAMETERS), ("state parameters", STATE_PARAMETERS)])
@@ -355,8 +338,8 @@ def test_the_tables_of_parameters_are_those_of_the_shape(mark, parameters):
 
 def test_the_table_of_formats_has_every_suffix_and_its_extra():
     rows = rows_below(GUIDE / "files.md", "formats")
-    assert [suffix for row in rows for suffix in named(row[0])] == list(FORMATS)
-    assert {extra for row in rows for extra in named(row[2])} <= set(EXTRAS)
+    assert [suffix for row in rows for suffix in quoted(row[0])] == list(FORMATS)
+    assert {extra for row in rows for extra in quoted(row[2])} <= set(EXTRAS)
 
 
 def test_statements_of_the_table_of_tags_mean_what_it_says(tmp_path):
@@ -368,9 +351,9 @@ def test_statements_of_the_table_of_tags_mean_what_it_says(tmp_path):
 
     statements = []
     for statement, meaning in rows_below(GUIDE / "files.md", "tags"):
-        statements += named(statement)
+        statements += quoted(statement)
         if "`" in meaning:
-            rule, *values = named(meaning)
+            rule, *values = quoted(meaning)
             assert contents(*statements).rules[rule] == values[-1]
             assert set(RULES[rule]) <= set(values)
     found = contents(*statements)
@@ -381,11 +364,11 @@ def test_statements_of_the_table_of_tags_mean_what_it_says(tmp_path):
 
 
 def test_the_tables_of_tiers_and_of_figures_have_all_and_their_formats_and_options():
-    assert [named(row[0])[0] for row in rows_below(GUIDE / "comparing-renders.md", "tiers")] == list(TIERS)
+    assert [quoted(row[0])[0] for row in rows_below(GUIDE / "comparing-renders.md", "tiers")] == list(TIERS)
     stated = {}
     for name, _, formats, options in rows_below(GUIDE / "figures.md", "figures"):
-        words = tuple(option.removeprefix("--") for option in named(options))
-        stated[named(name)[0]] = tuple(formats.split(", ")), words
+        words = tuple(option.removeprefix("--") for option in quoted(options))
+        stated[quoted(name)[0]] = tuple(formats.split(", ")), words
     assert stated == {name: (figure.formats, figure.options) for name, figure in FIGURES.items()}
 
 
@@ -397,7 +380,7 @@ def test_the_entry_for_the_software_states_the_version():
 
 def test_the_readme_is_a_landing_page():
     """Short enough to be read at once, and it leads to every page."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = read("README.md")
     assert len(text.splitlines()) <= 120
     links = {(ROOT / target.partition("#")[0]).resolve() for target in re.findall(r"\]\((\w[^):]+)\)", text)}
     # Two pages of the documentation's site show the README and the changelog.

@@ -4,13 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
+from documents.pages import ARCHITECTURE, MATHEMATICS, PLUGIN, ROOT, quoted, rows_below, without_blocks
 from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, regular_signature
 from mitsuba_subdivision.mesh.signature import Fan, Signature
 from mitsuba_subdivision.schemes import scheme_named
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGE = ROOT / "plugin" / "mitsuba_subdivision"
-ARCHITECTURE, MATHEMATICS = ROOT / "plugin" / "ARCHITECTURE.md", ROOT / "plugin" / "MATHEMATICS.md"
+PACKAGE = PLUGIN / "mitsuba_subdivision"
 # Paths on the two pages that begin with one of these lie below the top level, all others in the package.
 TOP = ("tests/", "scenes/", "renders/", "plugin/", "pyproject.toml")
 SUFFIXES = (".py", ".md", ".toml", ".obj", ".xml", ".json", ".cff")
@@ -28,13 +27,7 @@ CITATION = re.compile(rf"\[({KEY.pattern}[^\[\]]*)\]")
 
 
 def text_of(page):
-    """Without blocks of code and diagrams."""
-    return re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-
-
-def quoted(page):
-    """What stands between backticks."""
-    return set(re.findall(r"`([^`\n]+)`", text_of(page)))
+    return without_blocks(page.read_text(encoding="utf-8"))
 
 
 def is_path(word):
@@ -48,19 +41,13 @@ def citations(text):
     return {key.group() for key in keys if key}
 
 
-def table_below(page, mark):
-    """Cells of the rows of the table that follows a comment."""
-    below = page.read_text(encoding="utf-8").split(f"<!-- {mark} -->\n")[1].split("\n\n")[0]
-    return [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in below.splitlines()[2:]]
-
-
 def bibliography():
     return set(re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of(MATHEMATICS), flags=re.MULTILINE))
 
 
 @BOTH
 def test_every_file_that_a_page_names_exists(page):
-    paths = {word for word in quoted(page) if is_path(word)}
+    paths = {word for word in quoted(text_of(page)) if is_path(word)}
     assert len(paths) > 20
     assert [word for word in sorted(paths) if not ((ROOT if word.startswith(TOP) else PACKAGE) / word).exists()] == []
 
@@ -69,7 +56,7 @@ def test_every_file_that_a_page_names_exists(page):
 def test_every_name_that_a_page_gives_is_in_the_code(page):
     words = {word for path in SOURCES for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
     words |= {path.stem for path in SOURCES} | {path.name for path in PACKAGE.iterdir()}
-    names = {word for word in quoted(page) if re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", word)}
+    names = {word for word in quoted(text_of(page)) if re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", word)}
     names = {name for name in names if not is_path(name) and PLACEHOLDER not in name}
     assert len(names) > 5
     assert [name for name in sorted(names) if name.split(".")[-1] not in words] == []
@@ -119,7 +106,7 @@ def test_citations_are_found(text, keys):
 
 
 def test_the_table_of_eigenvalues_is_what_the_rules_give():
-    rows = table_below(MATHEMATICS, "eigenvalues")
+    rows = rows_below(MATHEMATICS, "eigenvalues")
     assert {row[0] for row in rows} == {"catmull_clark", "loop", "doo_sabin"}
     for name, cell, *stated in rows:
         scheme, valence = scheme_named(name), int(cell)

@@ -4,29 +4,17 @@ import importlib.util
 import re
 import shutil
 import subprocess
-import sys
-from pathlib import Path
 
 import mitsuba_subdivision
 import pytest
 import yaml
+from documents.pages import PROJECT, ROOT, read, without_blocks
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib  # A package that pytest needs there.
-
-ROOT = Path(__file__).resolve().parents[2]
 GITHUB = ROOT / ".github"
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 VERSION = mitsuba_subdivision.__version__
 # Systems by the names that images of workflows begin with, and by those of classifiers.
 SYSTEMS = {"ubuntu": "POSIX :: Linux", "macos": "MacOS", "windows": "Microsoft :: Windows"}
 REPOSITORY = "https://github.com/someone/something"
-
-
-def read(path):
-    return (ROOT / path).read_text(encoding="utf-8")
 
 
 def workflow(name="tests"):
@@ -118,8 +106,7 @@ def long_description():
 
 
 def targets(text):
-    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
-    return list(map("".join, re.findall(r'\]\(([^)]+)\)|src="([^"]+)"', text)))
+    return list(map("".join, re.findall(r'\]\(([^)]+)\)|src="([^"]+)"', without_blocks(text))))
 
 
 @pytest.mark.parametrize("repository", [None, REPOSITORY])
