@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import ragged
 from .control_cage import ControlCage
 from .errors import CageError, CageSource
 
@@ -110,53 +109,31 @@ def extraordinary_triangles(valence: int, rows: int = 4) -> ControlCage:
         With 4 or more, the poles are isolated.
     """
     _require_extraordinary(valence)
-    # Circle r of the upper half has r vertices per sector. Circle 0 is the pole.
-    lengths = valence * np.arange(1, rows + 1)
-    starts = 1 + ragged.starts(lengths)
+    # Circle r of the upper half has r vertices per sector; circle 0 is the pole. Triangles are sorted by circle, so
+    # that those of the pole come first.
+    circle, sector, step = np.indices((rows, valence, rows)).reshape(3, -1)
+    inner, outer = sector * circle + step, sector * (circle + 1) + step
+    up = np.array([(circle, inner), (circle + 1, outer), (circle + 1, outer + 1)])
+    down = np.array([(circle, inner), (circle + 1, outer + 1), (circle, inner + 1)])
+    corners = np.concatenate([up[..., step <= circle], down[..., step < circle]], axis=2)
+    around = corners[:, 1] % np.maximum(valence * corners[:, 0], 1)
+    vertices, number = np.unique(valence * rows * corners[:, 0] + around, return_inverse=True)
+    faces = number.reshape(3, -1).T
 
-    def number(circle, step):
-        return np.where(circle == 0, 0, starts[np.maximum(circle, 1) - 1] + step % (valence * np.maximum(circle, 1)))
-
-    sector, circle, step = np.indices((valence, rows, rows)).reshape(3, -1)
-    # Sort by circle, so that the triangles of the pole come first.
-    order = np.argsort(circle, kind="stable")
-    sector, circle, step = sector[order], circle[order], step[order]
-    inner_start, outer_start = sector * circle, sector * (circle + 1)
-    outward = step <= circle
-    inward = step < circle
-    up = np.stack(
-        [
-            number(circle, inner_start + step),
-            number(circle + 1, outer_start + step),
-            number(circle + 1, outer_start + step + 1),
-        ],
-        axis=1,
-    )[outward]
-    down = np.stack(
-        [
-            number(circle, inner_start + step),
-            number(circle + 1, outer_start + step + 1),
-            number(circle, inner_start + step + 1),
-        ],
-        axis=1,
-    )[inward]
-
-    circle, step = np.repeat(np.arange(1, rows + 1), lengths), ragged.index_in_row(lengths)
+    circle, around = np.divmod(vertices, valence * rows)
     # Interpolate along the sector's side of the polygon, then project to the sphere.
-    side, along = np.divmod(step, circle)
+    side, along = np.divmod(around, np.maximum(circle, 1))
     angle = 2 * np.pi / valence * np.stack([side, side + 1])
-    weight = np.stack([1 - along / circle, along / circle])
+    weight = np.stack([1 - along / np.maximum(circle, 1), along / np.maximum(circle, 1)])
     flat = np.stack([(weight * np.cos(angle)).sum(axis=0), (weight * np.sin(angle)).sum(axis=0)], axis=1)
     radius = np.sin(np.pi / 2 * circle / rows)[:, None]
-    ring = np.concatenate([radius * flat / np.linalg.norm(flat, axis=1, keepdims=True), np.sqrt(1 - radius**2)], axis=1)
-    upper = np.concatenate([[[0, 0, 1]], ring])
-    below = len(upper) - valence * rows
+    ring = radius * flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    upper = np.concatenate([ring, np.sqrt(1 - radius**2)], axis=1)
     # The equator is shared; the lower half has mirrored copies of the other vertices.
+    below = len(upper) - valence * rows
     lower_number = np.concatenate([len(upper) + np.arange(below), np.arange(below, len(upper))])
-    faces = np.concatenate([up, down])
-    positions = np.concatenate([upper, upper[:below] * [1, 1, -1]])
     return ControlCage(
-        positions,
+        np.concatenate([upper, upper[:below] * [1, 1, -1]]),
         np.concatenate([faces, lower_number[faces[:, ::-1]]]),
         source=CageSource(f"extraordinary_triangles({valence})"),
     )
