@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks, kept_rules, kept_sharpness
@@ -67,20 +67,21 @@ class CatmullClark(Scheme):
         )
 
         origin, end = t.face_vertices, t.face_vertices[t.next]
-        size = t.face_sizes[t.face].astype(float)
-        masks = crease_masks(t)
+        size = t.face_sizes[t.face]
+        smooth, at_vertex, of_neighbours, midpoint = crease_masks(t)
         valence = np.maximum(t.vertex_face_count, 1).astype(float)
-        vertex_weight = masks.smooth * (valence - 2) / valence + masks.at_vertex
+        vertex_weight, neighbour_weight = smooth * (valence - 2) / valence + at_vertex, smooth / valence**2
 
         # Weight of each of the two face points in an edge point, and of each end.
         face_weight = np.where((size == 3) & (self.triangle_rule == "smooth"), 0.47, 0.25)
-        face_weight = (face_weight + face_weight[t.twin]) / 2 * (1 - masks.midpoint)
+        face_weight = (face_weight + face_weight[t.twin]) / 2 * (1 - midpoint)
         end_weight = 0.5 - face_weight
         # Face points in edge and vertex points: an entry for each corner and each vertex of its face.
-        corner, member = _corner_members(t)
-        in_edge_point, in_vertex_point = face_weight[corner] != 0, masks.smooth[origin[corner]] > 0
+        corner = np.repeat(np.arange(t.half_edge_count), size)
+        member = t.face_vertices[ragged.ranges(t.face_offsets[t.face], size)]
+        in_edge_point, in_vertex_point = face_weight[corner] != 0, smooth[origin[corner]] > 0
         edge_corner, vertex_corner = corner[in_edge_point], corner[in_vertex_point]
-        is_border, is_smooth = t.twin < 0, masks.smooth[origin] > 0
+        is_border, is_smooth = t.twin < 0, smooth[origin] > 0
         stencils = StencilTable.of(
             n_v + n_e + n_f,
             n_v,
@@ -92,13 +93,9 @@ class CatmullClark(Scheme):
             (vertex_of_edge[edge_corner], member[in_edge_point], (face_weight / size)[edge_corner]),
             # In (Q + 2 R + (n - 3) S) / n, R contains S / 2, so the weight of S without Q is (n - 2) / n.
             (np.arange(n_v), np.arange(n_v), vertex_weight),
-            (origin[is_smooth], end[is_smooth], (masks.smooth / valence**2)[origin[is_smooth]]),
-            (
-                origin[vertex_corner],
-                member[in_vertex_point],
-                (masks.smooth / valence**2)[origin[vertex_corner]] / size[vertex_corner],
-            ),
-            (masks.rows, masks.columns, masks.weights),
+            (origin[is_smooth], end[is_smooth], neighbour_weight[origin[is_smooth]]),
+            (origin[vertex_corner], member[in_vertex_point], (neighbour_weight[origin] / size)[vertex_corner]),
+            of_neighbours,
         )
         return Refinement(refined, stencils)
 
@@ -132,10 +129,3 @@ def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
         for column, values in enumerate(row):
             basis[order, ..., column] = values
     return basis
-
-
-def _corner_members(topology: Topology) -> tuple[IntArray, IntArray]:
-    """Return all pairs (corner, vertex of the corner's face) as two flat arrays."""
-    sizes = topology.face_sizes[topology.face]
-    corner = np.repeat(np.arange(topology.half_edge_count), sizes)
-    return corner, topology.face_vertices[ragged.ranges(topology.face_offsets[topology.face], sizes)]

@@ -22,8 +22,6 @@ sharpness above one smooth; the weight of its midpoint is then above one, as in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,23 +33,23 @@ from .domain import FloatArray
 CREASE_NEIGHBOUR = 1 / 8
 
 
-@dataclass(frozen=True, eq=False)
-class CreaseMasks:
-    """Masks of all vertices and edges: the scheme's smooth masks times a factor, plus further weights."""
+def crease_masks(
+    topology: Topology,
+) -> tuple[FloatArray, FloatArray, tuple[IntArray, IntArray, FloatArray], FloatArray]:
+    """Compute the masks of all vertices and edges of a mesh: a factor of the scheme's smooth masks, and more weights.
 
-    smooth: FloatArray  # (n_v,) float64: factor of the scheme's smooth mask in the mask of each vertex
-    at_vertex: FloatArray  # (n_v,) float64: further weight of the vertex itself
-    # (m,) int64 and (m,) float64: further weights of neighbours: of vertex ``columns`` in the mask of vertex ``rows``
-    rows: IntArray
-    columns: IntArray
-    weights: FloatArray
-    # (n_h,) float64: factor of the midpoint in the edge point of each half-edge; that of the scheme's smooth mask is
-    # one minus this. Equal for both half-edges of an edge, 1 on borders.
-    midpoint: FloatArray
-
-
-def crease_masks(topology: Topology) -> CreaseMasks:
-    """Compute the masks of all vertices and edges of a mesh."""
+    Returns
+    -------
+    smooth : (n_v,) float64
+        Factor of the scheme's smooth mask in the mask of each vertex.
+    at_vertex : (n_v,) float64
+        Further weight of the vertex itself.
+    of_neighbours : (m,) int64, (m,) int64, (m,) float64
+        Further weights in the mask of a vertex of one of its neighbours: vertex, neighbour and weight.
+    midpoint : (n_h,) float64
+        Factor of the midpoint in the edge point of each half-edge; that of the scheme's smooth mask is one minus this.
+        Equal for both half-edges of an edge, 1 on borders.
+    """
     t, semi = topology, topology.semi_sharpness
     border = t.twin < 0
     # Edges at each vertex: the outgoing half-edges, and the last edge of an open fan, whose half-edge ends there.
@@ -97,7 +95,7 @@ def crease_masks(topology: Topology) -> CreaseMasks:
     at_vertex = (share * np.array([0, 0, 1 - 2 * CREASE_NEIGHBOUR, 1])[sharp_count]).sum(axis=0)
     row, edge = np.nonzero((along > 0) & ((sharp_count == 2) & (share > 0))[:, centre])
     weights = CREASE_NEIGHBOUR * along[row, edge] * share[row, centre[edge]]
-    return CreaseMasks(smooth, at_vertex, centre[edge], far[edge], weights, midpoint)
+    return smooth, at_vertex, (centre[edge], far[edge], weights), midpoint
 
 
 def _mean_of_smoothed(vertex: IntArray, before: FloatArray, after: FloatArray) -> FloatArray:

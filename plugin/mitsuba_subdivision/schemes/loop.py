@@ -105,11 +105,11 @@ class Loop(Scheme):
         )
 
         origin, end = t.face_vertices, t.face_vertices[t.next]
-        masks = crease_masks(t)
-        is_border, is_smooth_vertex = t.twin < 0, masks.smooth[origin] > 0
+        smooth, at_vertex, of_neighbours, midpoint = crease_masks(t)
+        is_border, is_smooth_vertex = t.twin < 0, smooth[origin] > 0
         valence = np.maximum(t.vertex_face_count, 1).astype(float)
-        beta = masks.smooth * self.vertex_weight(valence)
-        end_weight, opposite_weight = (3 + masks.midpoint) / 8, (1 - masks.midpoint) / 8
+        beta = smooth * self.vertex_weight(valence)
+        end_weight, opposite_weight = (3 + midpoint) / 8, (1 - midpoint) / 8
         is_smooth_edge = opposite_weight != 0
         stencils = StencilTable.of(
             n_v + n_e,
@@ -119,9 +119,9 @@ class Loop(Scheme):
             (edge_point, origin, end_weight),
             (edge_point[is_border], end[is_border], end_weight[is_border]),
             (edge_point[is_smooth_edge], t.face_vertices[t.prev[is_smooth_edge]], opposite_weight[is_smooth_edge]),
-            (np.arange(n_v), np.arange(n_v), masks.smooth - valence * beta + masks.at_vertex),
+            (np.arange(n_v), np.arange(n_v), smooth - valence * beta + at_vertex),
             (origin[is_smooth_vertex], end[is_smooth_vertex], beta[origin[is_smooth_vertex]]),
-            (masks.rows, masks.columns, masks.weights),
+            of_neighbours,
         )
         return Refinement(refined, stencils)
 
