@@ -6,11 +6,11 @@ import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import random_locations
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.kernels.array_types import float_type_of
-from mitsuba_subdivision.kernels.channel_kernel import ChannelKernel, LinearChannelKernel, channel_kernel
+from mitsuba_subdivision.kernels.channel_kernel import LinearChannelKernel, channel_kernel
 from patches.closed_cages import mixed_torus, triangulated
 from reference.refined_cages import sheet, spokes, tagged
 
@@ -65,9 +65,12 @@ def evaluated(surface, name, variant, element, uv, corner):
     return [np.array(each).astype(np.float64).reshape(-1, len(element)).T for each in found]
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
 def test_values_are_the_channels(surface, variant, np_rng):
     locations = random_locations(surface, np_rng, 600)
+    # On edges, where elements on both sides of a seam have values of their own; and at corners.
+    locations[1][:100, 1] = locations[1][:20] = 0
     for name in surface.attribute_names:
         found, *_ = evaluated(surface, name, variant, *locations)
         expected = surface.evaluate_attribute(name, *locations)
@@ -99,37 +102,3 @@ def test_derivatives_are_differences(surface, np_rng):
         for derivative, step in zip(found, STEP * np.eye(2), strict=True):
             ahead, behind = (surface.evaluate_attribute(name, element, uv + each, corner) for each in (step, -step))
             np.testing.assert_allclose(derivative, (ahead - behind) / (2 * STEP), rtol=0, atol=DIFFERENCES)
-
-
-@pytest.mark.core
-def test_values_differ_across_seams_only(np_rng):
-    """The same place, seen from two elements."""
-    cage = mixed_torus()
-    t = cage.topology
-    indices = t.face_vertices + t.vertex_count * (t.face % 2)
-    values = np_rng.random((2 * t.vertex_count, 2))
-    surface = LimitSurface(tagged(cage, texcoords=Attribute(values, "face_varying", indices)))
-    whole = surface.patches.is_whole[t.face]
-    edge = np.flatnonzero(whole & whole[t.twin])
-    along = np_rng.random(len(edge))
-
-    def seen_from(h, u):
-        corner = h - t.face_offsets[t.face[h]]
-        return evaluated(surface, "texcoords", DOUBLE, t.face[h], np.stack([u, 0 * u], axis=1), corner)[0]
-
-    here, there = seen_from(edge, along), seen_from(t.twin[edge], 1 - along)
-    differs = np.abs(here - there).max(axis=1)
-    is_seam = surface.channel("texcoords").seam[edge]
-    assert is_seam.any()
-    assert not is_seam.all()
-    assert (differs[is_seam] > 1e-3).mean() > 0.9
-    assert differs[~is_seam].max() <= ROUNDING[DOUBLE]
-
-
-@pytest.mark.core
-def test_kinds_of_channels_have_kernels_of_their_own():
-    attributes = {"a": Attribute(np.eye(3), "vertex"), "b": Attribute(np.eye(3), "varying")}
-    surface = LimitSurface(ControlCage(np.eye(3), [[0, 1, 2]], attributes=attributes))
-    walk = surface.on_device(DOUBLE).walk
-    kinds = [type(channel_kernel(surface.channel(name), walk, float_type_of(DOUBLE))) for name in ("a", "b")]
-    assert kinds == [ChannelKernel, LinearChannelKernel]
