@@ -146,7 +146,7 @@ def test_runs_do_not_show(weights, coefficients, monkeypatch):
     table = surface.sampling(3)
     expected = table.apply(surface.cage.positions)
     for name, value in (("WEIGHTS_AT_ONCE", weights), ("COEFFICIENTS_AT_ONCE", coefficients)):
-        monkeypatch.setattr(f"mitsuba_subdivision.tessellation.vertex_polynomials.{name}", value)
+        monkeypatch.setattr(f"mitsuba_subdivision.tessellation.vertex_table.{name}", value)
     for found, one in zip(table.apply(surface.cage.positions), expected, strict=True):
         np.testing.assert_allclose(found, one, rtol=0, atol=ROUNDING)
 

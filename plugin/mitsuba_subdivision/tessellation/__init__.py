@@ -42,8 +42,7 @@ if TYPE_CHECKING:
     from .criterion import Criterion, DisplacementBound, Measure, Sensor
     from .uniform import uniform_table
     from .uniform_grid import UniformGrid
-    from .vertex_polynomials import VertexPolynomials
-    from .vertex_table import Tessellation, VertexMatrices, VertexTable
+    from .vertex_table import Tessellation, VertexMatrices, VertexPolynomials, VertexTable
 
 # Segments along an edge of the control cage. Triangles are numbered by 32 bits, and memory ends long before that.
 HIGHEST_RATE = 1024
@@ -68,12 +67,5 @@ __all__ = [
 __getattr__ = deferred(
     __name__,
     {
-        "adaptive": ("adaptive_table",),
-        "attribute_table": ("AttributeLayout", "AttributeTable"),
-        "criterion": ("Criterion", "DisplacementBound", "Measure", "Sensor"),
-        "uniform": ("uniform_table",),
-        "uniform_grid": ("UniformGrid",),
-        "vertex_polynomials": ("VertexPolynomials",),
-        "vertex_table": ("Tessellation", "VertexMatrices", "VertexTable"),
     },
 )

@@ -23,8 +23,7 @@ from .criterion import Criterion
 from .memory import require_memory_for_triangles
 from .tile_rates import Part, TileRates, feature_edges, sides_on
 from .uniform import checked_rate
-from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
-from .vertex_table import VertexTable
+from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
 
 # Tiles of a kind that are processed together, whose bounds stay in a core's cache; and most tiles that wait for more of
 # their kind. Both bound temporary memory; smaller numbers would take more time.

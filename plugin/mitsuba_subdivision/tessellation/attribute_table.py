@@ -65,15 +65,12 @@ class AttributeTable:
     ) -> AttributeTable:
         """Evaluate attributes in float64."""
         layouts = tuple(channel.layout for channel in channels.values())
-
-        def make() -> AttributeLayout:
-            return _layout(table, patches, control_of_vertex, layouts)
-
-        layout = _LAYOUTS.get((table, *layouts), make)
-        values = {
-            name: _VALUES.get((layout, index, Content(channel.values)), partial(_read_only, evaluate, channel))
-            for index, (evaluate, (name, channel)) in enumerate(zip(layout.evaluate, channels.items(), strict=True))
-        }
+        layout = _LAYOUTS.get((table, *layouts), lambda: _layout(table, patches, control_of_vertex, layouts))
+        values = {}
+        for index, (name, channel) in enumerate(channels.items()):
+            key, evaluate = (layout, index, Content(channel.values)), partial(layout.evaluate[index], channel)
+            values[name] = _VALUES.get(key, evaluate)
+            values[name].flags.writeable = False
         return cls(layout, values)
 
     @property
@@ -94,12 +91,6 @@ class AttributeTable:
     def gathered(self, values: NDArray) -> NDArray:
         """Values at the vertices of this table, from values at the vertices of the vertex table."""
         return values if self.surface_vertex is None else values[self.surface_vertex]
-
-
-def _read_only(evaluate: Callable[[Channel], FloatArray], channel: Channel) -> FloatArray:
-    values = evaluate(channel)
-    values.flags.writeable = False
-    return values
 
 
 _VALUES: Shared[FloatArray] = Shared()
@@ -124,12 +115,18 @@ def _layout(
         surface_vertex = grid.vertices_of(table.grid)
     locate = cache(grid.locations)
 
+    def on_surface(channel: Channel) -> FloatArray:
+        # Without seams, and subdivided on the surface's mesh.
+        control_values = np.zeros((table.control_count, channel.values.shape[1]))
+        control_values[control_of_vertex] = channel.values[channel.value_index]
+        vertex_values = table.interpolated(control_values)
+        vertex_values[table.copies[0]] = vertex_values[table.copies[1]]
+        return vertex_values if surface_vertex is None else vertex_values[surface_vertex]
+
     def evaluate(layout: ChannelLayout) -> Callable[[Channel], FloatArray]:
-        if layout.kind is LinearChannel:
-            return lambda channel: channel.evaluate(*locate())
-        if layout.patches is patches:
-            return lambda channel: _chosen(_on_surface(table, control_of_vertex, channel), surface_vertex)
-        if not isinstance(table.grid, UniformGrid):
+        if layout.patches is patches and layout.kind is not LinearChannel:
+            return on_surface
+        if layout.kind is LinearChannel or not isinstance(table.grid, UniformGrid):
             return lambda channel: channel.evaluate(*locate())
         channel_table = uniform_table(layout.patches, table.grid.rate)
         vertices = grid.vertices_of(channel_table.grid)
@@ -137,16 +134,3 @@ def _layout(
 
     triangles = grid.triangles if seams else lambda: table.triangles
     return AttributeLayout(surface_vertex, triangles, tuple(map(evaluate, layouts)), locate if seams else None)
-
-
-def _chosen(values: FloatArray, rows: IntArray | None) -> FloatArray:
-    return values if rows is None else values[rows]
-
-
-def _on_surface(table: VertexTable, control_of_vertex: IntArray, channel: Channel) -> FloatArray:
-    """Values at the table's vertices of a channel without seams that is subdivided on the surface's mesh."""
-    control_values = np.zeros((table.control_count, channel.values.shape[1]))
-    control_values[control_of_vertex] = channel.values[channel.value_index]
-    vertex_values = table.interpolated(control_values)
-    vertex_values[table.copies[0]] = vertex_values[table.copies[1]]
-    return vertex_values

@@ -75,10 +75,8 @@ class Sensor:
             view = (lower + upper) / 2 - self.eye[:, None]
             distance, radius = np.linalg.norm(view, axis=-2), np.linalg.norm(upper - lower, axis=-2) / 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                view, spread = (
-                    view / distance[..., None, :],
-                    np.where(radius < distance, np.arcsin(radius / distance), np.pi),
-                )
+                view = view / distance[..., None, :]
+                spread = np.where(radius < distance, np.arcsin(radius / distance), np.pi)
         tilt = np.arcsin(np.clip(np.abs(dot(cone.axis, view)), 0, 1))
         return ~(tilt > np.arcsin(np.clip(cone.sine, 0, 1)) + spread + BESIDE_OUTLINE) | (cone.sine >= 1)
 
@@ -132,18 +130,9 @@ class Criterion:
     def form(self, points: FloatArray, derivatives: list[FloatArray], corner_count: int) -> FloatArray:
         """Bound the limited quantity, relative to its limit, by a function of the numbers of segments along u and v.
 
-        Parameters
-        ----------
-        points, derivatives : (b, .., 3, t) float, and five of that
-            Bernstein coefficients of parts of patches, and of their derivatives by u, v, uu, uv and vv.
-        corner_count : int
-            Of the domain.
-
-        Returns
-        -------
-        (3, .., t) float
-            A, B and C. Over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2`` must not exceed 1. Over triangles with
-            n segments per side, ``A / n^2`` must not, and B and C are zero.
+        ``points`` are Bernstein coefficients ``(b, .., 3, t)`` of parts of patches, and ``derivatives`` those by u, v,
+        uu, uv and vv. Returns A, B and C, ``(3, .., t)``. Over squares, ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2``
+        must not exceed 1. Over triangles with n segments per side, ``A / n^2`` must not, and B and C are zero.
         """
         (u, shortest_u), (v, shortest_v) = map(tangent_cone, derivatives[:2])
         normals = normal_cone(u, v)
@@ -205,11 +194,11 @@ def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, c
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         slip = 1 + np.where(shortest > 0, np.max(longest, axis=0) / shortest**2 / 8, np.inf)
         # Largest extent along any of the normals.
+        lengths = [np.sqrt(most) for most in longest]
         extents = [
-            np.abs(dot(d, normals.axis)).max(axis=0) + normals.sine * np.sqrt(most)
-            for d, most in zip(second, longest, strict=True)
+            np.abs(dot(d, normals.axis)).max(axis=0) + normals.sine * a for d, a in zip(second, lengths, strict=True)
         ]
-        sizes = [np.fmin(slip * extent, np.sqrt(most)) for extent, most in zip(extents, longest, strict=True)]
+        sizes = [np.fmin(slip * extent, length) for extent, length in zip(extents, lengths, strict=True)]
     if corner_count == 3:
         return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])))
     return SQUARE_ERROR * np.stack(sizes)

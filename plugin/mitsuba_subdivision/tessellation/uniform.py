@@ -16,8 +16,7 @@ from ..schemes.domain import FloatArray
 from .memory import require_memory
 from .quad_grid import QuadGrid
 from .uniform_grid import GridPart, TriangleGrid, UniformGrid
-from .vertex_polynomials import VertexPolynomials, VertexRuns, vertex_polynomials
-from .vertex_table import VertexTable
+from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
 
 # Most vertices of a tessellation: buffer sizes have 32 bits, and there are two triangles, of three indices, per vertex.
 MOST_VERTICES = ((1 << 32) - 1) // 6
