@@ -67,5 +67,11 @@ __all__ = [
 __getattr__ = deferred(
     __name__,
     {
+        "adaptive": ("adaptive_table",),
+        "attribute_table": ("AttributeLayout", "AttributeTable"),
+        "criterion": ("Criterion", "DisplacementBound", "Measure", "Sensor"),
+        "uniform": ("uniform_table",),
+        "uniform_grid": ("UniformGrid",),
+        "vertex_table": ("Tessellation", "VertexMatrices", "VertexPolynomials", "VertexTable"),
     },
 )
