@@ -21,7 +21,7 @@ import drjit as dr
 
 from .algebra import added, cross, dot, like, unit
 from .array_types import Float, Index, Mask, Value
-from .piece_kernel import DIFFERENCE, PatchValues, Piece
+from .piece_kernel import PatchValues, Piece, differences
 
 if TYPE_CHECKING:
     from .channel_kernel import ChannelKernel
@@ -111,14 +111,5 @@ class DisplacedPiece(Piece):
         values = displaced(surface, (h, h_u, h_v))
         if derivatives == 1:
             return values
-        step = DIFFERENCE * dr.rcp(self.magnification)
-        with dr.suspend_grad():
-            by_u, by_v = (
-                [self.values(du + x * sign, dv + y * sign) for sign in (1, -1)] for x, y in ((step, 0), (0, step))
-            )
-        inverse = 0.5 * dr.rcp(step)
-        uu, uv, vv = (
-            (getattr(after, name) - getattr(before, name)) * inverse
-            for (after, before), name in ((by_u, "du"), (by_v, "du"), (by_v, "dv"))
-        )
+        (uu, _), (uv, vv) = differences(lambda u, v: self.values(du + u, dv + v).first_order[1:3], self.magnification)
         return replace(values, second=(uu, uv, vv))

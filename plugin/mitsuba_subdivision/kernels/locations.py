@@ -61,10 +61,6 @@ class ElementWalk:
         corner = self.row(location.half_edge, active)[CODE] & CORNERS
         return Location(location.half_edge - corner, *turned(self.domain, location.u, location.v, corner)), corner
 
-    def is_whole(self, half_edge: Index, active: Mask = True) -> Mask:
-        """Whether the element of a half-edge fits the domain."""
-        return (self.row(half_edge, active)[CODE] & WHOLE) != 0
-
     def carried(self, location: Location, active: Mask = True, row: Index4 | None = None) -> Location:
         """Map locations whose parameters are outside of their element to the neighbouring element.
 
@@ -189,7 +185,7 @@ class TriangleLocations:
         element = dr.gather(types.index, self._element, triangle, active)
         number = triangle - dr.gather(types.index, self._first, element, active)
         first = walk.at(element, 0, 0, active=active).half_edge
-        is_whole, per_corner = walk.is_whole(first, active), max(self._corner_count, 1)
+        is_whole, per_corner = (walk.row(first, active)[CODE] & WHOLE) != 0, max(self._corner_count, 1)
         corner = dr.select(is_whole, 0, number // per_corner)
         return first + corner, dr.select(is_whole, number, self._whole_count + number % per_corner)
 

@@ -7,6 +7,7 @@ to an extraordinary point, at levels that have no pieces, equations (10) and (12
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -432,6 +433,17 @@ class PieceKernel:
             dr.select(is_child, inner_v, v),
             dr.select(is_child, scale * inner_scale, scale),
         )
+
+
+def differences(vectors: Callable[[Float, Float], Sequence[Vector3]], magnification: Float) -> list[list[Vector3]]:
+    """Detached derivatives of vectors by u, then by v, from the vectors at parameters offset by two numbers."""
+    step = DIFFERENCE * dr.rcp(magnification)
+    with dr.suspend_grad():
+        inverse = 0.5 * dr.rcp(step)
+        return [
+            [(ahead - behind) * inverse for ahead, behind in zip(vectors(u, v), vectors(-u, -v), strict=True)]
+            for u, v in ((step, 0), (0, step))
+        ]
 
 
 _KERNELS: Shared[PieceKernel] = Shared()

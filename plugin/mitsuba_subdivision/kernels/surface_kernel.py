@@ -16,7 +16,7 @@ from .line_intersection import MISSED, ON_LINE, LineHits, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
 from .locations import Location
 from .nearest_points import NearestPoints, nearest_locations
-from .piece_kernel import DIFFERENCE, PatchValues, Piece, PieceKernel
+from .piece_kernel import PatchValues, Piece, PieceKernel, differences
 from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
@@ -329,7 +329,7 @@ class SurfaceKernel:
             points = replace(points, location=location, p=shifted.value, n=n, dp_du=dp_du, dp_dv=dp_dv)
             if derivatives == 1:
                 return points
-            by_u, by_v = _second_normal_derivatives(piece)
+            by_u, by_v = differences(lambda du, dv: _normal_derivatives(piece.values(du, dv, 2)), piece.magnification)
             dn_du, dn_dv = (x + (x_u * du + x_v * dv) for x, x_u, x_v in zip((dn_du, dn_dv), by_u, by_v, strict=True))
             return replace(points, dn_du=dn_du, dn_dv=dn_dv)
 
@@ -353,28 +353,12 @@ class SurfaceKernel:
             return line_hits(self.walk, piece, p, d, location, active, **limits)
 
 
-def _normal_derivatives(values: PatchValues, n: Vector3) -> tuple[Vector3, Vector3]:
+def _normal_derivatives(values: PatchValues, n: Vector3 | None = None) -> tuple[Vector3, Vector3]:
+    """Derivatives of the unit normal ``n``, if it is known."""
+    n = unit(values.normal) if n is None else n
     uu, uv, vv = values.second
     # Zero where the surface collapses: infinite derivatives times zero would be NaN.
     inverse = over(1, dr.norm(cross(values.du, values.dv)), 0)
     changes = (cross(uu, values.dv) + cross(values.du, uv), cross(uv, values.dv) + cross(values.du, vv))
     dn_du, dn_dv = ((change - n * dr.dot(n, change)) * inverse for change in changes)
     return dn_du, dn_dv
-
-
-def _second_normal_derivatives(piece: Piece) -> tuple[list, list]:
-    """Second derivatives of the unit normal as finite differences, detached: those by u, then those by v."""
-    step = DIFFERENCE * dr.rcp(piece.magnification)
-
-    def normal_derivatives(du: Float, dv: Float) -> tuple[Vector3, Vector3]:
-        values = piece.values(du, dv, 2)
-        return _normal_derivatives(values, unit(values.normal))
-
-    with dr.suspend_grad():
-        inverse = 0.5 * dr.rcp(step)
-        pairs = (
-            (normal_derivatives(step, 0), normal_derivatives(-step, 0)),
-            (normal_derivatives(0, step), normal_derivatives(0, -step)),
-        )
-        by_u, by_v = ([(b - a) * inverse for b, a in zip(*pair, strict=True)] for pair in pairs)
-    return by_u, by_v
