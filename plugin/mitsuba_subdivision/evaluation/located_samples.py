@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -42,18 +41,13 @@ FEW_SAMPLES = 4
 PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
 
 
-@dataclass(frozen=True, eq=False)
-class _Depth:
-    """Distinct elements at one depth of the patch trees, and their samples, sorted by element."""
+class _Node(NamedTuple):
+    """An element at one depth of the patch trees, with samples."""
 
-    elements: list[PatchTree]
-    first: IntArray  # (n + 1,) the first sample of each element; then the number of samples
-    # One group for each child that contains samples: index of the element, number of the child, the samples; index of
-    # the child among the elements of the next depth, and the same samples as numbered there.
-    groups: list[tuple[int, int, IntArray, int, IntArray]]
-
-    def samples(self, element: int) -> slice:
-        return slice(int(self.first[element]), int(self.first[element + 1]))
+    tree: PatchTree
+    samples: IntArray  # In increasing order
+    # For each child that contains samples: its number, its index among the nodes of the next depth, and these samples
+    children: list[tuple[int, int, IntArray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +56,8 @@ class Leaves:
 
     patch: IrregularPatch | None
     uv: FloatArray  # (n, 2) parameters in the leaf
-    # For each leaf: its depth, its index among the elements of this depth, its piece, its samples as numbered at this
-    # depth, and their slice of `uv`.
-    parts: list[tuple[int, int, Piece, IntArray, slice]]
+    # For each leaf: its depth, its index among the nodes of this depth, its piece, and its slice of `uv`
+    parts: list[tuple[int, int, Piece, slice]]
     begin: int  # Number of the first sample, counted over all `Leaves`
 
     def rows(self, scheme: Scheme, evaluator: Evaluator, dtype: DTypeLike, derivatives: int) -> SampleRows:
@@ -104,88 +97,57 @@ class LocatedSamples:
         corner: IntArray,  # (s,) int64: corner of the element at which (u, v) is (0, 0)
     ) -> None:
         self.scheme, self._given = scheme, (elements, element, uv, corner)
-        self.leaves: list[Leaves] = []
-        self._depths: list[_Depth] = []
-        parts = self._descend(list(elements), element, uv, corner)
-        self.leaf_sample, self.path, self.jacobian = self._ascend(parts, len(uv))
-
-    def _descend(
-        self, elements: list[PatchTree], element: IntArray, uv: FloatArray, turn: IntArray
-    ) -> list[tuple[int, IntArray, IntArray]]:
-        """Fill `_depths` and `leaves`; return depth, samples and turns of all `Leaves.parts`, in order."""
-        scheme, domain = self.scheme, self.scheme.domain
-        in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray, FloatArray, IntArray]]] = {}
+        self.path, self.leaf_sample = (np.zeros(len(uv), dtype=np.int64) for _ in range(2))
+        self._depths: list[list[_Node]] = []
+        domain, uv, speed, leaf_turn = scheme.domain, uv.copy(), np.ones(len(uv)), corner.copy()
+        in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray]]] = {}
+        samples, trees, node = np.arange(len(uv)), list(elements), element.copy()
         for depth in range(MOST_DEPTH + 1):
-            first = ragged.offsets(np.bincount(element, minlength=len(elements)))
-            kinds = np.array([tree.kind for tree in elements])
-            leaf_turn = (turn + np.array([tree.turn for tree in elements])[element]) % domain.corner_count
-            leaf_uv = _turned(scheme, uv, leaf_turn)
-            for number, (tree, sample_range) in enumerate(zip(elements, pairwise(first.tolist()), strict=True)):
-                if tree.piece is not None and sample_range[0] < sample_range[1]:
-                    samples = slice(*sample_range)
-                    row = depth, number, tree.piece, np.arange(*sample_range), leaf_uv[samples], leaf_turn[samples]
-                    in_leaves.setdefault(tree.piece.patch, []).append(row)
-            inner = np.flatnonzero(kinds[element] <= PartKind.ONLY_CHILD)
-            if not len(inner):
-                self._depths.append(_Depth(elements, first, []))
+            nodes = [
+                _Node(tree, in_tree, [])
+                for tree, in_tree in zip(trees, _split(samples, node[samples], len(trees)), strict=True)
+            ]
+            self._depths.append(nodes)
+            is_inner = np.array([tree.piece is None for tree in trees])[node[samples]]
+            for number, (tree, in_tree, _) in enumerate(nodes):
+                if tree.piece is not None and len(in_tree):
+                    in_leaves.setdefault(tree.piece.patch, []).append((depth, number, tree.piece, in_tree))
+                    leaf_turn[in_tree] = (corner[in_tree] + tree.turn) % domain.corner_count
+                    self.path[in_tree] += 1 << 2 * depth
+            samples = samples[is_inner]
+            if not len(samples):
                 break
-            child, child_uv = domain.first_child(uv[inner].T)
-            is_only = kinds[element[inner]] == PartKind.ONLY_CHILD
+            child, child_uv = domain.first_child(uv[samples].T)
+            is_only = np.array([tree.kind == PartKind.ONLY_CHILD for tree in trees])[node[samples]]
             # Children at corners are numbered from the element's first corner; the middle of a triangle comes last.
             corners = domain.corner_count
-            child = np.where(child < corners, (child + turn[inner]) % corners, child)
-            child, child_uv = np.where(is_only, 0, child), np.where(is_only, uv[inner].T, child_uv).T
-            # Pairs of an element and the number of one of its children, as `4 * element + child`.
-            pairs, pair = np.unique(4 * element[inner] + child, return_inverse=True)
+            child = np.where(child < corners, (child + corner[samples]) % corners, child)
+            child, uv[samples] = np.where(is_only, 0, child), np.where(is_only, uv[samples].T, child_uv).T
+            self.path[samples] += child << 2 * depth
+            # Pairs of a node and the number of one of its children, as `4 * node + child`.
+            pairs, pair = np.unique(4 * node[samples] + child, return_inverse=True)
             child_index: dict[PatchTree, int] = {}
-            children = [
-                child_index.setdefault(elements[key // 4].child_element(key % 4), len(child_index))
-                for key in pairs.tolist()
-            ]
-            next_element, next_turn, next_uv, next_sample = _sorted(np.array(children)[pair], turn[inner], child_uv)
-            pair_samples = np.split(np.argsort(pair, kind="stable"), np.cumsum(np.bincount(pair))[:-1])
-            groups: list[tuple[int, int, IntArray, int, IntArray]] = [
-                (key // 4, key % 4, inner[samples], index, next_sample[samples])
-                for key, samples, index in zip(pairs.tolist(), pair_samples, children, strict=True)
-            ]
-            self._depths.append(_Depth(elements, first, groups))
-            elements, element, uv, turn = list(child_index), next_element, next_uv, next_turn
+            for key, in_child in zip(pairs.tolist(), _split(samples, pair, len(pairs)), strict=True):
+                parent, number = nodes[key // 4], key % 4
+                tree = parent.tree.child_element(number)
+                index = child_index.setdefault(tree, len(child_index))
+                parent.children.append((number, index, in_child))
+                speed[in_child] *= parent.tree.domains[number].matrix[0, 0]
+                node[in_child] = index
+            trees = list(child_index)
         else:
-            raise not_isolated(scheme, elements[0].signature, MOST_DEPTH + 1)
-        return self._gather_leaves(in_leaves)
-
-    def _gather_leaves(self, in_leaves: dict) -> list[tuple[int, IntArray, IntArray]]:
-        all_parts, begin = [], 0
+            raise not_isolated(scheme, trees[0].signature, MOST_DEPTH + 1)
+        uv = _turned(scheme, uv, leaf_turn)
+        self.leaves, begin = list[Leaves](), 0
         for patch, rows in in_leaves.items():
-            parts, end = [], 0
-            for depth, number, piece, samples, _, turn in rows:
-                parts.append((depth, number, piece, samples, slice(end, end + len(samples))))
-                all_parts.append((depth, samples, turn))
-                end += len(samples)
-            self.leaves.append(Leaves(patch, np.concatenate([row[4] for row in rows]), parts, begin))
-            begin += end
-        return all_parts
-
-    def _ascend(self, parts: list[tuple[int, IntArray, IntArray]], count: int) -> tuple[IntArray, IntArray, FloatArray]:
-        """Return ``leaf_sample``, ``path`` and ``jacobian``; ``parts`` are the result of `_descend`."""
-        domain = self.scheme.domain
-        numbers = [np.empty(int(depth.first[-1]), dtype=np.int64) for depth in self._depths]
-        paths = [np.ones(len(depth_numbers), dtype=np.int64) for depth_numbers in numbers]
-        speeds = [np.ones(len(depth_numbers)) for depth_numbers in numbers]
-        begin = 0
-        for depth, samples, _ in parts:
-            numbers[depth][samples] = np.arange(begin, begin + len(samples))
-            begin += len(samples)
-        for depth in range(len(self._depths) - 2, -1, -1):
-            for element, number, samples, _, child_samples in self._depths[depth].groups:
-                speed = self._depths[depth].elements[element].domains[number].matrix[0, 0]
-                numbers[depth][samples] = numbers[depth + 1][child_samples]
-                paths[depth][samples] = 4 * paths[depth + 1][child_samples] + number
-                speeds[depth][samples] = speed * speeds[depth + 1][child_samples]
-        turns = np.concatenate([turn for *_, turn in parts]) if parts else np.empty(0, dtype=np.int64)
-        matrices = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)])
-        rotations = matrices[turns[numbers[0]]] if count else np.empty((0, 2, 2))
-        return numbers[0], paths[0], np.moveaxis(rotations * speeds[0][:, None, None], 0, -1)
+            in_patch = np.concatenate([in_tree for *_, in_tree in rows])
+            self.leaf_sample[in_patch] = np.arange(begin, begin + len(in_patch))
+            ends = np.cumsum([len(in_tree) for *_, in_tree in rows]).tolist()
+            parts = [(*row[:3], slice(end - len(row[3]), end)) for row, end in zip(rows, ends, strict=True)]
+            self.leaves.append(Leaves(patch, uv[in_patch], parts, begin))
+            begin += len(in_patch)
+        rotations = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)])
+        self.jacobian: FloatArray = np.moveaxis(rotations[leaf_turn] * speed[:, None, None], 0, -1)
 
     def chosen(self, which: IntArray) -> LocatedSamples:
         """Return a subset of the samples; ``which`` is in increasing order."""
@@ -208,32 +170,32 @@ class LocatedSamples:
         power : bool
             Whether rows of irregular patches are over control points, too.
         """
-        by_depth: list[list[FloatArray | None]] = [[None] * len(depth.elements) for depth in self._depths]
-
-        def element_weights(depth: int, number: int, size: int) -> FloatArray:
-            weights = by_depth[depth][number]
-            if weights is None:
-                current = self._depths[depth]
-                count = int(current.first[number + 1] - current.first[number])
-                weights = by_depth[depth][number] = np.empty((count, size, current.elements[number].control_count))
-            return weights
-
-        size = 0
+        size = len(of_leaves[0]) if of_leaves else 0
+        in_leaf: list[dict[int, FloatArray]] = [{} for _ in self._depths]
         for leaves, leaf_rows in zip(self.leaves, of_leaves, strict=True):
-            rows, size = leaf_rows.astype(np.float64, copy=False), len(leaf_rows)
-            for depth, number, piece, _, uv_slice in leaves.parts:
+            rows = leaf_rows.astype(np.float64, copy=False)
+            for depth, number, piece, uv_slice in leaves.parts:
                 matrix = piece.stencils if power or piece.patch is None else piece.coordinates
-                # An element that is a leaf has no samples in children, so this fills its array.
-                times(rows[:, uv_slice], matrix, element_weights(depth, number, size).swapaxes(0, 1))
-        for depth in range(len(self._depths) - 2, -1, -1):
-            current, child_first = self._depths[depth], self._depths[depth + 1].first
-            for element, number, samples, child, child_samples in current.groups:
-                child_rows = element_weights(depth + 1, child, size).take(child_samples - child_first[child], axis=0)
-                flat = child_rows.reshape(1, -1, child_rows.shape[2])
-                parent_rows = times(flat, current.elements[element].child(number)[1]).reshape(*child_rows.shape[:2], -1)
-                element_weights(depth, element, size)[samples - current.first[element]] = parent_rows
-            by_depth[depth + 1] = []
-        return [element_weights(0, number, size) for number in range(len(self._depths[0].elements))]
+                weights = np.empty((uv_slice.stop - uv_slice.start, size, matrix.shape[1]))
+                in_leaf[depth][number] = weights
+                times(rows[:, uv_slice], matrix, weights.swapaxes(0, 1))
+        below: list[FloatArray] = []
+        position = np.empty(len(self.leaf_sample), dtype=np.int64)
+        for depth in range(len(self._depths) - 1, -1, -1):
+            current = []
+            for number, (tree, samples, children) in enumerate(self._depths[depth]):
+                if number in in_leaf[depth]:
+                    current.append(in_leaf[depth][number])
+                    continue
+                node_weights: FloatArray = np.empty((len(samples), size, tree.control_count))
+                for child_number, child, in_child in children:
+                    position[self._depths[depth + 1][child].samples] = np.arange(len(below[child]))
+                    child_rows = below[child].take(position[in_child], axis=0)
+                    product = times(child_rows.reshape(1, -1, child_rows.shape[2]), tree.child(child_number)[1])
+                    node_weights[np.searchsorted(samples, in_child)] = product.reshape(*child_rows.shape[:2], -1)
+                current.append(node_weights)
+            below = current
+        return below
 
     def per_sample(self, of_leaves: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Reorder values ``(.., n)`` of the samples of each of the `leaves` to ``(.., s)``, the order of samples."""
@@ -250,7 +212,14 @@ class LocatedSamples:
 
     def slices(self) -> Iterator[slice]:
         """Return the samples of each element."""
-        return (self._depths[0].samples(number) for number in range(len(self._depths[0].elements)))
+        ends = np.cumsum([len(node.samples) for node in self._depths[0]]).tolist()
+        return (slice(begin, end) for begin, end in pairwise([0, *ends]))
+
+
+def _split(samples: IntArray, number: IntArray, count: int) -> list[IntArray]:
+    """Split samples by their numbers, from 0 to ``count - 1``."""
+    order = np.argsort(number.astype(np.min_scalar_type(count)), kind="stable")
+    return np.split(samples[order], np.cumsum(np.bincount(number, minlength=count))[:-1])
 
 
 def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:
@@ -260,7 +229,7 @@ def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:
     if leaves.patch is not None:
         rows = CANCELLED * times(rows, np.abs(leaves.patch.basis.inverse).astype(rows.dtype))
     magnitude = np.empty(rows.shape[:2], rows.dtype)
-    for _, _, piece, _, uv_slice in leaves.parts:
+    for _, _, piece, uv_slice in leaves.parts:
         magnitude[:, uv_slice] = rows[:, uv_slice] @ piece.absolute_sums.astype(rows.dtype)
         if leaves.patch is not None:
             magnitude[:, uv_slice] += np.abs(times(tangents[:, uv_slice], piece.coordinates)).sum(axis=2)
@@ -279,14 +248,6 @@ def _turned(scheme: Scheme, uv: FloatArray, turn: IntArray) -> FloatArray:
         is_turned = turn == corner
         turned[is_turned] = scheme.domain.rotation(int(corner))(uv[is_turned])
     return turned
-
-
-def _sorted(element: IntArray, turn: IntArray, uv: FloatArray) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-    """Return samples sorted by element, and the new index of each sample."""
-    order = np.argsort(element.astype(np.min_scalar_type(element.max(initial=0))), kind="stable")
-    number = np.empty_like(order)
-    number[order] = np.arange(len(order))
-    return element[order], turn[order], uv[order], number
 
 
 class Polynomials(NamedTuple):

@@ -17,7 +17,7 @@ from .linear_maps import CoefficientMap, ControlValues, SparseMatrix
 from .piece_kernel import PatchValues, PieceKernel
 
 if TYPE_CHECKING:
-    from ..patches import Channel, SubdividedChannel
+    from ..patches import Channel
     from .locations import ElementWalk, Location
 
 # Exponents of the monomials 1, u, v and, on the square, u v.
@@ -34,7 +34,7 @@ def channel_kernel(channel: Channel, walk: ElementWalk, float_type: type) -> Cha
 class ChannelKernel:
     """Evaluates values that are subdivided like points."""
 
-    def __init__(self, channel: SubdividedChannel, float_type: type) -> None:
+    def __init__(self, channel: Channel, float_type: type) -> None:
         table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
         self._kernel = PieceKernel.shared(table, float_type)
         values = ControlValues(self._kernel.types, channel.values.shape[1], CoefficientMap.shared(table, float_type))

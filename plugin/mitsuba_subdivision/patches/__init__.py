@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .patch_table import PatchClass, PatchTable
     from .piece_table import PieceTable
     from .polynomial_pieces import ElementBounds, SurfacePieces
-    from .stencil_matrices import StencilMatrices, StencilRows, sample_matrices
+    from .stencil_matrices import StencilMatrices, sample_matrices
 
 __all__ = [
     "AreaSamples",
@@ -30,7 +30,6 @@ __all__ = [
     "PieceTable",
     "SamplingCells",
     "StencilMatrices",
-    "StencilRows",
     "SubdividedChannel",
     "SurfaceAreas",
     "SurfacePieces",
@@ -59,6 +58,6 @@ __getattr__ = deferred(
         "patch_table": ("PatchClass", "PatchTable"),
         "piece_table": ("PieceTable",),
         "polynomial_pieces": ("ElementBounds", "SurfacePieces"),
-        "stencil_matrices": ("StencilMatrices", "StencilRows", "sample_matrices"),
+        "stencil_matrices": ("StencilMatrices", "sample_matrices"),
     },
 )

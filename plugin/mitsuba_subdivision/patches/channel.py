@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -69,11 +70,23 @@ _LAYOUTS: Shared[ChannelLayout] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
-class _OfLayout:
-    """Members common to all channels."""
+class Channel(ABC):
+    """An attribute as a scheme interpolates it over the elements. Samples are given as for `PatchSampler.evaluate`."""
 
     layout: ChannelLayout
     values: FloatArray  # (n, k) float64
+
+    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
+        """``(s, k)`` values at samples."""
+        return self.with_derivatives(half_edge, uv)[0]
+
+    @abstractmethod
+    def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
+        """``(3, s, k)`` values and derivatives by u and v."""
+
+    @abstractmethod
+    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
+        """``(s, n)`` weights of the values at samples; rows sum to one."""
 
     @property
     def patches(self) -> PatchTable:
@@ -91,16 +104,12 @@ class _OfLayout:
         return self.layout.seam
 
 
-class SubdividedChannel(_OfLayout):
+class SubdividedChannel(Channel):
     """Values at mesh vertices that are subdivided as points are.
 
     `patches` belong to the mesh on which the values are subdivided, which is cut along seams as well. Its half-edges
     have the same indices as the cage's.
     """
-
-    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at samples, given as for `PatchSampler.evaluate`."""
-        return self.with_derivatives(half_edge, uv)[0]
 
     def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values and derivatives by u and v; at extraordinary points tangents, see `SurfaceSamples`."""
@@ -111,11 +120,10 @@ class SubdividedChannel(_OfLayout):
         return PatchSampler(self.patches, self.values, self.value_index)
 
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
-        """``(s, n)`` weights of the values at samples; rows sum to one."""
         return vertex_matrices(self.patches, self.value_index, len(self.values), half_edge, uv, 1)[0]
 
 
-class LinearChannel(_OfLayout):
+class LinearChannel(Channel):
     """Values at face corners that are interpolated linearly over each element.
 
     Over a polygon that has a patch at each corner, values are interpolated bilinearly over each patch: the
@@ -123,12 +131,7 @@ class LinearChannel(_OfLayout):
     `patches` are those of the surface.
     """
 
-    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at samples, given as for `PatchSampler.evaluate`."""
-        return self.with_derivatives(half_edge, uv)[0]
-
     def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(3, s, k)`` values, and derivatives by u and by v."""
         domain, (u, v) = self.patches.scheme.domain, uv.T[:, :, None]
         corners, face, is_partial = self._corners(half_edge)
         values = [self.values[self.value_index[corner]] for corner in corners]
@@ -141,7 +144,6 @@ class LinearChannel(_OfLayout):
         return np.stack([sum(weight * value for weight, value in zip(row, values, strict=True)) for row in rows])
 
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
-        """``(s, n)`` weights of the values at samples; rows sum to one."""
         from scipy import sparse
 
         t, entries = self.patches.topology, [*self.patches.scheme.domain.corner_weights(*uv.T)]
@@ -187,9 +189,6 @@ class LinearChannel(_OfLayout):
         t = self.patches.topology
         sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.value_index].T]
         return np.stack(sums, axis=1) / t.face_sizes[:, None]
-
-
-Channel = SubdividedChannel | LinearChannel
 
 
 def contracts_alike(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,22 +48,18 @@ class StencilMatrices(NamedTuple):
     d2p_dvv: sparse.csr_array | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class StencilRows:
-    """Rows of ``d`` sparse matrices with the same structure."""
-
-    rows: IntArray  # (n,) int: row indices
-    columns: IntArray  # (n, K) int: column indices; entries of a row with the same column add up
-    weights: FloatArray  # (d, n, K) float64
+# Rows of ``d`` sparse matrices with the same structure: row indices ``(n,)``; column indices ``(n, K)``, of which equal
+# ones in a row add up; weights ``(d, n, K)``.
+StencilRows = tuple[IntArray, IntArray, FloatArray]
 
 
 def joined_matrices(parts: Iterable[StencilRows], count: int, shape: tuple[int, int]) -> list[sparse.csr_array]:
     """Assemble ``count`` sparse matrices from their rows, given in any order."""
     entries: list[list[tuple[IntArray, IntArray, FloatArray]]] = [[] for _ in range(count)]
-    for part in parts:
-        columns = part.columns.astype(np.int32).ravel()
-        rows = np.repeat(part.rows.astype(np.int32), part.columns.shape[1])
-        for matrix_entries, weights in zip(entries, part.weights, strict=True):
+    for part_rows, part_columns, part_weights in parts:
+        columns = part_columns.astype(np.int32).ravel()
+        rows = np.repeat(part_rows.astype(np.int32), part_columns.shape[1])
+        for matrix_entries, weights in zip(entries, part_weights, strict=True):
             matrix_entries.append((rows, columns, weights.ravel()))
     none = np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32), np.empty(0)
     matrices = [StencilTable.of(*shape, none, *matrix_entries).matrix for matrix_entries in entries]
@@ -145,7 +140,7 @@ def _rows(
             distinct = run[is_new]
             weights = stencils(patch_class.signature, uv[distinct], patch_corner[distinct])
             controls = control_of_vertex[patch_class.controls[patch[run]]]
-            yield StencilRows(run, controls, weights[:, np.cumsum(is_new) - 1])
+            yield run, controls, weights[:, np.cumsum(is_new) - 1]
 
 
 def _in_refined(
