@@ -1,7 +1,6 @@
 """Cages and their refinements for tests of borders and creases."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
@@ -63,7 +62,7 @@ def refined(surface):
     )
     # Its own rules and edges: what a cage of these faces has not.
     structure = replace(cage.structure, topology=t)
-    vars(structure)["sharp_mesh"] = SimpleNamespace(cut=CutMesh(t, np.arange(t.vertex_count)))
+    vars(structure)["cut"] = CutMesh(t, np.arange(t.vertex_count))
     vars(cage).update(topology=t, structure=structure)
     return LimitSurface(cage, surface.scheme)
 

@@ -18,7 +18,6 @@ from ..mesh.sharpness import CreaseMethod
 from ..variants import variant_module
 from .contents import RULES, Attribute, CageContents, validated_attribute
 from .errors import CageError, CageSource
-from .structure import CageStructure
 from .validation import (
     flattened_faces,
     validated_face_indices,
@@ -96,7 +95,7 @@ class ControlCage:
     ----------
     positions : (n_v, 3) float64
         Read-only.
-    structure : CageStructure
+    structure : SharpMesh
         Everything that does not depend on positions. Cages with the same faces, tags and rules share it.
     topology : Topology
         Faces and half-edges. Half-edges of non-manifold edges have no twin, like those of boundary edges.
@@ -127,7 +126,7 @@ class ControlCage:
     """
 
     positions: NDArray[np.float64]
-    structure: CageStructure
+    structure: SharpMesh
     topology: Topology
     non_manifold: NonManifold | None
     tags: Sharpness
@@ -184,7 +183,7 @@ class ControlCage:
             )
         validated = validated_positions(positions, source)
         topology, non_manifold, order = validated_faces(len(validated), sizes, vertices, source, strict)
-        structure = CageStructure(
+        structure = SharpMesh(
             topology=topology,
             non_manifold=non_manifold,
             tags=validated_tags(topology, creases, corners, source),
@@ -378,13 +377,13 @@ class ControlCage:
 
     @property
     def sharp_mesh(self) -> SharpMesh:
-        """The cage's mesh with its sharp edges and vertices."""
-        return self.structure.sharp_mesh
+        """The cage's mesh with its sharp edges and vertices: `structure`."""
+        return self.structure
 
     @property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
-        return self.structure.cut_mesh
+        return self.structure.cut
 
     @property
     def is_hole(self) -> NDArray[np.bool_]:
@@ -415,12 +414,12 @@ class ControlCage:
 
         The lower vertex comes first. Rows are sorted by the higher vertex, then by the lower.
         """
-        return self.structure.edges
+        return self.topology.edge_ends
 
     @property
     def triangles(self) -> IndexArray:
         """``(n, 3)`` int32, 0-based vertices of the triangle fan at the first vertex of each face; read-only."""
-        return self.structure.triangles
+        return self.topology.triangles
 
     def laplacian(self) -> sparse.csr_array:
         """Return the uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.

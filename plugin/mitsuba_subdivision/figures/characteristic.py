@@ -10,7 +10,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, PowerNorm
 from numpy.typing import NDArray
 
-from ..cage.structure import edges_of
 from ..evaluation.element import element_stencils
 from ..evaluation.irregular_patch import IrregularPatch, level_domains, level_rows
 from ..evaluation.patch_tree import irregular_patch, isolated_signature, patch_tree
@@ -149,9 +148,9 @@ def refinement_step(valence: int) -> tuple[CharacteristicMap, FloatArray, FloatA
     # Refined points without such a stencil belong to neighbouring patches.
     distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
     needed = (distance < 10.0**-DECIMALS).any(axis=1)
-    edges, old = edges_of(refinement.topology), characteristic.control_points
+    edges, old = refinement.topology.edge_ends, characteristic.control_points
     new_edges = refinement.apply(old)[edges[needed[edges].all(axis=1)]]
-    return characteristic, old, stencils @ old, old[edges_of(ring)], new_edges
+    return characteristic, old, stencils @ old, old[ring.edge_ends], new_edges
 
 
 def draw_refinement(options: FigureOptions) -> list[Path]:
@@ -211,7 +210,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
         return np.asarray(element_stencils(scheme, signature, uv)[0] @ flat)
 
     figure, ((face, matrix),) = panels(options, 1, 2)
-    face.add_collection(LineCollection(list(flat[edges_of(ring.topology)]), colors="#b6bec6", linewidths=0.6))
+    face.add_collection(LineCollection(list(flat[ring.topology.edge_ends]), colors="#b6bec6", linewidths=0.6))
     face.plot(*flat.T, "o", color="black", markersize=3, zorder=4)
     around = outline(scheme.domain.corners)
     coloured = [(domain, LEAF_COLOURS[level]) for domain, level, _ in leaves] + [(rest, REST) for rest in rests]

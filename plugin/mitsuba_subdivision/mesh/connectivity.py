@@ -146,6 +146,28 @@ class Topology:
         return first_indices(self.edge, self.edge_count)
 
     @cached_property
+    def edge_ends(self) -> IndexArray:
+        """``(n_e, 2)`` read-only ends of each edge, the lower vertex first; by the higher vertex, then the lower.
+
+        Edges between the same two vertices, which occur in non-manifold meshes, are one edge.
+        """
+        start, end = self.face_vertices.astype(np.int64), self.face_vertices[self.next]
+        keys = np.unique(np.maximum(start, end) * self.vertex_count + np.minimum(start, end))
+        ends = np.stack(np.divmod(keys, self.vertex_count)[::-1], axis=1).astype(np.int32)
+        ends.flags.writeable = False
+        return ends
+
+    @cached_property
+    def triangles(self) -> IndexArray:
+        """``(n, 3)`` vertices of the triangle fans at the first vertex of each face, in order of faces. Read-only."""
+        counts = self.face_sizes - 2
+        first = np.repeat(self.face_offsets[:-1], counts)
+        step = first + ragged.index_in_row(counts)
+        triangles = self.face_vertices[np.stack([first, step + 1, step + 2], axis=1)]
+        triangles.flags.writeable = False
+        return triangles
+
+    @cached_property
     def vertex_half_edge(self) -> IndexArray:
         """``(n_v,)`` lowest outgoing half-edge of each vertex, -1 if no face uses the vertex."""
         return first_indices(self.face_vertices, self.vertex_count)

@@ -5,7 +5,7 @@ Values of face-varying data are subdivided like points, on the mesh that is cut 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
 from .manifold import NonManifold
+from .shared import Content, Shared
 from .sharpness import INFINITE, CreaseMethod, FloatArray, SemiSharpness
 
 # For each mode, the `_corner_conditions` under which a value at a seam is a corner.
@@ -79,19 +80,66 @@ class CutMesh:
 
 @dataclass(frozen=True, eq=False)
 class SharpMesh:
-    """A mesh and its sharp features."""
+    """The faces, tags and rules of a control cage: all that does not depend on positions.
+
+    Attributes are as in `ControlCage`. Cages with equal ones share one object, see `shared`.
+    """
 
     topology: Topology
-    sharpness: Sharpness
-    is_corner: NDArray[np.bool_]  # (n_v,) bool: vertices that are corners regardless of their edges
-    is_boundary_vertex: NDArray[np.bool_]  # (n_v,) bool: vertices with an edge that belongs to one face only
-    crease_method: CreaseMethod = "uniform"  # How semi-sharp edges decay
-    non_manifold: NonManifold | None = None  # None for a manifold
+    non_manifold: NonManifold | None  # None for a manifold
+    tags: Sharpness
+    boundary: str = "edge_only"
+    crease_method: CreaseMethod = "uniform"
+    triangle_rule: str = "catmull_clark"
+    face_varying: str = "corners_plus1"
+    holes: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def shared(self) -> SharpMesh:
+        """Return the shared mesh that equals this one, or this one if there is none yet."""
+        t = self.topology
+        names = None if t.edge_names is None else Content(t.edge_names)
+        arrays = (t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)
+        rules = (self.boundary, self.crease_method, self.triangle_rule, self.face_varying)
+        return _SHARED.get((t.vertex_count, names, *map(Content, arrays), *rules), lambda: self)
+
+    @cached_property
+    def is_corner(self) -> NDArray[np.bool_]:
+        t, is_corner = self.topology, self.tags.is_corner
+        if self.non_manifold is not None:
+            is_corner = is_corner | self.non_manifold.is_corner
+        if self.boundary == "edge_and_corner":
+            is_corner = is_corner | t.is_border_vertex & (t.vertex_face_count == 1)
+        return is_corner
+
+    @cached_property
+    def is_boundary(self) -> NDArray[np.bool_]:
+        is_border, non_manifold = self.topology.twin < 0, self.non_manifold
+        return is_border if non_manifold is None else is_border & ~non_manifold.is_edge | non_manifold.has_one_face
+
+    @cached_property
+    def is_boundary_vertex(self) -> NDArray[np.bool_]:
+        if self.non_manifold is None:
+            return self.topology.is_border_vertex
+        return self.topology.ends_of(self.is_boundary)
 
     @cached_property
     def cut(self) -> CutMesh:
         """The mesh cut along its infinitely sharp edges, with the rules of its vertices."""
         return cut_along_creases(self)
+
+    @cached_property
+    def is_hole(self) -> NDArray[np.bool_]:
+        t = self.topology
+        is_hole = np.zeros(t.face_count, dtype=bool)
+        is_hole[self.holes] = True
+        if self.boundary == "none":
+            # Faces at infinitely sharp boundary edges are part of the surface.
+            at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
+            is_hole[t.face[np.flatnonzero(at_boundary[t.face_vertices])]] = True
+        return is_hole
+
+
+_SHARED: Shared[SharpMesh] = Shared()
 
 
 def cut_along_creases(mesh: SharpMesh) -> CutMesh:
@@ -101,7 +149,7 @@ def cut_along_creases(mesh: SharpMesh) -> CutMesh:
     other side. So each side can be refined separately, with the crease as its border.
     """
     t = mesh.topology
-    is_cut = mesh.sharpness.is_infinite & (t.twin >= 0)
+    is_cut = mesh.tags.is_infinite & (t.twin >= 0)
     is_border = is_cut | (t.twin < 0)
     rules = _vertex_rules(mesh, is_cut, is_border)
     if mesh.non_manifold is None and not is_cut.any():
@@ -203,7 +251,7 @@ def semi_sharpness_of_cut(
     in the cut mesh: that pair is in `SemiSharpness.edges`. A semi-sharp edge that is itself cut, along a seam, belongs
     to neither side and sharpens no copy, but Chaikin's method averages over it.
     """
-    t, sharpness, method = mesh.topology, mesh.sharpness, mesh.crease_method
+    t, sharpness, method = mesh.topology, mesh.tags, mesh.crease_method
     if not sharpness.any:
         return None
     rules, face_vertices = cut.topology.vertex_rules, cut.topology.face_vertices
@@ -248,9 +296,8 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
 
 def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
     """Cut a mesh along seams, after it was cut along creases. The caller sets the rules of its vertices."""
-    sharpness = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
-    no_corners = np.zeros(topology.vertex_count, dtype=bool)
-    return cut_along_creases(SharpMesh(topology, sharpness, no_corners, topology.is_border_vertex))
+    tags = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
+    return cut_along_creases(SharpMesh(topology, None, tags))
 
 
 def value_mesh(
@@ -310,7 +357,7 @@ def value_mesh(
     is_sharpened_across = ~differs[vertex]
     if mode in _SHARPENED_ACROSS:
         is_sharpened_across[copies] = _is_sharpened_by_other(mesh, seam, cut, copies)
-    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.sharpness.is_infinite, is_sharpened_across)
+    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.tags.is_infinite, is_sharpened_across)
     return cut.topology.with_rules(rules, semi_sharpness), value_index
 
 
@@ -405,7 +452,7 @@ def _is_sharpened_by_other(
 
     A copy is smooth if no semi-sharp edges are between its faces and its vertex is not semi-sharp.
     """
-    t, sharpness = mesh.topology, mesh.sharpness
+    t, sharpness = mesh.topology, mesh.tags
     semi_sharp = (sharpness.edges > 0) & ~sharpness.is_infinite & (t.twin >= 0) & ~seam
     is_sharp = np.bincount(cut.topology.face_vertices, semi_sharp, minlength=len(cut.vertex)) > 0
     vertex = cut.vertex[copies]

@@ -240,7 +240,7 @@ def _layout_of(
         scheme.has_phantom_points and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
     ):
         return ChannelLayout(LinearChannel, patches, indices, seam)
-    topology, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
+    topology, value_index = value_mesh(cage.structure, cage.face_varying, indices)
     if not scheme.has_phantom_points and ((topology.twin < 0).any() or topology.vertex_rules.any()):
         raise SchemeError(
             f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '

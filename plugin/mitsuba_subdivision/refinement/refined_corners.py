@@ -213,7 +213,7 @@ def refined_attributes(
             if cage.face_varying == "all":
                 corner_values: NDArray[np.floating] = corners.linear(values[indices])
             else:
-                t, value_index = value_mesh(cage.sharp_mesh, cage.face_varying, indices)
+                t, value_index = value_mesh(cage.structure, cage.face_varying, indices)
                 if not scheme.has_phantom_points and ((t.twin < 0).any() or t.vertex_rules.any()):
                     raise SchemeError(
                         f"{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "
@@ -264,7 +264,7 @@ def _common_mode(
     def first_wrong(mode: str) -> tuple[str, int] | None:
         """Return the first attribute and refined corner at which the value mesh differs; None if all are equal."""
         for name, (expected, stays, indices) in value_meshes.items():
-            t = value_mesh(refined.sharp_mesh, mode, indices)[0]
+            t = value_mesh(refined.structure, mode, indices)[0]
             is_joined, is_torn, has_other_rule, is_sharper = differences(expected, t)
             is_corner = (t.vertex_rules == VertexRule.CORNER)[t.face_vertices]
             wrong = is_joined | is_torn | (has_other_rule & ~(stays & is_corner)) | is_sharper
