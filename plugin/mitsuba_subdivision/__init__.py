@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
     from .refinement.cage_refinement import CageRefinement
     from .schemes import SchemeError
-    from .shapes.moving_vertices import loss_of_views
+    from .shapes.derivatives import loss_of_views
     from .shapes.tessellation_parameters import pixel_error_for
     from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
@@ -76,7 +76,7 @@ _NAMES = {
     "patches": ("AreaSamples", "ClosestPoints", "ElementBounds", "StencilMatrices"),
     "refinement.cage_refinement": ("CageRefinement",),
     "schemes": ("SchemeError", "register_scheme"),
-    "shapes.moving_vertices": ("loss_of_views",),
+    "shapes.derivatives": ("loss_of_views",),
     "shapes.tessellation_parameters": ("pixel_error_for",),
     "studio": ("render_denoised", "studio_scene"),
     "surface": ("LimitSurface", "SurfaceSamples"),

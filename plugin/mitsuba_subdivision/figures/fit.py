@@ -24,7 +24,7 @@ from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.cage_fit import with_sample_count
 from ..fit.point_fit import mesh_samples
 from ..schemes.domain import FloatArray
-from ..shapes.moving_vertices import loss_of_views
+from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_figure

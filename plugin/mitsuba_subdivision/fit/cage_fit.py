@@ -17,7 +17,7 @@ from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
-from ..shapes.moving_vertices import loss_of_views
+from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
 from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import LargeSteps, regularizer, rows

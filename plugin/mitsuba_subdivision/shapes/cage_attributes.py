@@ -25,8 +25,8 @@ from ..device_arrays import take_over
 from ..kernels.array_types import FloatBuffer
 from ..mesh.shared import SharedArray
 from ..variants import Variant
+from .derivatives import Watched, computed_ones, warn_of_lost
 from .device_state import is_recording
-from .moving_vertices import Watched, computed_ones, warn_of_lost
 from .parameter_table import errors_about
 from .spectral_colors import SpectralUpsampling, holds_spectra
 

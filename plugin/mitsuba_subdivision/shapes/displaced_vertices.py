@@ -7,9 +7,7 @@ side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -31,54 +29,66 @@ if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
     from ..patches import Channel
     from ..surface import LimitSurface
+    from ..tessellation import AttributeTable, VertexTable
     from .displacement import ShapeDisplacement
 
 
-@dataclass(frozen=True, eq=False)
-class VertexLocations:
+class VertexLocations(NamedTuple):
     """Locations of the vertices of a tessellation on the surface."""
 
     # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`
     corner: IntArray
     uv: FloatArray  # (n, 2) float64: samples at corners of elements have (0, 0)
-    weld_target: IntArray  # (n,) int64: the first copy of each vertex; the vertex itself where it has no copies
+    copies: IntArray  # (g, c) int64: vertices at each location with several copies, padded with -1
+    group: IntArray  # (n,) int64: row of `copies` of each vertex; -1 for a vertex without copies
+    # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
+    # where a seam ends, as positions and values contract at different rates.
+    has_slope: NDArray[np.bool_]
 
-    @cached_property
-    def copies(self) -> IntArray:
-        """``(g, c)`` vertices at each location with several copies, padded with -1."""
-        order = np.argsort(self.weld_target, kind="stable")
-        _, begins, counts = np.unique(self.weld_target[order], return_index=True, return_counts=True)
-        has_copies = counts > 1
-        begins, counts = begins[has_copies, None], counts[has_copies, None]
-        column = np.arange(counts.max(initial=0))
-        copies = order[np.minimum(begins + column, len(order) - 1)]
-        copies[column >= counts] = -1
-        return copies
 
-    @cached_property
-    def group(self) -> IntArray:
-        """``(n,)`` row of `copies` of each vertex; -1 for a vertex without copies."""
-        group = np.full(len(self.weld_target), -1, dtype=np.int64)
-        rows, columns = np.nonzero(self.copies >= 0)
-        group[self.copies[rows, columns]] = rows
-        return group
+def displaced_vertices(
+    table: VertexTable,
+    split: AttributeTable,  # Vertices with copies along seams, whose different displacements are averaged
+    weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
+    surface: LimitSurface,
+    displacement: ShapeDisplacement,
+    types: ArrayTypes | None,  # Types of a JIT variant; None in scalar variants
+    *,
+    has_normals: bool,  # Whether normals are needed
+) -> DeviceDisplacement | HostDisplacement:
+    """Create what displaces the vertices of a tessellation."""
+    corner, uv = (split.locate or table.locations)()
+    copies, group = _copies(weld_target, len(corner))
+    has_slope, corners = np.ones(len(corner), dtype=bool), np.flatnonzero((uv == 0).all(axis=1))
+    samples = _sampler(surface, surface.cage.positions).evaluate(corner[corners], uv[corners])
+    points = corners[samples.level == AT_EXTRAORDINARY_POINT]
+    has_slope[points] = contracts_alike(displacement.channel, surface.patches, corner[points])
+    locations = VertexLocations(corner, uv, copies, group, has_slope)
+    kernel = displacement.kernel
+    if types is not None and kernel is not None and kernel.displacement is not None:
+        return DeviceDisplacement(locations, kernel, kernel.displacement, types, has_normals=has_normals)
+    return HostDisplacement(locations, surface, displacement, has_normals=has_normals)
 
-    def follow_slopes(self, surface: LimitSurface, channel: Channel) -> NDArray[np.bool_]:
-        """Whether the slope of heights along the surface exists at each vertex.
 
-        It does not exist at an extraordinary point where a seam ends, as positions and values contract at different
-        rates.
+def _copies(weld_target: NDArray | None, count: int) -> tuple[IntArray, IntArray]:
+    """`VertexLocations.copies` and `group`, from the first copy of each vertex; None if there are no copies."""
+    group = np.full(count, -1, dtype=np.int64)
+    if weld_target is None:
+        return np.empty((0, 0), dtype=np.int64), group
+    order = np.argsort(weld_target, kind="stable")
+    _, begins, counts = np.unique(weld_target[order], return_index=True, return_counts=True)
+    has_copies = counts > 1
+    begins, counts = begins[has_copies, None], counts[has_copies, None]
+    column = np.arange(counts.max(initial=0))
+    copies = order[np.minimum(begins + column, len(order) - 1)]
+    copies[column >= counts] = -1
+    rows, columns = np.nonzero(copies >= 0)
+    group[copies[rows, columns]] = rows
+    return copies, group
 
-        Returns (n,) bool.
-        """
-        follows = np.ones(len(self.corner), dtype=bool)
-        corners = np.flatnonzero((self.uv == 0).all(axis=1))
-        cage = surface.cage
-        sampler = PatchSampler(surface.patches, cage.positions, cage.cut_mesh.vertex)
-        samples = sampler.evaluate(self.corner[corners], self.uv[corners])
-        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
-        follows[points] = contracts_alike(channel, surface.patches, self.corner[points])
-        return follows
+
+def _sampler(surface: LimitSurface, points: FloatArray) -> PatchSampler:
+    return PatchSampler(surface.patches, points, surface.cage.cut_mesh.vertex)
 
 
 class DeviceDisplacement:
@@ -90,26 +100,26 @@ class DeviceDisplacement:
     def __init__(
         self,
         locations: VertexLocations,
-        slopes: NDArray[np.bool_],  # (n,) bool: see `VertexLocations.follow_slopes`
         surface: SurfaceKernel,  # Displaced surface, with the control points of the vertices
-        float_type: type,
+        displacement: Displacement,  # That of the surface
+        types: ArrayTypes,
         *,
         has_normals: bool,  # Whether normals are needed
     ) -> None:
-        self._surface, self._has_normals = surface, has_normals
-        self.is_differentiable = bool(dr.is_diff_v(float_type))
-        self._types = types = ArrayTypes(float_type)
+        self._surface, self._displacement = surface, displacement
+        self._types, self._has_normals = types, has_normals
         u, v = (types.floats(column) for column in locations.uv.T)
         self._location = Location(types.indices(locations.corner), u, v)
         self._read: FloatBuffer = None
         self._read_values()
-        self._follows = types.indices(slopes.astype(np.uint32)) != 0
-        dr.eval(self._follows)
-        self._copies = [types.indices(np.maximum(column, 0)) for column in locations.copies.T]
-        self._counts = types.floats((locations.copies >= 0).sum(axis=1).astype(np.float64))
-        self._group = types.indices(np.maximum(locations.group, 0))
-        self._has_copies = types.indices((locations.group >= 0).astype(np.uint32)) != 0
-        dr.eval(self._has_copies)
+        copies, group = locations.copies, locations.group
+        self._copies = [types.indices(np.maximum(column, 0)) for column in copies.T]
+        self._counts = types.floats((copies >= 0).sum(axis=1).astype(np.float64))
+        self._group = types.indices(np.maximum(group, 0))
+        self._has_slope, self._has_copies = (
+            types.indices(mask.astype(np.uint32)) != 0 for mask in (locations.has_slope, group >= 0)
+        )
+        dr.eval(self._has_slope, self._has_copies)
 
     def _read_values(self) -> None:
         """Evaluate the channel of the heights if its values have changed."""
@@ -120,13 +130,6 @@ class DeviceDisplacement:
             # Keep a reference, so that Dr.Jit assigns its indices to no other array.
             self._read, self._value = type(values)(values), channel(self._location)[0]
             dr.eval(self._value)
-
-    @property
-    def _displacement(self) -> Displacement:
-        displacement = self._surface.displacement
-        if displacement is None:
-            raise RuntimeError("a surface without displacement; expected one that `ShapeDisplacement` was attached to")
-        return displacement
 
     def __call__(
         self,
@@ -142,7 +145,7 @@ class DeviceDisplacement:
         positions = dr.ravel(p + self._mean(height * n))
         if self._has_normals:
             displaced_normal = self._surface.at(self._location).n
-            exists = self._follows & (dr.squared_norm(n) > 0) & (dr.squared_norm(displaced_normal) > 0)
+            exists = self._has_slope & (dr.squared_norm(n) > 0) & (dr.squared_norm(displaced_normal) > 0)
             normals = dr.ravel(dr.select(exists, displaced_normal, n))
         return positions, normals
 
@@ -160,18 +163,15 @@ class DeviceDisplacement:
 class HostDisplacement:
     """Displaces vertices on the host."""
 
-    is_differentiable = False
-
     def __init__(
         self,
         locations: VertexLocations,
-        slopes: NDArray[np.bool_],  # (n,) bool: see `VertexLocations.follow_slopes`
         surface: LimitSurface,
         displacement: ShapeDisplacement,
         *,
         has_normals: bool,  # Whether normals are needed
     ) -> None:
-        self._locations, self._slopes = locations, slopes
+        self._locations = locations
         self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
         self._read: Channel | None = None
 
@@ -187,7 +187,7 @@ class HostDisplacement:
         if self._has_normals:
             h, h_u, h_v = (scale * component for component in heights(*self._values))
             displaced_normal = _rows(unit(displaced(self._limit(points), (h, h_u, h_v)).normal))
-            exists = self._slopes & normals.any(axis=1) & displaced_normal.any(axis=1)
+            exists = self._locations.has_slope & normals.any(axis=1) & displaced_normal.any(axis=1)
             normals = np.where(exists[:, None], displaced_normal, normals).astype(np.float32)
         return positions.ravel(), normals.ravel()
 
@@ -201,8 +201,7 @@ class HostDisplacement:
 
     def _limit(self, points: FloatBuffer) -> PatchValues:
         """Evaluate the undisplaced limit surface at the vertices."""
-        points, vertex = np.array(points, dtype=np.float64).reshape(-1, 3), self._surface.cage.cut_mesh.vertex
-        sampler = PatchSampler(self._surface.patches, points, vertex)
+        sampler = _sampler(self._surface, np.array(points, dtype=np.float64).reshape(-1, 3))
         samples = sampler.evaluate(self._locations.corner, self._locations.uv, derivatives=2)
         # Second derivatives do not exist at extraordinary points.
         value, du, dv, *second = (_columns(rows) for rows in np.nan_to_num(samples.values))

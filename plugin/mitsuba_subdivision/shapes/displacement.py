@@ -1,18 +1,13 @@
-"""The displacement of a shape: heights, their channel and their scale, on the device and on the host.
-
-    parameters.py            checks ``displacement`` and ``displacement_scale``
-    heights.py               heights and their slopes, of a texture or an attribute; their range
-    displacement.py          displacement of a shape: this module
-    displaced_vertices.py    displaced vertices of a tessellation, with exact normals
-    exact_shading.py         hits on the displaced surface
-    kernels/displacement.py  formulas, and the displaced surface that rays intersect
+"""The displacement of a shape: its heights, the channel that they depend on, and their scale.
 
 In object space, a surface point S is displaced to S + scale h N, along the unit limit normal N. A point without a
-normal is not displaced.
+normal is not displaced. `kernels.displacement` has the formulas, and the displaced surface that rays intersect;
+`displaced_vertices` displaces the vertices of a tessellation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,25 +16,34 @@ import mitsuba as mi
 import numpy as np
 
 from ..device_arrays import mapped
-from ..kernels.array_types import FloatBuffer
+from ..kernels.array_types import Float, FloatBuffer, Mask, Value
 from ..kernels.channel_kernel import channel_kernel
-from ..kernels.displacement import Displacement
-from ..kernels.linear_maps import ControlValues
+from ..kernels.displacement import Displacement, Heights
 from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import DisplacementBound
 from ..variants import Variant
+from .cage_attributes import mesh_name
 from .device_state import is_recording
-from .heights import AttributeHeights, HeightRange, TextureHeights
 
 if TYPE_CHECKING:
+    from ..kernels.linear_maps import ControlValues
     from ..patches import Channel
     from .exact_shading import ExactShading
 
-# Prefix of an attribute's name in the parameter, as in the texture `mesh_attribute`.
-PREFIX = "vertex_"
+# Step of central differences of a texture, in texture coordinates.
+DIFFERENCE = 2.0**-10
+# Number of samples along each side of the unit square, from which the range of textures that are no bitmaps follows.
+RANGE_SAMPLES = 256
+# Textures that are not functions of texture coordinates, and the expected alternatives for messages.
+_ELSEWHERE = {
+    "MeshAttribute": 'the name of the attribute itself, such as "vertex_height"',
+    "VolumeAdapter": "one over texture coordinates",
+}
+# Relative luminance of linear sRGB, with Mitsuba's weights.
+_LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 class ShapeDisplacement:
@@ -55,28 +59,25 @@ class ShapeDisplacement:
         positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `RecentredPoints`
         given: Any,  # Value of the parameter ``displacement``
         scale: float,
-        exact: ExactShading | None = None,  # Exact shading of the shape, whose surface is displaced, too
+        exact: ExactShading | None,  # Exact shading of the shape, whose surface is displaced, too
     ) -> None:
         self._is_jit = dr.is_jit_v(variant.Float)
-        # ``self.attribute`` is the name of the channel that the heights depend on: an attribute, or "texcoords".
+        # Name of the channel that the heights depend on: an attribute, or "texcoords".
+        self.attribute = _attribute_named(given, surface) if isinstance(given, str) else TEXCOORDS
+        if self.attribute not in surface.attribute_names:
+            raise ValueError(
+                f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
+                "with some, or the name of an attribute"
+            )
         self.heights: AttributeHeights | TextureHeights
-        if isinstance(given, str):
-            self.attribute = _attribute_named(given, surface)
-            self._loaded = surface.channel(self.attribute)
-            self.heights = AttributeHeights(self._loaded)
-        else:
-            if TEXCOORDS not in surface.attribute_names:
-                raise ValueError(
-                    f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
-                    "with some, or the name of an attribute"
-                )
-            self.attribute, self._loaded = TEXCOORDS, surface.channel(TEXCOORDS)
-            self.heights = TextureHeights(variant, given)
-        # Updated values of the channel on the device; None until the first update.
+        self.heights = AttributeHeights() if isinstance(given, str) else TextureHeights(variant, given)
+        # The channel as it was loaded, and with its current values: None if these have not been read from the device.
+        self._loaded = surface.channel(self.attribute)
+        self._channel: Channel | None = self._loaded
         self._values: FloatBuffer = None
         # The parameter ``displacement_scale``: a flat array of one number.
         self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
-        # The displaced surface on the device, shared with exact shading. None in scalar variants without exact shading.
+        # The displaced surface on the device, shared with exact shading; None in scalar variants.
         self.kernel: SurfaceKernel | None = None
         # Values of the channel on the device; None with exact shading, whose values `CageAttributes` updates.
         self._own_values: ControlValues | None = None
@@ -119,11 +120,11 @@ class ShapeDisplacement:
 
     @property
     def channel(self) -> Channel:
-        """The channel with its current values, read from the device."""
-        if self._values is None:
-            return self._loaded
-        values = np.array(self._values, dtype=np.float64).reshape(self._loaded.values.shape)
-        return replace(self._loaded, values=values)
+        """The channel with its current values, on the host."""
+        if self._channel is None:
+            values = np.array(self._values, dtype=np.float64).reshape(self._loaded.values.shape)
+            self._channel = replace(self._loaded, values=values)
+        return self._channel
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the scale; Mitsuba exposes a texture as an attribute of the shape."""
@@ -132,9 +133,7 @@ class ShapeDisplacement:
 
     def set_values(self, values: FloatBuffer) -> None:
         """Set values, flat, of the channel that the heights depend on."""
-        self._values = dr.detach(values)
-        if not self._is_jit:
-            self._loaded, self._values = self.channel, None
+        self._values, self._channel = dr.detach(values), None
         if self._own_values is not None:
             self._own_values.set(values)
 
@@ -144,8 +143,9 @@ class ShapeDisplacement:
 
     def bound(self) -> DisplacementBound:
         """Scaled heights as a function of the location, and their bound, for adaptive tessellation."""
-        heights = self.range()
-        return DisplacementBound(self._heights_at, max(abs(heights.low), abs(heights.high)))
+        return DisplacementBound(
+            self._heights_at, max(map(abs, self.heights.range(self.channel))) * abs(self.host_scale)
+        )
 
     def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
@@ -154,25 +154,171 @@ class ShapeDisplacement:
         # A constant texture returns one number for all samples.
         return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))
 
-    def range(self) -> HeightRange:
-        """Interval of the scaled heights."""
-        heights = AttributeHeights(self.channel) if isinstance(self.heights, AttributeHeights) else self.heights
-        unscaled = heights.range()
-        low, high = sorted((unscaled.low * self.host_scale, unscaled.high * self.host_scale))
-        return HeightRange(low, high)
-
 
 def _attribute_named(given: str, surface: LimitSurface) -> str:
     """Return the name in the cage of the attribute that the parameter names.
 
     Raises ValueError if there is no such attribute, or its values are not scalar.
     """
-    attributes = surface.cage.attributes
-    widths = {f"{PREFIX}{name}": attribute.values.shape[1] for name, attribute in attributes.items()}
+    names = {mesh_name(name): name for name in surface.cage.attributes}
+    widths = {given: surface.cage.attributes[name].values.shape[1] for given, name in names.items()}
     if given not in widths:
         possible = [f'"{name}"' for name, width in widths.items() if width == 1]
         expected = f"one of {', '.join(possible)}" if possible else "a cage with an attribute of one number per value"
         raise ValueError(f'{surface.cage.source.name} has no attribute "{given}"; expected {expected}, or a texture')
     if widths[given] != 1:
         raise ValueError(f'"{given}" has {widths[given]} numbers per value; expected an attribute of one')
-    return given.removeprefix(PREFIX)
+    return names[given]
+
+
+# Heights are evaluated for arrays of a kernel, single points, and arrays on the host.
+
+
+class AttributeHeights(Heights):
+    """Heights equal to a channel's values."""
+
+    def range(self, channel: Channel) -> tuple[float, float]:
+        """Interval of the control values, which contains all heights because weights are not negative."""
+        return float(channel.values.min()), float(channel.values.max())
+
+
+class TextureHeights(Heights):
+    """Heights of a texture, with derivatives by the chain rule.
+
+    The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
+    Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives. The
+    derivatives of a bitmap's gradient by texture coordinates are differences over a texel.
+
+    Raises ValueError if the texture is not a function of texture coordinates, or not scalar.
+    """
+
+    def __init__(self, variant: Variant, texture: mi.Texture) -> None:
+        self._variant, self._texture = variant, texture
+        name = texture.class_name()
+        if name in _ELSEWHERE:
+            raise ValueError(f'a texture of the kind "{name}" was given; expected {_ELSEWHERE[name]}')
+        self._is_jit = dr.is_jit_v(variant.Float)
+        middle = self._interaction(0.5, 0.5)
+        try:
+            texture.eval_1(middle)
+        except RuntimeError as error:
+            raise ValueError(
+                f'a texture of the kind "{name}" cannot be evaluated as a single number; expected a scalar texture, '
+                f'such as a bitmap that is "raw" ({error})'
+            ) from None
+        try:
+            texture.eval_1_grad(middle)
+            self._has_gradient = True
+        except RuntimeError:
+            self._has_gradient = False
+
+    def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
+        """See `Heights`."""
+        s, t = value
+        moves = self._has_gradient and self._is_jit and dr.grad_enabled(s, t)
+        by_s, by_t = (self._moving_slopes if moves else self._slopes)(s, t, active)
+        return self._at_points(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
+
+    def height(self, value: Value) -> Float:
+        """Heights without derivatives."""
+        s, t = value
+        return self._at_points(self._height, s, t, True)
+
+    def variables(self) -> list:
+        """Differentiable arrays: the differentiable parameters of the texture."""
+        return [value for _, value in mi.traverse(self._texture) if dr.is_diff_v(value)] if self._is_jit else []
+
+    def range(self, _channel: Channel | None = None) -> tuple[float, float]:
+        """Interval of the texels of a bitmap, which contains all heights; for other textures, of samples."""
+        parameters = mi.traverse(self._texture)
+        if "data" in parameters and self._texture.class_name().startswith("BitmapTexture"):
+            values = np.array(parameters["data"])
+            if values.shape[2] == 3:
+                values = values @ np.array(_LUMINANCE, dtype=values.dtype)
+        else:
+            centres = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
+            float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
+            s, t = (mapped(float_type, coordinate) for coordinate in np.meshgrid(centres, centres))
+            values = np.array(self.height((s, t)))
+        return float(values.min()), float(values.max())
+
+    def _at_points(self, function: Callable, s: Float, t: Float, active: Mask) -> Value:
+        """Evaluate a function of s and t; point by point in scalar variants."""
+        if self._is_jit or not dr.is_array_v(s):
+            return function(s, t, active)
+        results = np.array([function(*uv, True) for uv in zip(s, t, strict=True)])
+        return type(s)(results) if results.ndim == 1 else [type(s)(column) for column in results.T]
+
+    def _interaction(self, s: Float, t: Float) -> mi.SurfaceInteraction3f:
+        si = dr.zeros(self._variant.SurfaceInteraction3f, max(dr.width(s), dr.width(t)) if self._is_jit else 1)
+        si.uv = self._variant.Point2f(s, t)
+        return si
+
+    def _height(self, s: Float, t: Float, active: Mask) -> Float:
+        return self._texture.eval_1(self._interaction(s, t), active)
+
+    def _slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
+        """Derivatives of the heights by s and t."""
+        if not self._has_gradient:
+            by_differences = not dr.is_diff_v(self._variant.Float)
+            return self._at_points(self._differences if by_differences else self._derivatives, s, t, active)
+        by_s, by_t = self._at_points(
+            lambda s, t, active: self._texture.eval_1_grad(self._interaction(s, t), active), s, t, active
+        )
+        # Mitsuba 3.9.1 multiplies the gradient by the resolution after applying ``to_uv`` instead of before, which
+        # differs where a bitmap's sides differ in length and ``to_uv`` turns it.
+        sides = np.array(self._texture.resolution(), dtype=np.float64)
+        if sides[0] == sides[1]:
+            return by_s, by_t
+        to_uv = self._to_uv()
+        if (to_uv[0, 1] == 0 and to_uv[1, 0] == 0) or np.linalg.det(to_uv) == 0:
+            return by_s, by_t
+        (a, b), (c, d) = (to_uv.T @ np.diag(sides) @ np.linalg.inv(to_uv.T) @ np.diag(1 / sides)).tolist()
+        return a * by_s + b * by_t, c * by_s + d * by_t
+
+    def _moving_slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
+        """Slopes of a bitmap, with derivatives by s and t that are differences over a texel.
+
+        Bilinear interpolation makes the slope along s constant in s between texels, with jumps at these. Its derivative
+        would be zero everywhere, although the normals of the displaced surface vary.
+        """
+        s_0, t_0 = dr.detach(s), dr.detach(t)
+        slopes = self._slopes(s_0, t_0, active)
+        # Lengths of a texel in texture coordinates.
+        texels = abs(self._to_uv()) * np.array(self._texture.resolution(), dtype=np.float64)[:, None]
+        step_s, step_t = (1 / np.maximum(texels.max(axis=0), 1)).tolist()
+        for parameter, ds, dt in ((s, step_s / 2, 0.0), (t, 0.0, step_t / 2)):
+            with dr.suspend_grad():
+                behind = self._slopes(s_0 - ds, t_0 - dt, active)
+                ahead = self._slopes(s_0 + ds, t_0 + dt, active)
+            move = dr.replace_grad(type(s)(0), parameter)  # type: ignore[func-returns-value]  # The stub is wrong.
+            inverse = 1 / (2 * (ds + dt))
+            slopes = [slope + (b - a) * inverse * move for slope, a, b in zip(slopes, behind, ahead, strict=True)]
+        return slopes
+
+    def _to_uv(self) -> FloatArray:
+        """``(2, 2)`` linear part of a bitmap's ``to_uv``."""
+        parameters = mi.traverse(self._texture)
+        if "to_uv" not in parameters:
+            return np.eye(2)
+        return np.array(parameters["to_uv"].matrix, dtype=np.float64).reshape(3, 3)[:2, :2]
+
+    def _derivatives(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
+        gradient = []
+        with dr.resume_grad():
+            for step_s, step_t in ((1, 0), (0, 1)):
+                step = self._variant.Float(0)
+                dr.enable_grad(step)
+                height = self._height(dr.detach(s) + step_s * step, dr.detach(t) + step_t * step, active)
+                if dr.grad_enabled(height):
+                    dr.forward_from(step)
+                gradient.append(dr.grad(height))
+        return gradient
+
+    def _differences(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
+        ends = ((1, 0), (0, 1))
+        ahead, behind = (
+            [self._height(s + step * ds, t + step * dt, active) for ds, dt in ends]
+            for step in (DIFFERENCE, -DIFFERENCE)
+        )
+        return [(a - b) / (2 * DIFFERENCE) for a, b in zip(ahead, behind, strict=True)]

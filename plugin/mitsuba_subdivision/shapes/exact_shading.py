@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from enum import Enum, auto
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -47,25 +45,9 @@ _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 # Locations on triangles, shared by shapes with the same tessellation and elements.
 _TRIANGLES: Shared[TriangleLocations] = Shared()
 _WELDED: Shared[AttributeLayout] = Shared()
-# Number of fixed-point iterations of `Parameterization.hit`. Each removes most of the difference between texture
+# Number of fixed-point iterations of `hit_by_texcoords`. Each removes most of the difference between texture
 # coordinates on the surface and on its triangles.
 STEPS = 3
-
-
-class Side(Enum):
-    """How rays behave at a shape. Determines origin and normal of rays that leave it.
-
-    - OPAQUE: rays leave the shape on the side that they came from. They start on the surface or on the triangle,
-      whichever is in front, so that no triangle occludes them.
-    - TRANSMISSIVE: rays may pass through a material or into a medium, so both sides need the same origin: the triangle.
-    - EMITTER: emitters are sampled on their triangles. Hits need the same points and normals, or the weights of
-    multiple
-      importance sampling would not sum to one.
-    """
-
-    OPAQUE = auto()
-    TRANSMISSIVE = auto()
-    EMITTER = auto()
 
 
 class ExactShading:
@@ -93,7 +75,6 @@ class ExactShading:
         self.kernel.values.load(positions)
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
-        self.take_counts()
         self._limit_surface = surface
         self._channels: dict[str, ChannelKernel] = {}
         self._texcoords = self.channel(TEXCOORDS) if TEXCOORDS in surface.attribute_names else None
@@ -106,7 +87,7 @@ class ExactShading:
             name for name, channel in self._attributes.items() if holds_spectra(variant, name, channel.values.size)
         }
         self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
-        self.side: Callable[[], Side] = lambda: Side.OPAQUE
+        self._shape: Callable[[], mi.Mesh | None] = lambda: None
         self._sign = 1.0
 
     def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
@@ -134,12 +115,18 @@ class ExactShading:
         if split.surface_vertex is None:
             return AttributeTable(_welded(table), values)
         _, first = np.unique(split.surface_vertex, return_index=True)
-        layout = _welded(table, split.layout, first)
+        locate = split.locate
+
+        def first_ones() -> tuple[IntArray, FloatArray]:
+            start, uv = (locate or table.locations)()
+            return start[first], uv[first]
+
+        layout = _welded(table, split.layout, None if locate is None else first_ones)
         return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
-    def follow_side_of(self, shape: mi.Mesh) -> None:
-        """Use the current `Side` of a shape at each hit, and the orientation of its normals."""
-        self.side = _side_of(shape)
+    def follow(self, shape: mi.Mesh) -> None:
+        """Use a shape's current material at each hit, and the orientation of its normals, without keeping it alive."""
+        self._shape = weakref.ref(shape)
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
 
     def set_transform(
@@ -299,16 +286,21 @@ class ExactShading:
         facing: Float,  # Negative where the ray hits the triangle from outside
     ) -> None:
         """Set the normals, and the origin of rays that leave the surface."""
-        variant, side = self._variant, self.side()
-        if side is Side.EMITTER:
+        variant, shape = self._variant, self._shape()
+        # Emitters are sampled on their triangles. Hits need the same points and normals, or the weights of multiple
+        # importance sampling would not sum to one.
+        if shape is not None and shape.is_emitter():
             return
         exists = dot(points.n, points.n) > 0
         n = dr.select(exists, variant.Normal3f(points.n * self._sign), si.n)
         n = _facing(n, dr.detach(d), facing)
         si.sh_frame.n = n
-        if side is Side.TRANSMISSIVE:
+        # Where rays may pass through a material or into a medium, both sides need the same origin: the triangle.
+        transmission = int(mi.BSDFFlags.Transmission)
+        if shape is None or shape.is_medium_transition() or int(shape.bsdf().flags()) & transmission:
             return
-        # If the surface is behind the triangle, rays leave from the triangle, so that it does not occlude them.
+        # Otherwise, rays leave on the side that they came from. They start on the surface or on the triangle, whichever
+        # is in front, so that no triangle occludes them.
         t = dot(points.p - o, d) / dot(d, d)
         is_before &= t > 0
         si.p, si.t = dr.select(is_before, variant.Point3f(points.p), si.p), dr.select(is_before, t, si.t)
@@ -344,25 +336,11 @@ def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
     return dr.select(cosine * facing < 0, turned * dr.rsqrt(dot(turned, turned)), n)
 
 
-def _side_of(shape: mi.Mesh) -> Callable[[], Side]:
-    """Return a function that returns the current `Side` of a shape without keeping it alive."""
-    reference = weakref.ref(shape)
-
-    def side() -> Side:
-        alive = reference()
-        if alive is not None and alive.is_emitter():
-            return Side.EMITTER
-        if alive is None or alive.is_medium_transition() or int(alive.bsdf().flags()) & int(mi.BSDFFlags.Transmission):
-            return Side.TRANSMISSIVE
-        return Side.OPAQUE
-
-    return side
-
-
 def _welded(
     table: VertexTable,
     split: AttributeLayout | None = None,  # Triangles with copies of vertices along seams, if there are seams
-    first: IntArray | None = None,  # (n,) int64: for each vertex, the vertex of `split` that provides its attributes
+    # Locations of the vertices of ``split`` that provide each vertex's attributes, as for `AttributeLayout`
+    locate: Callable[[], tuple[IntArray, FloatArray]] | None = None,
 ) -> AttributeLayout:
     """Triangles without copies of vertices, shared between shapes."""
 
@@ -371,59 +349,47 @@ def _welded(
             return table.triangles
         return table.weld_target.astype(np.uint32)[table.triangles]
 
-    def make() -> AttributeLayout:
-        locate = (
-            None if split is None or split.locate is None or first is None else partial(_chosen, split.locate, first)
-        )
-        return AttributeLayout(None, triangles, locate=locate)
-
-    return _WELDED.get((table, split), make)
+    return _WELDED.get((table, split), lambda: AttributeLayout(None, triangles, locate=locate))
 
 
-def _chosen(locate: Callable[[], tuple[IntArray, FloatArray]], chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Select rows of the locations that a function returns."""
-    start, uv = locate()
-    return start[chosen], uv[chosen]
+def texture_scene(variant: Variant, shape: mi.Mesh, exact: ExactShading) -> mi.Scene:
+    """Scene of a shape's triangles over the plane of texture coordinates, in which `hit_by_texcoords` finds them."""
+    uv = exact.texcoords_of_corners(shape.face_count())
+    mesh = variant.Mesh("texture coordinates", vertex_count=len(uv), face_count=len(uv) // 3)
+    parameters = mi.traverse(mesh)
+    for name, values in (("vertex_positions", np.pad(uv, ((0, 0), (0, 1)))), ("faces", np.arange(len(uv)))):
+        parameters[name] = upload(type(parameters[name]), values)
+    parameters.update()
+    return mi.load_dict({"type": "scene", "mesh": mesh})
 
 
-class Parameterization:
-    """Finds points of a shape with exact shading by texture coordinates, like `mi.Mesh.eval_parameterization`."""
+def hit_by_texcoords(
+    variant: Variant,
+    scene: mi.Scene,  # Made by `texture_scene`, of current texture coordinates
+    shape: mi.Mesh,
+    uv: Vector2,
+    ray_flags: int,
+    active: Mask,
+) -> mi.SurfaceInteraction3f:
+    """Interaction at the point of a shape with given texture coordinates; invalid where there is none."""
 
-    def __init__(
-        self,
-        variant: Variant,
-        shape: mi.Mesh,
-        exact: ExactShading,  # Exact shading of the shape, with current texture coordinates
-    ) -> None:
-        self._variant = variant
-        uv = exact.texcoords_of_corners(shape.face_count())
-        mesh = variant.Mesh("texture coordinates", vertex_count=len(uv), face_count=len(uv) // 3)
-        parameters = mi.traverse(mesh)
-        for name, values in (("vertex_positions", np.pad(uv, ((0, 0), (0, 1)))), ("faces", np.arange(len(uv)))):
-            parameters[name] = upload(type(parameters[name]), values)
-        parameters.update()
-        self._scene = mi.load_dict({"type": "scene", "mesh": mesh})
-
-    def hit(self, shape: mi.Mesh, uv: Vector2, ray_flags: int, active: Mask) -> mi.SurfaceInteraction3f:
-        """Interaction at the point of a shape with given texture coordinates; invalid where there is none."""
-        si = self._at(shape, uv, ray_flags, active)
-        target = uv
-        for _ in range(STEPS):
-            target = target + dr.select(si.is_valid(), uv - si.uv, 0)
-            next_si = self._at(shape, target, ray_flags, active & si.is_valid())
-            si = dr.select(next_si.is_valid(), next_si, si)
-        return si
-
-    def _at(self, shape: mi.Mesh, uv: Vector2, ray_flags: int, active: Mask) -> mi.SurfaceInteraction3f:
-        variant = self._variant
+    def at(uv: Vector2, active: Mask) -> mi.SurfaceInteraction3f:
         uv_ray = variant.Ray3f(variant.Point3f(uv.x, uv.y, -1), variant.Vector3f(0, 0, 1))
-        preliminary = self._scene.ray_intersect_preliminary(uv_ray, active=active)
+        preliminary = scene.ray_intersect_preliminary(uv_ray, active=active)
         active &= preliminary.is_valid()
         index = dr.select(active, preliminary.prim_index, 0)
         corners = [shape.vertex_position(vertex, active) for vertex in shape.face_indices(index, active)]
         n, (b1, b2) = shape.face_normal(index, active), preliminary.prim_uv
         point = corners[0] + (corners[1] - corners[0]) * b1 + (corners[2] - corners[0]) * b2
         ray = variant.Ray3f(dr.detach(point + n), dr.detach(variant.Vector3f(-n)))
-        preliminary.t = dr.select(active, 1, dr.inf)
-        preliminary.shape = variant.ShapePtr(shape) if dr.is_jit_v(variant.Float) else shape
+        preliminary.t = dr.select(active, variant.Float(1), dr.inf)
+        preliminary.shape = variant.ShapePtr(shape)
         return preliminary.compute_surface_interaction(ray, ray_flags | int(mi.RayFlags.UV), active)
+
+    target: Any = uv
+    si = at(uv, active)
+    for _ in range(STEPS):
+        target = target + dr.select(si.is_valid(), uv - si.uv, 0)
+        next_si = at(target, active & si.is_valid())
+        si = dr.select(next_si.is_valid(), next_si, si)
+    return si

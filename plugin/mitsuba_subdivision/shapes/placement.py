@@ -115,6 +115,22 @@ class Placement:
         matrix = dr.detach(to_world.matrix)
         return Placement(self._recentred(to_world.matrix, centre), dr.rcp(matrix), False, self.mirrors)
 
+    def placed(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Map flat positions and unit normals from object space to world space."""
+        matrix = self.matrix
+        if dr.is_jit_v(matrix):
+            from ..kernels.array_types import ArrayTypes
+            from ..kernels.vertex_kernel import placed
+
+            return placed(positions, normals, matrix, ArrayTypes(type(positions)).vector3)
+        linear, offset = matrix[:3, :3], matrix[:3, 3]
+        p = positions.reshape(-1, 3) @ linear.T.astype(np.float32)
+        p += offset.astype(np.float32)
+        n: NDArray[np.float32] = normals.reshape(-1, 3) @ np.linalg.inv(linear).astype(np.float32)
+        lengths = np.linalg.norm(n, axis=1, keepdims=True)
+        np.divide(n, lengths, out=n, where=lengths > 0)
+        return p.ravel(), n.ravel()
+
     @staticmethod
     def _recentred(matrix: Matrix4, centre: NDArray[np.float64] | None) -> Matrix4:
         if centre is None:

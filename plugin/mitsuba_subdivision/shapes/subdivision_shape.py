@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,17 +16,17 @@ from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
+from .derivatives import on_backward_of
 from .device_state import DeviceState, is_recording, paused_collection, traversed
-from .moving_vertices import MovingVertices, on_backward_of
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
 from .registration import on_shallow_stack
-from .vertices import Triangles, require_control_points, vertices_of
+from .vertices import MovingVertices, Triangles, require_control_points
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
-    from .exact_shading import ExactShading, Parameterization
+    from .exact_shading import ExactShading
 
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
@@ -68,7 +68,8 @@ def make_subdivision(
             self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
-            self._parameterization: Parameterization | None = None
+            # The triangles over texture coordinates; None until they are needed.
+            self._texture_scene: Any = None
             self._has_texcoords = TEXCOORDS in surface.attribute_names
             if is_exact:
                 from .exact_shading import ExactShading
@@ -111,7 +112,7 @@ def make_subdivision(
             if self._exact is not None:
                 from .interaction_hook import interaction_hook
 
-                self._exact.follow_side_of(self)
+                self._exact.follow(self)
                 interaction_hook(variant).attach(self, self._exact)
             self._device_state = DeviceState(self) if is_jit else None
             # Empty, because Mitsuba would convert values from a list one by one. `_assemble` sets the buffers.
@@ -147,12 +148,18 @@ def make_subdivision(
                 self._exact.set_triangles(table, kept)
             self._cage.set_triangles(table, attributes)
             self._triangles = Triangles(variant, table, attributes, kept)
-            float_type = variant.Float if is_jit else None
-            is_exact = self._exact is not None
-            vertices = vertices_of(table, attributes, parameters, self._displacement, float_type, is_exact=is_exact)
-            self._vertices = MovingVertices(vertices, self._points, parameters.source, self._exact, self._displacement)
+            self._vertices = MovingVertices(
+                variant,
+                table,
+                attributes,
+                parameters,
+                self._points,
+                self._exact,
+                self._displacement,
+                on_backward_of(self.renew_derivatives),
+            )
             self._has_outlines = False
-            self._parameterization = None
+            self._texture_scene = None
 
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
@@ -214,7 +221,7 @@ def make_subdivision(
                 # Mitsuba discards the silhouette edges of old faces.
                 self._has_outlines = False
             attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
-            self._parameterization = None
+            self._texture_scene = None
             if (_MOVING | {tessellation.limit} | self._cage.moving).isdisjoint(keys):
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
@@ -281,10 +288,7 @@ def make_subdivision(
         def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
             """Evaluate the moving buffers, and update exact shading."""
             with errors_about("control_points"):
-                on_backward = on_backward_of(self.renew_derivatives)
-                return self._vertices.evaluated(
-                    self.control_points, self._placement, on_backward, moves_points=moves_points
-                )
+                return self._vertices.evaluated(self.control_points, self._placement, moves_points=moves_points)
 
         def renew_derivatives(
             self,
@@ -307,8 +311,7 @@ def make_subdivision(
                     self._attach_vertices()
 
         def _attach_vertices(self) -> None:
-            on_backward = on_backward_of(self.renew_derivatives)
-            self._replace_gradients(self._vertices.attached(self.control_points, self._placement, on_backward))
+            self._replace_gradients(self._vertices.attached(self.control_points, self._placement))
 
         def _replace_gradients(self, buffers: dict[str, FloatBuffer]) -> None:
             """Attach the mesh's buffers to the graphs of ``buffers``, unless a user has assigned them since."""
@@ -400,12 +403,13 @@ def make_subdivision(
             if self.has_vertex_texcoords():
                 return super().eval_parameterization(uv, ray_flags, active)
             self._require_at_vertices("eval_parameterization", "texture coordinates", self._has_texcoords)
-            if self._parameterization is None and self._exact is not None:
-                from .exact_shading import Parameterization
+            from .exact_shading import hit_by_texcoords, texture_scene
 
-                self._parameterization = Parameterization(variant, self, self._exact)
-            assert self._parameterization is not None
-            return self._parameterization.hit(self, variant.Point2f(uv), int(ray_flags), variant.Mask(active))
+            if self._texture_scene is None and self._exact is not None:
+                self._texture_scene = texture_scene(variant, self, self._exact)
+            return hit_by_texcoords(
+                variant, self._texture_scene, self, variant.Point2f(uv), int(ray_flags), variant.Mask(active)
+            )
 
         def recompute_vertex_normals(self) -> None:
             """Replace the normals of the limit surface by averages of triangle normals.

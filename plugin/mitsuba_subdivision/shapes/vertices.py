@@ -1,193 +1,209 @@
-"""Positions and normals of the shape's vertices in object space, and the triangles of its mesh."""
+"""Vertices of the shape's mesh, which follow control points and placement, and its triangles."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import mapped, take_over
-from ..kernels.array_types import FloatBuffer, IndexBuffer
+from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, Matrix4
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray
 from ..surface import LimitSurface
 from ..variants import Variant
+from .derivatives import Watched, computed_ones, warn_of_lost
 from .device_state import is_recording
+from .placement import Placement, RecentredPoints
 
 if TYPE_CHECKING:
     from ..kernels import EvaluatedVertices, VertexKernel
-    from ..mesh.connectivity import IntArray
+    from ..kernels.surface_kernel import SurfaceKernel
     from ..tessellation import AttributeTable, VertexTable
-    from .displaced_vertices import DeviceDisplacement, HostDisplacement
     from .displacement import ShapeDisplacement
+    from .exact_shading import ExactShading
     from .parameters import Parameters
 
-
-class ConstantVertices(NamedTuple):
-    """Vertices that are not differentiable, with the interface of `EvaluatedVertices`."""
-
-    positions: FloatBuffer
-    normals: FloatBuffer
-
-    def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:  # noqa: ARG002
-        return self.positions, self.normals
+# Kernels and arrays, shared by shapes with the same tessellation.
+_KERNELS: Shared[VertexKernel] = Shared()
+_SHARED: Shared[SharedArray] = Shared()
 
 
-# Function of flat, detached control points, relative to the centre of the loaded ones (`RecentredPoints`).
-Evaluate = Callable[[FloatBuffer], "EvaluatedVertices | ConstantVertices"]
+class MovingVertices:
+    """Positions and normals of a shape in world space and its exact shading, for moving control points and placement.
 
+    Surfaces are evaluated in object space, relative to the centre of the loaded control points, and then mapped to
+    world space. Arrays are Dr.Jit arrays, or NumPy arrays in scalar variants.
 
-class Vertices:
-    """Evaluates the vertices of a tessellation, copies them along the seams of attributes, and displaces them.
-
-    Arrays are Dr.Jit arrays, or NumPy arrays in scalar variants.
+    Dr.Jit removes a computation from its graph once a gradient has passed backwards through it. So the arrays must be
+    `attached` to the parameters again before the gradient of another view. If the parameters were themselves computed
+    from other variables, that computation is lost: gradients end at the parameters, and `warn_of_lost` warns.
     """
 
     def __init__(
         self,
-        evaluate: Evaluate,
-        are_differentiable: bool,  # Whether vertices are differentiable with respect to the control points
-        *,
-        # (n,) int: index of each vertex of the shape among those that ``evaluate`` returns, if seams have copies
-        copied: IntArray | None = None,
-        displacement: DeviceDisplacement | HostDisplacement | None = None,  # Applied to the copied vertices
-        # (m,) int: indices of the displaced vertices that the shape keeps. Exact shading needs one copy of each vertex.
-        kept: IntArray | None = None,
-        float_type: type | None = None,  # Flat Dr.Jit array of JIT variants
+        variant: Variant,
+        table: VertexTable,
+        attributes: AttributeTable,  # Vertices of the mesh, with or without copies along seams
+        parameters: Parameters,
+        points: RecentredPoints,
+        shading: ExactShading | None,
+        displacement: ShapeDisplacement | None,
+        # Called with the gradients of the moving arrays, by name, after each reverse-mode pass
+        on_backward: Callable[[dict[str, FloatBuffer | Matrix4]], None],
     ) -> None:
-        self._evaluate, self._displacement, self.are_differentiable = evaluate, displacement, are_differentiable
-        self._copies, self._kept = _Selection(copied, float_type), _Selection(kept, float_type)
-        self._evaluated: EvaluatedVertices | ConstantVertices | None = None
+        self._table, self._parameters, self._points = table, parameters, points
+        self._shading, self._displacement, self._on_backward = shading, displacement, on_backward
+        is_jit = dr.is_jit_v(variant.Float)
+        self._types = ArrayTypes(variant.Float) if is_jit else None
+        self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
+        self._kernel: VertexKernel | None = None
+        if is_jit and not self._is_sampled:
+            from ..kernels import VertexKernel
 
-    def __call__(self, points: FloatBuffer, *, keep: bool) -> tuple[FloatBuffer, FloatBuffer]:
-        """Evaluate flat positions and normals. ``keep`` stores the evaluation for `attached`."""
+            self._kernel = _KERNELS.get((table, variant.Float), lambda: VertexKernel(table, variant.Float))
+        # Whether vertices are differentiable with respect to control points, placement and displacement.
+        self.are_differentiable = self._kernel is not None and dr.is_diff_v(variant.Float)
+        self._computed: set[int] = set()
+        self._evaluated: EvaluatedVertices | None = None
+        # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
+        # differently and averaged; with exact shading, only one of them is kept.
+        copied, kept, self._displaced = attributes.surface_vertex, None, None
+        if displacement is not None:
+            from .displaced_vertices import displaced_vertices
+
+            split = parameters.surface.attribute_table(table)
+            has_normals = shading is None and not parameters.face_normals
+            self._displaced = displaced_vertices(
+                table,
+                split,
+                split_weld_targets(table, split),
+                parameters.surface,
+                displacement,
+                self._types,
+                has_normals=has_normals,
+            )
+            if copied is None and split.surface_vertex is not None:
+                _, kept = np.unique(split.surface_vertex, return_index=True)
+            copied = split.surface_vertex
+        self._copied, self._kept = self._index(copied), self._index(kept)
+
+    def evaluated(
+        self,
+        control_points: FloatBuffer,  # Parameter of the shape, in object space
+        placement: Placement,
+        *,
+        moves_points: bool,  # Whether control points have changed
+    ) -> dict[str, FloatBuffer]:
+        """Evaluate the mesh's buffers, and update exact shading. Returns the buffers by name."""
+        points, surface = self._points(control_points), self._surface
+        if surface is not None and moves_points:
+            surface.set_control_points(points)
+        elif surface is not None and self.are_differentiable and dr.grad_enabled(points):
+            surface.values.attach(points)
+        sources = self._sources(control_points, placement)
+        moves = self.are_differentiable and dr.grad_enabled(*sources)
+        self._computed = computed_ones(*sources) if moves else set()
         # Free the memory of the last evaluation before the next one.
         self._evaluated = None
-        evaluated = self._evaluate(dr.detach(points))
-        # Also stored for a displacement, as gradients of heights may be enabled later.
-        self._evaluated = evaluated if keep or self._displacement is not None else None
-        return self._displaced(*evaluated.attached(points), points)
+        if self._kernel is None:
+            return self._placed(*self._on_host(points), points, placement)
+        evaluated = self._kernel.evaluated(dr.detach(points))
+        # Also kept for a displacement, as gradients of heights may be enabled later.
+        self._evaluated = evaluated if moves or self._displaced is not None else None
+        return self._placed(*evaluated.attached(points), points, placement)
 
-    def attached(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Attach the vertices of the last call to the control points and the displacement again."""
+    def attached(self, control_points: FloatBuffer, placement: Placement) -> dict[str, FloatBuffer]:
+        """Attach exact shading and the buffers of the last evaluation to the parameters again."""
+        points, surface = self._points(control_points), self._surface
+        if surface is not None and dr.grad_enabled(points):
+            surface.values.attach(points)
         if self._evaluated is None:
-            raise RuntimeError("vertices were not kept; expected a call that keeps them before")
-        return self._displaced(*self._evaluated.attached(points), points)
+            raise RuntimeError("vertices were not kept; expected an evaluation with derivatives before")
+        return self._placed(*self._evaluated.attached(points), points, placement)
 
-    def _displaced(
-        self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer
-    ) -> tuple[FloatBuffer, FloatBuffer]:
-        copied = self._copies(positions), self._copies(normals)
-        if self._displacement is None:
-            return copied
-        positions, normals = self._displacement(*copied, points)
-        return self._kept(positions), self._kept(normals)
+    def warn_of_lost(
+        self,
+        # Gradients by the arrays computed from the parameters, by name. Zero for shapes of scenes that are no longer
+        # used.
+        gradients: dict[str, FloatBuffer | Matrix4],
+        control_points: FloatBuffer,
+        placement: Placement,
+    ) -> None:
+        """Warn if a gradient has reached the parameters, but not the variables that these were computed from."""
+        lost = self._computed - computed_ones(*self._sources(control_points, placement))
+        if lost and not is_recording() and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
+            others = (
+                "control_points or to_world" if self._displacement is None else "control_points, to_world or heights"
+            )
+            warn_of_lost(self._parameters.source, others)
 
+    @property
+    def _surface(self) -> SurfaceKernel | None:
+        """The surface of hits and of displaced normals; None if it is not needed."""
+        if self._shading is not None:
+            return self._shading.kernel
+        return None if self._displacement is None else self._displacement.kernel
 
-class _Selection:
-    """Selects flat 3-vectors by index; all of them if there is no index."""
+    def _sources(self, control_points: FloatBuffer, placement: Placement) -> list:
+        """Arrays that vertices depend on."""
+        heights = [] if self._displacement is None else self._displacement.variables()
+        return [control_points, placement.matrix, *heights]
 
-    def __init__(self, index: IntArray | None, float_type: type | None) -> None:
-        self._index: IntArray | IndexBuffer | None = index
-        if index is not None and float_type is not None:
-            from ..kernels.array_types import ArrayTypes
+    def _on_host(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Evaluate positions and normals in NumPy.
 
-            self._types = ArrayTypes(float_type)
-            self._index = self._types.indices(index)
+        Raises ValueError if the number of control points differs from that of the tessellation.
+        """
+        coordinates = np.array(dr.detach(points), dtype=np.float64)
+        _require_coordinates(coordinates.size, self._table.control_count)
+        if not self._is_sampled:
+            positions, normals = self._table.apply(coordinates.reshape(-1, 3))
+            return positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel()
+        # Each vertex as a sample in float32, by the evaluator of the parameters, for comparison.
+        given = self._parameters
+        cage = given.surface.cage.with_positions(coordinates.reshape(-1, 3))
+        surface, how = LimitSurface(cage, given.surface.scheme), (given.evaluator, np.float32, given.sample_offset)
+        p, n = surface.sample_vertices(self._table, *how)
+        # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
+        n = np.nan_to_num(n)
+        return (p.ravel(), n.ravel()) if self._types is None else (self._types.floats(p), self._types.floats(n))
 
-    def __call__(self, flat: FloatBuffer) -> FloatBuffer:
-        if self._index is None:
+    def _index(self, index: IntArray | None) -> IntArray | IndexBuffer | None:
+        return index if index is None or self._types is None else self._types.indices(index)
+
+    def _selected(self, flat: FloatBuffer, index: IntArray | IndexBuffer | None) -> FloatBuffer:
+        """Select flat 3-vectors by index; all of them if there is no index."""
+        if index is None:
             return flat
-        if isinstance(self._index, np.ndarray):
-            return np.reshape(flat, (-1, 3))[self._index].ravel()
-        return self._types.gathered(flat, self._index)
+        if self._types is None:
+            return np.reshape(flat, (-1, 3))[index].ravel()
+        return self._types.gathered(flat, index)
 
-
-def vertices_of(
-    table: VertexTable,
-    attributes: AttributeTable,
-    parameters: Parameters,
-    displacement: ShapeDisplacement | None,
-    float_type: type | None,  # Flat Dr.Jit array of a JIT variant; None in scalar variants
-    *,
-    is_exact: bool,  # Whether shading is exact
-) -> Vertices:
-    """Create the evaluator of the shape's vertices."""
-    evaluate, is_differentiable = _evaluator(table, parameters, float_type)
-    if displacement is None:
-        return Vertices(evaluate, is_differentiable, copied=attributes.surface_vertex, float_type=float_type)
-    from .displaced_vertices import DeviceDisplacement, HostDisplacement, VertexLocations
-
-    # With copies along seams, whose different displacements are averaged.
-    split = parameters.surface.attribute_table(table)
-    split_targets = split_weld_targets(table, split)
-    weld_target = np.arange(table.vertex_count) if split_targets is None else split_targets.astype(np.int64)
-    locations = VertexLocations(*(split.locate or table.locations)(), weld_target)
-    slopes = locations.follow_slopes(parameters.surface, displacement.channel)
-    has_normals = not (is_exact or parameters.face_normals)
-    displaced: DeviceDisplacement | HostDisplacement
-    if displacement.kernel is not None and float_type is not None:
-        displaced = DeviceDisplacement(locations, slopes, displacement.kernel, float_type, has_normals=has_normals)
-    else:
-        displaced = HostDisplacement(locations, slopes, parameters.surface, displacement, has_normals=has_normals)
-    kept = None
-    if attributes.surface_vertex is None and split.surface_vertex is not None:
-        _, kept = np.unique(split.surface_vertex, return_index=True)
-    return Vertices(
-        evaluate,
-        displaced.is_differentiable,
-        copied=split.surface_vertex,
-        displacement=displaced,
-        kept=kept,
-        float_type=float_type,
-    )
-
-
-def _evaluator(table: VertexTable, parameters: Parameters, float_type: type | None) -> tuple[Evaluate, bool]:
-    """The function that evaluates the tessellation's vertices, and whether it is differentiable."""
-    if parameters.evaluator != "stabilized" or parameters.sample_offset:
-        return partial(_sampled, table, parameters, float_type), False
-    if float_type is None:
-        return partial(_in_numpy, table), False
-    from ..kernels import VertexKernel
-
-    kernel = _KERNELS.get((table, float_type), lambda: VertexKernel(table, float_type))
-    return kernel.evaluated, dr.is_diff_v(float_type)
-
-
-def _in_numpy(table: VertexTable, points: FloatBuffer) -> ConstantVertices:
-    positions, normals = table.apply(_rows(points, table.control_count))
-    return ConstantVertices(positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel())
-
-
-def _sampled(
-    table: VertexTable, parameters: Parameters, float_type: type | None, points: FloatBuffer
-) -> ConstantVertices:
-    """Evaluate each vertex as a sample in float32, by the evaluator of the parameters, for comparison."""
-    cage = parameters.surface.cage
-    surface = LimitSurface(cage.with_positions(_rows(points, cage.vertex_count)), parameters.surface.scheme)
-    positions, normals = surface.sample_vertices(table, parameters.evaluator, np.float32, parameters.sample_offset)
-    # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
-    vertices = positions.ravel(), np.nan_to_num(normals).ravel()
-    return ConstantVertices(*(vertices if float_type is None else (mapped(float_type, array) for array in vertices)))
-
-
-def _rows(points: FloatBuffer, count: int) -> NDArray[np.float64]:
-    """Reshape flat control points to ``(count, 3)``. Raises ValueError if their number is not ``count``."""
-    coordinates = np.array(points, dtype=np.float64)
-    if coordinates.size != 3 * count:
-        from ..kernels.vertex_kernel import coordinates_expected
-
-        raise ValueError(coordinates_expected(coordinates.size, count))
-    return coordinates.reshape(-1, 3)
-
-
-# Kernels, shared by shapes with the same tessellation.
-_KERNELS: Shared[VertexKernel] = Shared()
+    def _placed(
+        self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer, placement: Placement
+    ) -> dict[str, FloatBuffer]:
+        """Copy, displace and place vertices, and update exact shading."""
+        positions, normals = self._selected(positions, self._copied), self._selected(normals, self._copied)
+        if self._displaced is not None:
+            positions, normals = self._displaced(positions, normals, points)
+            positions, normals = self._selected(positions, self._kept), self._selected(normals, self._kept)
+        if not placement.is_identity:
+            positions, normals = placement.placed(positions, normals)
+        moved = {"vertex_positions": positions, "vertex_normals": normals}
+        shading = self._shading
+        if shading is not None:
+            moved |= {"coefficients": shading.kernel.coefficients, "to_world": placement.matrix}
+        if self.are_differentiable:
+            attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
+            if attached:
+                moved |= dr.custom(Watched, attached, self._on_backward)
+        if shading is not None:
+            shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
+        return moved
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
@@ -195,10 +211,7 @@ def require_control_points(control_points: FloatBuffer, count: int) -> None:
 
     Raises ValueError if their number differs, or a coordinate is not finite.
     """
-    if len(control_points) != 3 * count:
-        from ..kernels.vertex_kernel import coordinates_expected
-
-        raise ValueError(coordinates_expected(len(control_points), count))
+    _require_coordinates(len(control_points), count)
     if is_recording():
         return
     take_over(control_points)
@@ -211,6 +224,13 @@ def require_control_points(control_points: FloatBuffer, count: int) -> None:
         f"vertex {non_finite[0]} has the coordinates {coordinates}; expected finite numbers "
         f"({len(non_finite)} such {'vertex' if len(non_finite) == 1 else 'vertices'} in all)"
     )
+
+
+def _require_coordinates(given: int, count: int) -> None:
+    if given != 3 * count:
+        from ..kernels.vertex_kernel import coordinates_expected
+
+        raise ValueError(coordinates_expected(given, count))
 
 
 def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
@@ -233,9 +253,9 @@ class Triangles:
         variant: Variant,
         table: VertexTable,
         attributes: AttributeTable,  # Vertices of the mesh, with or without copies along seams
-        kept: IntArray | None = None,  # (n,) int64: indices of the triangles of the mesh; None for all
+        kept: IntArray | None,  # (n,) int64: indices of the triangles of the mesh; None for all
     ) -> None:
-        self._variant, self._is_jit = variant, dr.is_jit_v(variant.Float)
+        self._variant = variant
         self._kept = slice(None) if kept is None else kept
         self._name = None if kept is None else Content(kept)
         self.table, self.layout, self._attributes = table, attributes.layout, attributes
@@ -246,38 +266,38 @@ class Triangles:
     def faces(self, *, are_turned: bool) -> IndexBuffer:
         """Vertices of all triangles, flat; in reversed order if ``are_turned``."""
 
-        def make() -> SharedArray:
+        def make() -> NDArray:
             triangles = self.layout.triangles[self._kept]
-            triangles = triangles[:, [0, 2, 1]] if are_turned else triangles
-            if not self._is_jit:
-                return SharedArray(triangles.ravel())
-            return SharedArray(mapped(self._variant.UInt32, triangles))
+            return triangles[:, [0, 2, 1]] if are_turned else triangles
 
-        return self._shared("faces", (self.layout, self._variant, are_turned, self._name), make)
+        return self._shared("faces", (self.layout, are_turned, self._name), make, self._variant.UInt32)
 
     @property
     def element(self) -> FloatBuffer:
-        """Element of each triangle, as floats."""
+        """Element of each triangle; a buffer of floats."""
 
-        def make() -> SharedArray:
-            element = self.table.element[self._kept]
-            return SharedArray(mapped(self._variant.Float, element) if self._is_jit else element.astype(np.float32))
+        def make() -> NDArray:
+            return self.table.element[self._kept]
 
-        return self._shared("element", (self.table, self._variant, self._name), make)
+        return self._shared("element", (self.table, self._name), make, self._variant.Float)
 
     @property
     def weld_target(self) -> IndexBuffer | None:
         """See `split_weld_targets`; None if no vertex has copies."""
 
-        def make() -> SharedArray:
-            targets = split_weld_targets(self.table, self._attributes)
-            return SharedArray(None if targets is None else mapped(self._variant.UInt32, targets))
+        def make() -> NDArray | None:
+            return split_weld_targets(self.table, self._attributes)
 
-        return self._shared("weld_target", (self.table, self.layout, self._variant), make)
+        return self._shared("weld_target", (self.table, self.layout), make, self._variant.UInt32)
 
-    def _shared(self, name: str, key: tuple, make: Callable[[], SharedArray]) -> FloatBuffer | IndexBuffer:
-        self._held[name] = _SHARED.get((name, *key), make)
+    def _shared(
+        self, name: str, key: tuple, make: Callable[[], NDArray | None], kind: type
+    ) -> FloatBuffer | IndexBuffer:
+        def array() -> SharedArray:
+            values = make()
+            if values is None:
+                return SharedArray(None)
+            return SharedArray(mapped(kind, values) if dr.is_jit_v(kind) else values.ravel())
+
+        self._held[name] = _SHARED.get((name, self._variant, *key), array)
         return self._held[name].array
-
-
-_SHARED: Shared[SharedArray] = Shared()

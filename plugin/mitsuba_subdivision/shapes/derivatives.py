@@ -1,0 +1,119 @@
+"""Derivatives of what a shape computes from its parameters, which Dr.Jit forgets after each reverse-mode pass."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..cage.errors import warn
+from ..kernels.array_types import Float
+
+# Number of bits of a Dr.Jit variable index. The index of its derivative is in the bits above.
+_HALF = 32
+
+
+class Watched(dr.CustomOp):
+    """Identity function of arrays, which calls a function after reverse mode has passed through it."""
+
+    def eval(self, arrays, on_backward):
+        self.on_backward = on_backward
+        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
+        return {name: type(array)(array) for name, array in arrays.items()}
+
+    def forward(self):
+        self.set_grad_out(self.grad_in("arrays"))
+
+    def backward(self):
+        gradients = self.grad_out()
+        self.set_grad_in("arrays", gradients)
+        self.on_backward(gradients)
+
+    def name(self):
+        return "Watched"
+
+
+def on_backward_of(renew: Callable[..., None]) -> Callable[..., None]:
+    """Return a function that calls the bound method ``renew`` of a shape without keeping the shape alive."""
+    reference = weakref.WeakMethod(renew)
+
+    def call(*arguments: Any) -> None:
+        method = reference()
+        if method is not None:
+            method(*arguments)
+
+    return call
+
+
+def warn_of_lost(name: str, parameters: str) -> None:
+    """Warn that a gradient has reached parameters of a shape, but not the variables that they were computed from."""
+    warn(
+        f"{name}: gradients came to {parameters} a second time since the last update, and could not go on to the "
+        "variables that these were computed from, as Dr.Jit forgets a computation once gradients have passed through "
+        "it; assign the parameters and update before each view, or differentiate one loss of all views, as "
+        "loss_of_views computes it"
+    )
+
+
+def loss_of_views(
+    scene: mi.Scene,
+    params: mi.SceneParameters,
+    loss: Callable[[mi.TensorXf, int], Float],
+    sensors: Sequence[int | mi.Sensor] | None = None,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> Float:
+    """Render a scene through several sensors, and sum a loss of each image.
+
+    ``dr.backward`` of the sum reaches all variables that the scene's parameters were computed from. With one call of
+    ``dr.backward`` per view, only the first one would: Dr.Jit then forgets how the parameters were computed.
+
+    Parameters
+    ----------
+    scene : mi.Scene
+    params : mi.SceneParameters
+        Parameters of the scene, updated.
+    loss : callable
+        Function of an image, ``(height, width, channels)``, and the index of its view; returns a differentiable number.
+    sensors : sequence of int or mi.Sensor, optional
+        By default all sensors of the scene.
+    seed : int
+        Each pair of a seed and a view has different random numbers.
+    **options
+        As for ``mi.render``: ``spp``, ``spp_grad``, ``integrator``.
+
+    Returns
+    -------
+    Dr.Jit float
+
+    Raises
+    ------
+    ValueError
+        If there is no sensor.
+    """
+    # Mitsuba's stub only accepts an array as seed.
+    render: Any = mi.render
+    sensors = range(len(scene.sensors())) if sensors is None else sensors
+    if not len(sensors):
+        raise ValueError("no views: expected a scene with sensors, or some sensors")
+    return sum(
+        loss(render(scene, params, sensor=sensor, seed=seed * len(sensors) + view, **options), view)
+        for view, sensor in enumerate(sensors)
+    )
+
+
+def computed_ones(*values: Any) -> set[int]:
+    """Find arrays whose derivatives depend on other variables in Dr.Jit's graph.
+
+    A variable whose gradient was enabled directly has no such dependence, nor has an array after a gradient has passed
+    through its computation, which Dr.Jit then removes by default.
+
+    Returns set of int: Dr.Jit's indices of the arrays' derivatives.
+    """
+    derivatives = {index >> _HALF for value in values for index in dr.detail.collect_indices(value)} - {0}
+    graph = str(dr.graphviz_ad(as_string=True))
+    return {index for index in derivatives if f" {index} -> " in graph}
