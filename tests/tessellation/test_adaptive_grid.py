@@ -1,7 +1,6 @@
 """Adaptive tessellations have no cracks and no folds, and their vertices lie where they say."""
 
 import warnings
-from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -9,8 +8,9 @@ from fuzz.topologies import random_cage
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.errors import without_warnings
-from mitsuba_subdivision.cage.named_cages import cube, torus
-from mitsuba_subdivision.tessellation import Criterion, Measure, adaptive_grid
+from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.mesh import ragged
+from mitsuba_subdivision.tessellation import Criterion, Measure, adaptive
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
 from mitsuba_subdivision.tessellation.tile_rates import feature_edges
 from patches.closed_cages import bumpy
@@ -92,11 +92,12 @@ def assert_vertices_lie_where_triangles_say(surface, table):
     positions, normals = table.apply(surface.cage.positions)
     rounding = ROUNDING * np.abs(positions).max()
     corner, uv = table.grid.triangle_locations
-    for i in range(3):
-        seen = surface._evaluate_from(corner.astype(np.int64), uv[:, i], "stabilized", np.float64)
-        np.testing.assert_allclose(positions[table.triangles[:, i]], seen.p, rtol=0, atol=rounding)
-    found = surface._evaluate_from(*table.locations(), "stabilized", np.float64)
-    np.testing.assert_allclose(normals, found.n, rtol=0, atol=ROUNDING / 1e-3)
+    vertex_corner, vertex_uv = table.locations()
+    corner, uv = np.concatenate([vertex_corner, corner.repeat(3)]), np.concatenate([vertex_uv, uv.reshape(-1, 2)])
+    exact = surface._evaluate_from(corner, uv, "stabilized", np.float64)
+    vertices = np.concatenate([np.arange(table.vertex_count), table.triangles.ravel()])
+    np.testing.assert_allclose(positions[vertices], exact.p, rtol=0, atol=rounding)
+    np.testing.assert_allclose(normals, exact.n[: len(normals)], rtol=0, atol=ROUNDING / 1e-3)
     np.testing.assert_array_equal(positions, positions[table.weld_target])
     assert np.array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
 
@@ -109,18 +110,11 @@ def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
     assert found.surface_vertex is not None
     np.testing.assert_array_equal(found.surface_vertex[found.triangles], table.triangles)
     corner, uv = table.grid.triangle_locations
-    first = surface.patches.elements.face_offsets[table.element]
+    element = table.element.repeat(3)
+    places = element, uv.reshape(-1, 2), corner.repeat(3) - surface.patches.elements.face_offsets[element]
     for name, values in found.values.items():
-        for i in range(3):
-            expected = surface.evaluate_attribute(name, table.element, uv[:, i], corner - first)
-            np.testing.assert_allclose(values[found.triangles[:, i]], expected, rtol=0, atol=ROUNDING)
-
-
-def test_the_same_cage_has_the_same_triangles():
-    cage = bumpy(torus(5, 4))
-    first, second = (table_of(LimitSurface(bumpy(torus(5, 4)))) for _ in range(2))
-    np.testing.assert_array_equal(first.triangles, second.triangles)
-    np.testing.assert_array_equal(*(each.apply(cage.positions)[0] for each in (first, second)))
+        expected = surface.evaluate_attribute(name, *places)
+        np.testing.assert_allclose(values[found.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
 
 
 def with_a_diagonal_twice():
@@ -166,30 +160,6 @@ def test_elements_that_meet_twice_have_no_edge_twice(cage, scheme, is_open):
     assert_vertices_lie_where_triangles_say(surface, table)
 
 
-# Random cages of whole elements, of which some meet twice: of three corners, and of four.
-@pytest.mark.parametrize("seed", [82, 115, 19, 114, 468])
-def test_elements_meet_twice_if_something_else_connects_two_of_their_corners(seed):
-    """Every edge of the mesh connects its ends once, and so does every diagonal of an element of four corners."""
-    with without_warnings():
-        surface = LimitSurface(*random_cage(np.random.default_rng(seed)))
-    frames, t = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex), surface.patches.elements
-    connections, of_face = defaultdict(set), defaultdict(set)
-    for half_edge, face in enumerate(t.face):
-        following = t.next[half_edge]
-        ways = [(("edge", t.edge[half_edge]), following)]
-        if t.face_sizes[face] == 4:
-            opposite = t.next[following]
-            ways.append((("diagonal", min(half_edge, opposite)), opposite))
-        for way, end in ways:
-            ends = frozenset(t.face_vertices[[half_edge, end]])
-            connections[ends].add(way)
-            of_face[face].add(ends)
-    expected = [any(len(ends) == 1 or len(connections[ends]) > 1 for ends in of_face[face]) for face in of_face]
-    np.testing.assert_array_equal(adaptive_grid._meets_twice(frames), expected)
-    assert frames.is_whole.all()
-    assert any(expected)
-
-
 def test_a_surface_may_be_a_curve():
     cage = cube()
     surface = LimitSurface(cage.with_positions(cage.positions * [1, 0, 0]))
@@ -198,7 +168,8 @@ def test_a_surface_may_be_a_curve():
     assert_elements_are_covered(surface, table)
 
 
-@pytest.mark.parametrize("seed", range(30))
+# In the last five, some whole elements meet twice: of three corners, and of four.
+@pytest.mark.parametrize("seed", [*range(30), 82, 115, 19, 114, 468])
 def test_any_cage_has_an_adaptive_tessellation(seed):
     """Without cracks wherever the uniform one has none, whatever the cage: not manifold, folded, cut or collapsed."""
     with warnings.catch_warnings():
@@ -245,3 +216,51 @@ def test_a_surface_folded_in_its_plane_is_covered(name):
     table, dense = table_of(surface, error, 1024), surface.tessellate(12).positions
     reached = distances_to(table.apply(surface.cage.positions)[0][table.triangles], dense).max()
     assert reached <= error * size_of(surface) * (1 + ROUNDING)
+
+
+def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
+    """And no block has more patches than it may: a class at its end is cut."""
+    surface, most, sizes = surface_named("rook"), 7, []
+    whole = table_of(surface, 1e-2, 64).triangles
+    whole_patches = adaptive._whole_patches
+
+    def counted(*arguments):
+        for part in whole_patches(*arguments):
+            sizes.append(len(part.tiles))
+            yield part
+
+    monkeypatch.setattr(adaptive, "MOST_WAITING", 2 * most)
+    monkeypatch.setattr(adaptive, "TILES_AT_ONCE", most)
+    monkeypatch.setattr(adaptive, "_whole_patches", counted)
+    np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)
+    assert max(sizes) == most
+    assert sum(sizes) == surface.patches.patch_count
+
+
+def test_tessellations_do_not_depend_on_the_chunks_that_fit_a_cache(monkeypatch):
+    named = surface_named("mixed torus")
+    tables = []
+    for length in (ragged.CHUNK_LENGTH, 5):
+        monkeypatch.setattr(ragged, "CHUNK_LENGTH", length)
+        # Tables of its own: a surface keeps what it has made.
+        surface = LimitSurface(named.cage, named.scheme)
+        adaptive, uniform = table_of(surface), surface.sampling(3)
+        vertices = *adaptive.apply(named.cage.positions), *uniform.apply(named.cage.positions)
+        places = *adaptive.locations(), *adaptive.grid.triangle_locations
+        tables.append([adaptive.triangles, adaptive.element, uniform.triangles, *vertices, *places])
+    assert len(tables[0][0]) > 100
+    for whole, cut in zip(*tables, strict=True):
+        np.testing.assert_array_equal(whole, cut)
+
+
+def test_too_many_triangles_are_refused_before_most_tiles_are_looked_at(monkeypatch):
+    surface, seen, decided = surface_named("rook"), [], adaptive.TileRates.decided
+
+    def counted(rates, part):
+        seen.append(len(part.tiles))
+        return decided(rates, part)
+
+    monkeypatch.setattr(adaptive.TileRates, "decided", counted)
+    with pytest.raises(MemoryError, match="expected a larger error"):
+        surface.adaptive_sampling(Criterion(Measure.EDGE, 1e-9), 1024)
+    assert sum(seen) < 10 * surface.patches.patch_count

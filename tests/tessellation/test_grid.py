@@ -38,7 +38,7 @@ def test_triangles_around_each_vertex_are_one_fan(scheme, name):
 
 
 @EVERY_SURFACE
-def test_sizes_have_their_formulas_and_every_vertex_is_used(scheme, name):
+def test_sizes_have_their_formulas_and_every_vertex_is_used_by_the_elements_around_it(scheme, name):
     """From these it follows that the Euler characteristic is that of the cage."""
     for rate in RATES:
         grid = grid_of(scheme, name, rate)
@@ -46,29 +46,21 @@ def test_sizes_have_their_formulas_and_every_vertex_is_used(scheme, name):
         inner, triangles = [], []
         for size in t.face_sizes.tolist():
             if scheme == "loop":
-                inner.append((rate - 1) * (rate - 2) // 2)
-                triangles.append(rate**2)
+                counts = (rate - 1) * (rate - 2) // 2, rate**2
             elif size == 4:
-                inner.append((rate - 1) ** 2)
-                triangles.append(2 * rate**2)
+                counts = (rate - 1) ** 2, 2 * rate**2
             elif rate % 2 == 0:
-                inner.append(size * half * (half - 1) + 1)
-                triangles.append(size * 2 * half**2)
+                counts = size * half * (half - 1) + 1, size * 2 * half**2
             else:
-                inner.append(size * half**2 + 1)
-                triangles.append(size * (2 * half**2 + 2 * half + 1))
+                counts = size * half**2 + 1, size * (2 * half**2 + 2 * half + 1)
+            inner.append(counts[0])
+            triangles.append(counts[1])
         assert grid.vertex_count == t.vertex_count + (rate - 1) * t.edge_count + sum(inner)
         np.testing.assert_array_equal(np.unique(grid.triangles()), np.arange(grid.vertex_count))
         np.testing.assert_array_equal(grid.element(), np.repeat(np.arange(t.face_count), triangles))
         assert len(grid.triangles()) == sum(triangles)
         assert grid.triangles().dtype == grid.element().dtype == np.uint32
-
-
-@EVERY_SURFACE
-def test_elements_meet_in_the_vertices_of_their_common_edges_only(scheme, name):
-    for rate in RATES:
-        grid = grid_of(scheme, name, rate)
-        t = grid.topology
+        # Elements meet in the vertices of their common edges only.
         owners = [set() for _ in range(grid.vertex_count)]
         for vertices, element in zip(grid.triangles().tolist(), grid.element().tolist(), strict=True):
             for vertex in vertices:
@@ -83,39 +75,6 @@ def test_elements_meet_in_the_vertices_of_their_common_edges_only(scheme, name):
                 assert len(elements) == 1
 
 
-def layouts(grid):
-    """Corners, samples and parts of the elements of each size; whole ones are at one of their corners, in turn."""
-    t = grid.topology
-    for size in np.unique(t.face_sizes[t.face_sizes > 0]):
-        faces = np.flatnonzero(t.face_sizes == size)
-        is_whole = size == grid.whole_size
-        corners = t.face_offsets[faces] + faces % size if is_whole else np.flatnonzero(t.face_sizes[t.face] == size)
-        yield corners, *grid.layout(corners)
-
-
-def vertices_of_parts(grid):
-    return sorted(np.concatenate([part.vertices.ravel() for *_, parts in layouts(grid) for part in parts]).tolist())
-
-
-@EVERY_SURFACE
-def test_parts_hold_every_vertex_once_and_agree_on_where_it_is(scheme, name):
-    """Samples lie on the lattice of the rate, whichever corner they are counted from."""
-    for rate in (1, 2, 3, 4, 5, 7, 8):
-        grid = grid_of(scheme, name, rate)
-        assert vertices_of_parts(grid) == list(range(grid.vertex_count))
-        t, domain = grid.topology, scheme_named(scheme).domain
-        for corners, sample_uv, parts in layouts(grid):
-            for part in parts:
-                assert (np.diff(part.patches) > 0).all()
-                assert len(part.patches) == len(part.first_vertex) == len(part.corners)
-                assert (t.face[part.corners] == t.face[corners[part.patches]]).all()
-                turns = (part.corners - corners[part.patches]) % t.face_sizes[t.face[part.corners]]
-                for turn in np.unique(turns):
-                    # Parts of polygons' corners are counted from the patch's own corner.
-                    expected = domain.rotation(int(turn))(part.uv) if turn else part.uv
-                    np.testing.assert_allclose(sample_uv[part.samples], expected, atol=1e-15)
-
-
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 @pytest.mark.parametrize("rate", [1, 2, 5])
 def test_faces_without_corners_leave_nothing_behind(scheme, rate):
@@ -127,4 +86,3 @@ def test_faces_without_corners_leave_nothing_behind(scheme, rate):
     grid = (TriangleGrid if scheme == "loop" else QuadGrid)(Topology(t.vertex_count, sizes, kept), rate)
     np.testing.assert_array_equal(np.unique(grid.triangles()), np.arange(grid.vertex_count))
     assert not np.isin(at_vertex, grid.element()).any()
-    assert vertices_of_parts(grid) == list(range(grid.vertex_count))

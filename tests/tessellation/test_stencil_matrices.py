@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, LimitSurface
-from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.tessellation import Criterion, Measure
 from patches.closed_cages import bumpy, cage_of, mixed_torus
 from peers.fidelity_cages import SURFACES
@@ -69,9 +68,8 @@ def tessellation(request, monkeypatch):
         refine_first(monkeypatch)
     surface = surface_of_case(case)
     assert (surface.patches.refined is not None) == (kind == "refined once")
-    return surface, surface.adaptive_sampling(
-        Criterion(Measure.CHORD, 0.1)
-    ) if kind == "adaptive" else surface.sampling(3)
+    is_adaptive = kind == "adaptive"
+    return surface, surface.adaptive_sampling(Criterion(Measure.CHORD, 0.1)) if is_adaptive else surface.sampling(3)
 
 
 def some_samples(surface, rng, count=300):
@@ -82,6 +80,12 @@ def some_samples(surface, rng, count=300):
     if surface.scheme.domain.corner_count == 3:
         uv = np.where(uv.sum(axis=1, keepdims=True) > 1, 1 - uv, uv)
     return element, uv, rng.integers(0, sizes[element])
+
+
+def assert_rows_sum_as_those_of_points_and_derivatives(points, *derivatives):
+    np.testing.assert_allclose(points.sum(axis=1), 1, atol=ROUNDING)
+    for matrix in derivatives:
+        np.testing.assert_allclose(matrix.sum(axis=1), 0, atol=10 * ROUNDING)
 
 
 def test_vertices_of_a_tessellation_are_a_matrix_times_control_points(tessellation):
@@ -95,6 +99,7 @@ def test_vertices_of_a_tessellation_are_a_matrix_times_control_points(tessellati
     crosses = np.cross(*tangents)[has_normal]
     found = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
     np.testing.assert_allclose(found, normals[has_normal], atol=NORMAL)
+    assert_rows_sum_as_those_of_points_and_derivatives(*matrices)
 
 
 def test_a_rate_stands_for_its_table(surface):
@@ -105,20 +110,13 @@ def test_a_rate_stands_for_its_table(surface):
 def test_samples_are_a_matrix_times_control_points(surface, np_rng):
     samples = some_samples(surface, np_rng)
     expected = surface.evaluate(*samples, derivatives=2)
+    matrices = surface.matrix(*samples, derivatives=2)
+    assert_rows_sum_as_those_of_points_and_derivatives(*matrices[:3])
     # Also in which of them are no numbers.
-    for name, matrix in surface.matrix(*samples, derivatives=2)._asdict().items():
+    for name, matrix in matrices._asdict().items():
         rtol, atol = (SECOND, SECOND) if name.startswith("d2p") else (ROUNDING, 10 * ROUNDING)
         found = matrix @ surface.cage.positions
         np.testing.assert_allclose(found, getattr(expected, name), rtol=rtol, atol=atol, err_msg=name)
-
-
-def test_rows_of_points_sum_to_one_and_of_derivatives_to_zero(tessellation, np_rng):
-    surface, table = tessellation
-    of_samples = surface.matrix(*some_samples(surface, np_rng))
-    for points, *derivatives in (surface.tessellation_matrix(table), of_samples[:3]):
-        np.testing.assert_allclose(points.sum(axis=1), 1, atol=ROUNDING)
-        for matrix in derivatives:
-            np.testing.assert_allclose(matrix.sum(axis=1), 0, atol=10 * ROUNDING)
 
 
 def test_matrices_are_in_canonical_form_and_sparse():
@@ -128,10 +126,7 @@ def test_matrices_are_in_canonical_form_and_sparse():
         assert matrix.has_canonical_format
         assert (matrix.data != 0).all()
         assert np.diff(matrix.indptr).max() < 40
-
-
-def test_second_derivatives_are_there_when_asked_for():
-    surface = LimitSurface(named_cages.cube())
+    # Second derivatives are there when asked for.
     assert surface.matrix(0, [[0.5, 0.5]]).d2p_duu is None
     with pytest.raises(ValueError, match="derivatives 3; expected 1 or 2"):
         surface.matrix(0, [[0.5, 0.5]], derivatives=3)

@@ -45,27 +45,22 @@ class DividedTile:
         turn: int,
     ) -> None:
         self._scheme, self._source, self._turn = scheme, source, turn
+        self._bernstein = regular_bernstein(scheme).basis
         self.is_piece = source is None
         # Whether the tile has an extraordinary point at a corner, so that one child equals the tile.
         self.is_self_similar = isinstance(source, IrregularPatch)
-
-    @cached_property
-    def control_points(self) -> FloatArray:
-        """``(n, K)`` stencils of the control points of the one-ring, or of a piece, over the tile's control points."""
-        if self._source is None:
-            return np.eye(len(regular_bernstein(self._scheme).basis.indices))
-        return (
-            self._source.basis.vectors
-            if isinstance(self._source, IrregularPatch)
-            else np.eye(self._source.control_count)
-        )
+        # (n, K) stencils of the control points of the one-ring, or of a piece, over the tile's control points.
+        if isinstance(source, IrregularPatch):
+            self.control_points: FloatArray = source.basis.vectors
+        else:
+            self.control_points = np.eye(len(self._bernstein.indices) if source is None else source.control_count)
 
     @cached_property
     def children(self) -> tuple[tuple[DividedTile, FloatArray], ...]:
         """The children, in the order of `ParameterDomain.children`, as returned by `part_of_tile`."""
         scheme, source, turn = self._scheme, self._source, self._turn
         if source is None:
-            return tuple((self, rows) for rows in regular_bernstein(scheme).basis.halves)
+            return tuple((self, rows) for rows in self._bernstein.halves)
         if isinstance(source, PatchTree):
             return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
         # The same tile at the next level, and three pieces.
@@ -78,15 +73,12 @@ class DividedTile:
         """``(m, K)`` stencils of the surface points at the tile's corners."""
         identity = np.eye(self.control_points.shape[1])
         if self.is_piece:
-            return identity[regular_bernstein(self._scheme).basis.corners]
-        # The first eigen-coordinate is the extraordinary point.
-        children = self.children[: self._scheme.domain.corner_count]
-        return np.array(
-            [
-                identity[0] if tile is self else (tile.corners @ rows)[number]
-                for number, (tile, rows) in enumerate(children)
-            ]
-        )
+            return identity[self._bernstein.corners]
+        corners = []
+        for number, (tile, rows) in enumerate(self.children[: self._scheme.domain.corner_count]):
+            # The first eigen-coordinate is the extraordinary point.
+            corners.append(identity[0] if tile is self else (tile.corners @ rows)[number])
+        return np.array(corners)
 
     @cached_property
     def control_faces(self) -> IntArray:
@@ -120,7 +112,7 @@ class DividedTile:
         pieces, rest = self._divided(DIVISIONS_OF_NORMALS)
         if not all(tile.is_self_similar for tile, _ in rest):
             return None
-        tangents: FloatArray = np.tensordot(regular_bernstein(self._scheme).basis.derivatives, np.stack(pieces), (2, 1))
+        tangents: FloatArray = np.tensordot(self._bernstein.derivatives, np.stack(pieces), (2, 1))
         return tangents
 
     @cached_property
@@ -162,7 +154,7 @@ class DividedTile:
         """
         identity, m = np.eye(self.control_points.shape[1]), self._scheme.domain.corner_count
         if self.is_piece:
-            return [identity if side is None else identity[regular_bernstein(self._scheme).basis.sides[side]]], []
+            return [identity if side is None else identity[self._bernstein.sides[side]]], []
         if not divisions:
             return [], [(self, identity)]
         # The children at the corners come first; those at the ends of a side cover it.
@@ -184,11 +176,7 @@ def part_of_tile(
 ) -> tuple[DividedTile, FloatArray]:
     """Return the tile of an element that is a part of a parent tile; equal tiles are the same object.
 
-    Returns
-    -------
-    tile : DividedTile
-    rows : (n, K) float64
-        Control points of the tile over those of the parent tile.
+    Also returns the tile's control points over those of the parent tile, (n, K) float64.
     """
     scheme, piece = element.scheme, element.piece
     if piece is None:

@@ -363,8 +363,7 @@ class AdaptiveGrid:
     def _seen(self, tile: IntArray, near: FloatArray, *points: FloatArray) -> tuple[IntArray, list[FloatArray]]:
         """Locate points in elements, from parameters ``(2, n)`` in patches.
 
-        Returns the corner of each element that is nearest to the parameters ``near``, and parameters ``(n, 2)`` in the
-        element, starting at that corner.
+        Returns the corners of the elements that are nearest to ``near``, and parameters ``(n, 2)`` that start there.
         """
         frames, corner = self.frames, self.tiles["corner"][tile]
         face, domain = frames.topology.face[corner], frames.domain
@@ -382,12 +381,7 @@ class AdaptiveGrid:
     def triangle_locations(self) -> tuple[IntArray, FloatArray]:
         """Locate the corners of triangles; computed at each call, as kernels keep the result.
 
-        Returns
-        -------
-        corner : (m,) int32
-            Corner of an element, a half-edge of `PatchTable.elements`.
-        uv : (m, 3, 2) float64
-            Parameters in the element, starting at that corner.
+        Returns a corner of an element, (m,) int32, and parameters in the element that start there, (m, 3, 2) float64.
         """
         tile, (_, samples) = self._tile(), self._parameters(slice(None))
         middle = in_patch(self.tiles, tile, np.full((2, len(tile)), 1 / self.frames.domain.corner_count))
@@ -443,21 +437,16 @@ def _meets_twice(frames: PatchFrames) -> NDArray[np.bool_]:
     Connections are edges, and diagonals of quadrilaterals, of any element.
     """
     t, m = frames.topology, frames.domain.corner_count
-    meets_twice = np.zeros(t.face_count, dtype=bool)
     whole = np.flatnonzero(frames.is_whole)
-    corners = t.face_offsets[whole] + np.arange(m, dtype=np.int32)[:, None]
-    # Each edge once, as one of its half-edges.
-    first = corners[t.edge_half_edge[t.edge[corners]] == corners]
-    second, twin = t.next[first], t.twin[first]
+    first = t.face_offsets[whole] + np.arange(m, dtype=np.int32)[:, None]
+    second, connection = t.next[first], t.edge[first]
     if m == 4:
-        first, second, twin = (
-            np.concatenate([edges, *ends])
-            for edges, ends in ((first, corners[:2]), (second, corners[2:]), (twin, corners[:2]))
-        )
+        second, connection = np.concatenate([second, first[2:]]), np.concatenate([connection, t.edge_count + first[:2]])
+        first = np.concatenate([first, first[:2]])
     ends = t.face_vertices[np.stack([first, second])].astype(np.int64)
     pairs = ends.min(axis=0) * t.vertex_count + ends.max(axis=0)
-    _, pair, counts = np.unique(pairs, return_inverse=True, return_counts=True)
-    is_double = (counts[pair] > 1) | (ends[0] == ends[1])
-    beside = np.concatenate([first[is_double], twin[is_double]])
-    meets_twice[t.face[beside[beside >= 0]]] = True
-    return meets_twice & frames.is_whole
+    _, once = np.unique(connection, return_index=True)
+    names, counts = np.unique(pairs.ravel()[once], return_counts=True)
+    meets_twice = np.zeros(t.face_count, dtype=bool)
+    meets_twice[whole] = ((counts[np.searchsorted(names, pairs)] > 1) | (ends[0] == ends[1])).any(axis=0)
+    return meets_twice
