@@ -101,7 +101,9 @@ class ElementWalk:
 
     def _nearest_side(self, u: Float, v: Float) -> tuple[Index, Float, Float]:
         """The nearest side of the domain, the signed distance from it, and the position along it."""
-        (depth, *depths), (t, *ts) = distances(self.domain, u, v), along_sides(self.domain, u, v)
+        depth, *depths = distances(self.domain, u, v)
+        # Positions run from the corner of the same number.
+        t, *ts = (u, v, 1 - (u + v)) if self.domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
         side = self.types.index(0)
         for k, (side_depth, side_t) in enumerate(zip(depths, ts, strict=True), start=1):
             is_nearer = side_depth < depth
@@ -193,11 +195,6 @@ class TriangleLocations:
 def distances(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
     """Signed distances of parameters from each side of a domain, positive inside."""
     return (v, 1 - (u + v), u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
-
-
-def along_sides(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
-    """Positions of parameters along each side of a domain, from the corner of the same number."""
-    return (u, v, 1 - (u + v)) if domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
 
 
 def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
