@@ -60,75 +60,6 @@ class View:
     mask: ArrayLike | None = None
 
 
-class Pictures:
-    """A scene with a subdivision surface, rendered in its views.
-
-    Raises ValueError if the variant has no derivatives, there are no views, a picture does not fit its film, or an
-    entry of ``scene`` has the shape's name.
-    """
-
-    def __init__(
-        self,
-        views: Sequence[View],
-        # What there is besides the surface: emitters, and the integrator if it is to be another one
-        scene: Mapping[str, Any],
-        shape: Mapping[str, Any],  # Parameters of the surface besides its cage
-        # Means over pixels of absolute or squared differences; or a function of a picture and the index of its view
-        loss: Loss,
-        spp: int,  # Samples of each pixel
-        edge_spp: int,  # Samples of outlines for each pixel, where the integrator has such
-    ) -> None:
-        if not mi.variant() or not dr.is_diff_v(mi.Float):
-            raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
-        if not views:
-            raise ValueError("no views: expected one at least")
-        if SHAPE in scene:
-            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
-        self._shape = {**DEFAULT_SHAPE, **shape}
-        self._scene = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
-        integrator = self._scene["integrator"]
-        if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
-            # Counts for derivatives, unless it has its own.
-            self._scene["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
-        self.sensors = [with_sample_count(view.sensor, spp) for view in views]
-        self._targets, self._masks = [], []
-        for index, (view, sensor) in enumerate(zip(views, self.sensors, strict=True)):
-            width, height = map(int, sensor.film().crop_size())
-            self._targets.append(_target(view.picture, (height, width), f"view {index}"))
-            self._masks.append(_mask(view.mask, (height, width), f"view {index}"))
-        if not callable(loss) and loss not in ("l1", "l2"):
-            raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
-        self._loss = loss
-
-    def load(
-        self,
-        cage: ControlCage,
-        halvings: int = 0,  # How often it was refined: its edges have half as many segments each time
-    ) -> None:
-        """Make the scene with a cage's surface."""
-        rate = max(1, self._shape["tessellation_rate"] >> halvings)
-        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}
-        self.scene = mi.load_dict({**self._scene, SHAPE: shape})
-        self.params = mi.traverse(self.scene)
-
-    def loss(self, values: Mapping[str, Any], seed: int) -> mi.TensorXf:
-        """The loss of all views at values of the scene's parameters, by their names.
-
-        It is one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
-        """
-        for name, value in values.items():
-            self.params[name] = value
-        self.params.update()
-        loss = self._loss if callable(self._loss) else self._difference
-        return loss_of_views(self.scene, self.params, loss, self.sensors, seed=seed, spp=0) / len(self.sensors)
-
-    def _difference(self, image: mi.TensorXf, view: int) -> mi.TensorXf:
-        difference = image - self._targets[view]
-        size = dr.square(difference) if self._loss == "l2" else dr.abs(difference)
-        mask = self._masks[view]
-        return dr.mean(size if mask is None else size * mask, axis=None)
-
-
 def with_sample_count(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sensor:
     """A sensor with a number of samples per pixel."""
     loaded = mi.load_dict(dict(sensor)) if isinstance(sensor, Mapping) else sensor
@@ -254,7 +185,7 @@ class CageFit(Fit):
         shape = {} if shape is None else dict(shape)
         if scheme is not None:
             shape["scheme"] = scheme
-        self._pictures = Pictures(views, scene, shape, loss, spp, edge_spp)
+        self._set_pictures(views, scene, shape, loss, spp, edge_spp)
         self._size = float(np.linalg.norm(np.ptp(cage.positions, axis=0)))
         self._learning_rate = Schedule.of(learning_rate, "learning_rate")
         self._smoothing, self._laplacian, self._seed = smoothing, laplacian, seed
@@ -272,13 +203,47 @@ class CageFit(Fit):
         self._others = mi.ad.Adam(lr=1.0)
         super().__init__(cage, scheme, refine, callbacks)
 
+    def _set_pictures(
+        self,
+        views: Sequence[View],
+        scene: Mapping[str, Any],
+        shape: Mapping[str, Any],
+        loss: Loss,
+        spp: int,
+        edge_spp: int,
+    ) -> None:
+        if not mi.variant() or not dr.is_diff_v(mi.Float):
+            raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
+        if not views:
+            raise ValueError("no views: expected one at least")
+        if SHAPE in scene:
+            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
+        if not callable(loss) and loss not in ("l1", "l2"):
+            raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
+        self._shape, self._loss = {**DEFAULT_SHAPE, **shape}, loss
+        self._entries = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
+        integrator = self._entries["integrator"]
+        if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
+            # Counts for derivatives, unless it has its own.
+            self._entries["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
+        self._sensors = [with_sample_count(view.sensor, spp) for view in views]
+        self._targets, self._masks = [], []
+        for index, (view, sensor) in enumerate(zip(views, self._sensors, strict=True)):
+            width, height = map(int, sensor.film().crop_size())
+            self._targets.append(_target(view.picture, (height, width), f"view {index}"))
+            self._masks.append(_mask(view.mask, (height, width), f"view {index}"))
+
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
         creases = self._creases
-        if creases is None:
-            self._pictures.load(start.cage)
-        else:
-            self._pictures.load(creases.refined, creases.highest)
+        cage, halvings = start.cage, 0
+        if creases is not None:
+            # Refined several times: its edges have half as many segments each time.
+            cage, halvings = creases.refined, creases.highest
             self._others[SHARPNESS] = upload(mi.Float, creases.initial)
+        rate = max(1, self._shape["tessellation_rate"] >> halvings)
+        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}
+        self._scene = mi.load_dict({**self._entries, SHAPE: shape})
+        self._params = mi.traverse(self._scene)
         self._steps: LargeSteps | None = None
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
@@ -288,15 +253,14 @@ class CageFit(Fit):
         flat = upload(mi.Float, positions)
         self._optimizer[U] = flat if self._steps is None else self._steps.to_differential(flat)
         self._initial_extent = self._extent()
-        params = self._pictures.params
         for name in self._other_names:
-            if name not in params:
-                raise ValueError(f'others has "{name}"; expected one of {", ".join(params.keys())}')
+            if name not in self._params:
+                raise ValueError(f'others has "{name}"; expected one of {", ".join(self._params.keys())}')
             if name.startswith(CAGE_VALUES) and creases is not None:
                 raise ValueError(f'others has "{name}", and sharp_edges are given; expected one of them')
             # An earlier start may have set it in the same size.
-            if name not in self._others or self._others[name].shape != params[name].shape:
-                self._others[name] = params[name]
+            if name not in self._others or self._others[name].shape != self._params[name].shape:
+                self._others[name] = self._params[name]
 
     def _follow(self, refinement: CageRefinement) -> None:
         if self._creases is not None:
@@ -344,7 +308,7 @@ class CageFit(Fit):
     @property
     def scene(self) -> mi.Scene:
         """The scene of the last step, with its surface."""
-        return self._pictures.scene
+        return self._scene
 
     def values(self) -> dict[str, Any]:
         """Current values of the other fitted parameters of the scene."""
@@ -359,7 +323,7 @@ class CageFit(Fit):
         points = self._points()
         moved = points if self._creases is None else self._creases.points(self._others[SHARPNESS], points)
         values = {CONTROL_POINTS: moved, **{name: self._others[name] for name in self._other_names}}
-        loss = self._pictures.loss(values, self._seed + number)
+        loss = self._loss_of_views(values, self._seed + number)
         total: Any = loss
         for name, term in self._regularizers.items():
             total += dr.opaque(mi.Float, self._weights[name](number)) * term(points)
@@ -380,6 +344,23 @@ class CageFit(Fit):
                 "one place; expected a smaller learning_rate, or smaller weights of regularizers"
             )
         return value
+
+    def _loss_of_views(self, values: Mapping[str, Any], seed: int) -> mi.TensorXf:
+        """The loss of all views at values of the scene's parameters, by their names.
+
+        It is one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
+        """
+        for name, value in values.items():
+            self._params[name] = value
+        self._params.update()
+        loss = self._loss if callable(self._loss) else self._difference
+        return loss_of_views(self._scene, self._params, loss, self._sensors, seed=seed, spp=0) / len(self._sensors)
+
+    def _difference(self, image: mi.TensorXf, view: int) -> mi.TensorXf:
+        difference = image - self._targets[view]
+        size = dr.square(difference) if self._loss == "l2" else dr.abs(difference)
+        mask = self._masks[view]
+        return dr.mean(size if mask is None else size * mask, axis=None)
 
     def _extent(self) -> float:
         """Diagonal of the box around the optimiser's variables: 0 where that around the control points is."""
