@@ -11,8 +11,7 @@ import pytest
 from mitsuba_subdivision.regression import ImageError
 from mitsuba_subdivision.regression.compare import compare, relmse
 from mitsuba_subdivision.regression.image import Image
-from mitsuba_subdivision.regression.tier_tests import compare_flip, flip_exposures, normal_angle
-from mitsuba_subdivision.regression.tiers import Status, Tolerances
+from mitsuba_subdivision.regression.tiers import Status, Tolerances, compare_flip, flip_exposures, normal_angle
 from regression.random_images import METADATA, SIZE, dome, random_image, truth
 
 LIMITS = Tolerances()
@@ -382,8 +381,7 @@ def test_a_black_reference_does_not_end_the_process():
     program = """
 import numpy as np
 from mitsuba_subdivision.regression.image import Image
-from mitsuba_subdivision.regression.tier_tests import compare_flip
-from mitsuba_subdivision.regression.tiers import Tolerances
+from mitsuba_subdivision.regression.tiers import Tolerances, compare_flip
 black, grey = (Image("grey", np.full((16, 16, 3), value)) for value in (0, 0.5))
 print([compare_flip(black, test, Tolerances()).status.value for test in (black, grey)])
 """

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .. import example_file
 from ..cage import ControlCage
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..regression.tier_tests import normal_angle
+from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence

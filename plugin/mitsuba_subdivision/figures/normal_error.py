@@ -15,7 +15,7 @@ from ..evaluation.equations import Evaluator
 from ..evaluation.patch_tree import irregular_patch
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
-from ..regression.tier_tests import normal_angle
+from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface

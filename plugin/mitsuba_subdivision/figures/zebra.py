@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..cage.named_cages import cube
 from ..regression.scene import render_pixels
-from ..regression.tier_tests import normal_angle
+from ..regression.tiers import normal_angle
 from ..surface import LimitSurface
 from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .own_cage import around_vertices, frame

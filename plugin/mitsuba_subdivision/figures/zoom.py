@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
-from ..regression.tier_tests import normal_angle
+from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface

@@ -15,7 +15,7 @@ pass
 part
     Some of an image's samples, rendered by one call of Mitsuba, so that progress can be shown in between.
 
-The modules `image`, `tiers`, `tier_tests`, `compare` and `report` do not use Mitsuba, so that they compare
+The modules `image`, `tiers`, `compare` and `report` do not use Mitsuba, so that they compare
 renders of any origin.
 """
 

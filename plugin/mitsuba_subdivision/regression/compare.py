@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 
 from . import ImageError
 from .image import Image
-from .tier_tests import compare_flip, compare_paired, compare_probes, compare_tiles, pixel_of_largest
-from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances
+from .tiers import (
+    DEFAULT_TIERS,
+    TIERS,
+    Status,
+    TierResult,
+    Tolerances,
+    compare_flip,
+    compare_paired,
+    compare_probes,
+    compare_tiles,
+    pixel_of_largest,
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from ..whole_file import write_text
 from . import ImageError
 from .compare import Comparison
 from .image import write_channels
-from .tier_tests import compare_flip, relative_difference
+from .tiers import compare_flip, relative_difference
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

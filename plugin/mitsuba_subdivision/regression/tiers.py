@@ -1,4 +1,7 @@
-"""The tiers of a comparison, their tolerances, and what they find."""
+"""The tiers of a comparison: their tolerances, results and tests.
+
+The tests compare geometry probes, the same samples, noise in tiles of several sizes, and what an eye sees.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ImageError
+from .image import Estimate, Image
 
-# Names, and what each compares. The functions are in `tier_tests`.
+__all__ = ["DEFAULT_TIERS", "TIERS", "Status", "TierResult", "Tolerances"]
+
+# Names, and what each compares.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
     "paired": "pixels from the same samples, which must be the same",
@@ -22,6 +28,27 @@ TIERS = {
 }
 # Noise makes FLIP's errors large. So this tier is left for images that no other tier can compare.
 DEFAULT_TIERS = ("probe", "paired", "tile")
+
+# The difference of a pixel that is darker than this part of the image's mean is taken relative to that part.
+DARK = 1e-3
+# Both images drew the same samples if these agree.
+_SAME_SAMPLES = ("variant", "filter", "paired")
+
+# Sides of the square tiles in pixels; None is the whole image. Small tiles find dents, large ones a change of colour.
+SCALES: tuple[int | None, ...] = (4, 8, 16, None)
+# Samples that a reference should have for each of the test's, so that its own noise hardly counts.
+REFERENCE_SAMPLES = 16
+# Events of a kind that a reference may miss by chance: it misses three expected ones in 5 % of all cases.
+MISSED_EVENTS = 3.0
+# Below it, the deviance is that of the normal distribution to one part in 10^5.
+_SMALL_EXCESS = 1e-5
+
+# ACES tone curve (a x^2 + b x + c) / (d x^2 + e x + f), as in FLIP, and the value that limits its exposures.
+_ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.0, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
+_ACES_LIMIT = 0.85
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+# Stops between the brightest and the median pixel at most: more would take time and show nothing new.
+_MOST_STOPS = 12
 
 
 class Status(Enum):
@@ -109,3 +136,330 @@ class Tolerances:
 
     def as_dict(self) -> dict[str, float]:
         return asdict(self)
+
+
+def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
+    """Row and column of the largest value of a map ``(height, width)``."""
+    row, column = np.unravel_index(np.argmax(values), values.shape)
+    return int(row), int(column)
+
+
+def _skipped(name: str, reason: str) -> TierResult:
+    return TierResult(name, Status.SKIPPED, [reason])
+
+
+def _skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
+    """Result of a tier that needs data of both images that at least one of them lacks."""
+    lacking = "images have" if reference is test is None else "reference has" if reference is None else "test has"
+    return _skipped(name, f"the {lacking} no {what}")
+
+
+def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolerances) -> TierResult:
+    """Compare the geometry probes of two images.
+
+    Normals, points and parameters are compared away from silhouettes. At a silhouette, where a pixel or one of its
+    eight neighbours hits another shape than its own neighbours or than the other probe, rounding decides what is hit.
+    Other triangles of the same surface are only a warning, since a mesh may be numbered in another order.
+    """
+    from scipy.ndimage import binary_dilation, generate_binary_structure, morphological_gradient
+
+    reference, test = reference_image.probe, test_image.probe
+    if reference is None or test is None:
+        return _skipped_without("probe", reference, test, "geometry probe (channels P, Ns, uv, prim)")
+    pixels = reference.shape.size
+    both = reference.hit & test.hit
+    other_shape = reference.shape != test.shape
+    shapes = np.stack([reference.shape, test.shape])
+    # Pixels beside, above or below a pixel that hits another shape; then these and their eight neighbours.
+    cross = generate_binary_structure(2, 1)[None]
+    edges = (morphological_gradient(shapes, footprint=cross, mode="nearest") > 0).any(axis=0) | other_shape
+    inside = both & ~binary_dilation(edges, generate_binary_structure(2, 2))
+    same_triangle = inside & (reference.triangle == test.triangle)
+    other_element = inside & (reference.element != test.element)
+
+    angle = np.where(both, normal_angle(reference.normal, test.normal), 0)
+    points = reference.position[reference.hit].astype(np.float64)
+    diagonal = (float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0) or 1.0
+    distance = np.linalg.norm(reference.position.astype(float) - test.position, axis=-1) / diagonal
+    parameters = np.abs(reference.uv.astype(float) - test.uv).max(axis=-1)
+    other_triangle = float((inside & ~same_triangle).sum() / pixels)
+
+    numbers = {
+        "mask_fraction": float(other_shape.sum() / pixels),
+        "element_fraction": float(other_element.sum() / pixels),
+        "angle_p999": _percentile(angle[inside]),
+        "angle_max": float(angle[inside].max(initial=0)),
+        "position": float(distance[inside].max(initial=0)),
+        "uv_p999": _percentile(parameters[same_triangle]),
+        "triangle_fraction": other_triangle,
+    }
+    # Each measurement's name, limit, text, and value at each pixel.
+    criteria = [
+        ("mask_fraction", tolerances.mask_fraction, "of the pixels hit another shape", other_shape),
+        ("element_fraction", tolerances.mask_fraction, "of the pixels hit another element", other_element),
+        ("angle_p999", tolerances.angle_p999, "degrees between normals, 99.9th percentile", angle * inside),
+        ("angle_max", tolerances.angle_max, "degrees between normals, maximum", angle * inside),
+        ("position", tolerances.position, f"of the diagonal {diagonal:.4g} between hit points", distance * inside),
+        ("uv_p999", tolerances.uv_p999, "between surface parameters, 99.9th percentile", parameters * same_triangle),
+    ]
+    broken = [criterion for criterion in criteria if not numbers[criterion[0]] <= criterion[1]]
+    worst, status = None, Status.PASS
+    lines = [
+        f"same shapes and elements, normals within {numbers['angle_max']:.2g} degrees, "
+        f"points within {numbers['position']:.2g} of the diagonal"
+    ]
+    if broken:
+        status, worst = Status.FAIL, pixel_of_largest(np.nan_to_num(broken[0][3], nan=np.inf))
+        lines = [f"{numbers[name]:.3g} {what}; at most {limit:.3g} expected" for name, limit, what, _ in broken]
+    elif other_triangle > tolerances.mask_fraction:
+        status = Status.WARN
+        lines = [f"{other_triangle:.3g} of the pixels hit another triangle of the same element"]
+    return TierResult("probe", status, lines, numbers, worst, {"angle": np.where(inside, angle, np.nan)})
+
+
+def normal_angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Angle in degrees between unit vectors, accurate for tiny angles. Not a number where one of them is zero."""
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+        b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def _percentile(values: NDArray[np.floating]) -> float:
+    return float(np.percentile(values, 99.9)) if values.size else 0.0
+
+
+def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
+    """Compare the first batches of two images, which are drawn from the same samples.
+
+    Skipped, with the reason, where the samples are not the same. On another machine or with other versions of the
+    libraries, equal pixels still prove that nothing changed, but different ones prove nothing: the tier then warns.
+    """
+    if reference.paired is None or test.paired is None:
+        what = "first batch to pair (channels paired.R, paired.G, paired.B)"
+        return _skipped_without("paired", reference.paired, test.paired, what)
+    reason = _different_samples(reference, test)
+    if reason:
+        return _skipped("paired", reason)
+    difference = np.abs(test.paired - reference.paired)
+    size = np.maximum(np.abs(reference.paired), DARK * np.abs(reference.paired).mean())
+    relative = difference / np.where(size > 0, size, 1)
+    largest = float(relative.max())
+    changed = int((difference.max(axis=2) > 0).sum())
+    numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels": int(difference[..., 0].size)}
+    maps = {"paired": relative_difference(reference.paired, test.paired)}
+    if largest <= tolerances.paired_relative:
+        line = "the same bits" if changed == 0 else f"relative difference up to {largest:.2g}, in {changed} pixels"
+        return TierResult("paired", Status.PASS, [line], numbers, maps=maps)
+    line = (
+        f"same samples, but {changed} of {numbers['pixels']} pixels differ, by up to {largest:.3g} relative; "
+        f"at most {tolerances.paired_relative:.2g} expected"
+    )
+    result = TierResult("paired", Status.FAIL, [line], numbers, pixel_of_largest(relative.max(axis=2)), maps)
+    environment = _differences(reference.metadata.get("environment", {}), test.metadata.get("environment", {}))
+    if environment:
+        result.status = Status.WARN
+        result.lines.append(f"which may come from the environment: {'; '.join(environment)}")
+    return result
+
+
+def relative_difference(reference: NDArray[np.floating], test: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Map of the relative difference between two images, in the mean of R, G and B; less so where it is dark."""
+    grey = 0.01 * np.abs(reference).mean() + 1e-12
+    return (test.mean(axis=2) - reference.mean(axis=2)) / (np.abs(reference).mean(axis=2) + grey)
+
+
+def _different_samples(reference: Image, test: Image) -> str | None:
+    """Why the samples of two images are not the same, None if they are."""
+    for image, role in ((reference, "reference"), (test, "test")):
+        if "paired" not in image.metadata:
+            return f"the {role} does not say with which seed its first batch was rendered"
+    wanted, given = ({key: image.metadata.get(key) for key in _SAME_SAMPLES} for image in (reference, test))
+    different = _differences(wanted, given)
+    if different:
+        return f"the samples are not the same: {'; '.join(different)}"
+    if wanted["filter"] != "box":
+        return f'filter "{wanted["filter"]}" adds samples in any order; expected "box"'
+    return None
+
+
+def _differences(reference: dict[str, Any], test: dict[str, Any]) -> list[str]:
+    """One phrase for each entry of two dictionaries that is not the same."""
+    return [
+        f"{key} {_in_words(test.get(key))} here, {_in_words(reference.get(key))} in the reference"
+        for key in sorted({*reference, *test})
+        if reference.get(key) != test.get(key)
+    ]
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {entry}" for key, entry in value.items())
+    return "unknown" if value is None else str(value)
+
+
+def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
+    """Test each tile for whether noise alone explains its difference: two-sided tests, at several scales.
+
+    A tile's difference is the sum of many small contributions, and of a few large ones where bright paths are rare. The
+    small ones are normally distributed, with the variance that the reference measures. The large ones are rare events,
+    whose number is Poisson distributed: a single one in the test may lie many standard errors from the mean. The
+    variance between the test's batches tells them: k events where the reference expects l raise the variance k / l
+    times, but a change of the scene raises it little. `_z_scores` has the formulas.
+
+    Single precision adds a bias: the standard error has a floor for that. Šidák's correction covers the tiles and
+    channels of a scale, Bonferroni's the scales and the scenes of a suite, of which there are ``suite_size``.
+    """
+    expected, tested = reference.estimate, test.estimate
+    if expected is None or tested is None:
+        return _skipped_without("tile", expected, tested, "channels variance.R, .G, .B and N")
+    for estimate, role in ((expected, "reference"), (tested, "test")):
+        if estimate.batches < 2:
+            return _skipped("tile", f"the {role} has one batch only, which gives no variance")
+    from scipy.stats import norm
+
+    height, width, _ = expected.mean.shape
+    scales, failing, evidence = {}, [], {}
+    for scale in SCALES:
+        side = scale or max(height, width)
+        z = _z_scores(expected, tested, side, tolerances)
+        p = 2 * norm.sf(np.abs(z))
+        limit = float(-np.expm1(np.log1p(-tolerances.alpha / (len(SCALES) * suite_size)) / z.size))
+        places = np.argwhere(p < limit)
+        scales[str(scale or "whole")] = {
+            "smallest_p": float(p.min()),
+            "limit": limit,
+            "largest_z": float(np.abs(z).max()),
+            "failing": len(places),
+            "tests": int(z.size),
+        }
+        for row, column, channel in places:
+            x, y = side * int(column), side * int(row)
+            place = {"x": x, "y": y, "width": min(side, width - x), "height": min(side, height - y)}
+            failing.append({**place, "channel": "RGB"[channel], "z": float(z[row, column, channel])})
+        if scale:
+            smallest = (norm.logsf(np.abs(z)).min(axis=2) + np.log(2)) / -np.log(10)
+            evidence[p.min() / limit] = np.repeat(np.repeat(smallest, side, axis=0), side, axis=1)[:height, :width]
+
+    pixel_z = _z_scores(expected, tested, 1, tolerances)
+    strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
+    spp, reference_spp = (int(np.median(estimate.count)) for estimate in (tested, expected))
+    samples = f"{spp} samples per pixel against {reference_spp}"
+    result = TierResult(
+        "tile",
+        Status.FAIL if failing else Status.PASS,
+        [f"noise explains every tile ({samples})"],
+        {"scales": scales, "samples": spp, "failing": failing},
+        # Of the scale that shows the difference best, by its smallest probability in units of the limit.
+        maps={"z": strongest, "evidence": evidence[min(evidence)]},
+    )
+    if failing:
+        counts = ", ".join(
+            f"{scale['failing']} of {scale['tests']} at {'full size' if name == 'whole' else f'{name} x {name}'}"
+            for name, scale in scales.items()
+            if scale["failing"]
+        )
+        clearest = max(failing, key=lambda tile: abs(tile["z"]))
+        result.lines = [
+            f"not noise ({samples}); tests that fail: {counts}",
+            "clearest: {width} x {height} pixels at x = {x}, y = {y}, channel {channel}, z = {z:+.1f}".format(
+                **clearest
+            ),
+        ]
+        # The pixel to look at lies in the smallest tile that failed.
+        small = min(failing, key=lambda tile: (tile["width"] * tile["height"], -abs(tile["z"])))
+        x, y = small["x"], small["y"]
+        row, column = pixel_of_largest(np.abs(strongest[y : y + small["height"], x : x + small["width"]]))
+        result.worst = (y + row, x + column)
+    if reference_spp < REFERENCE_SAMPLES * spp:
+        result.lines.append(
+            f"the reference has less than {REFERENCE_SAMPLES} times the samples: its own noise hides small changes"
+        )
+    return result
+
+
+def _z_scores(reference: Estimate, test: Estimate, side: int, tolerances: Tolerances) -> NDArray[np.float64]:
+    """z-scores ``(rows, columns, 3)`` of the tiles of one size, reduced where rare events may explain the difference.
+
+    Let D be the difference of a tile's means, V its variance by the reference, and E what the variance of the test's
+    own mean has in excess of that. If both come of events of one size, that size is M = E / |D|, in units of D: the
+    reference expects V / M^2 of them and the test has D / M more. The deviance of the Poisson distribution then gives
+
+        z = D / sqrt(V) * sqrt(2 ((1 + u) log(1 + u) - u)) / u,    u = E / V,
+
+    which is D / sqrt(V) without an excess. The reference may have missed some: V gets `MISSED_EVENTS` of this size for
+    all its samples. Tiles at the right and lower border may be smaller.
+    """
+    area = _tile_sums(np.ones((*test.count.shape, 1)), side)
+
+    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return _tile_sums(values, side) / area
+
+    count, reference_count = test.count[..., None], reference.count[..., None]
+    difference = mean(test.mean - reference.mean)
+    floor = tolerances.floor_relative * np.abs(mean(reference.mean)) + tolerances.floor_absolute
+    variance = mean(reference.variance * (1 / count + 1 / reference_count)) / area + floor**2
+    excess = np.maximum(mean((test.variance - reference.variance) / count) / area, 0)
+    size = excess / np.where(difference == 0, np.inf, np.abs(difference))
+    variance += MISSED_EVENTS * mean(count / reference_count) * size**2
+    u = np.maximum(excess / variance, _SMALL_EXCESS)
+    return difference / np.sqrt(variance) * np.sqrt(2 * ((1 + u) * np.log1p(u) - u)) / u
+
+
+def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
+    """Sums of values ``(height, width, channels)`` over each tile."""
+    rows, columns = (np.arange(0, length, side) for length in values.shape[:2])
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+
+
+def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
+    """First and last exposure for FLIP, in stops, and the number of exposures, chosen from a reference.
+
+    FLIP would end the whole process at a black image. As in FLIP, the first and the last exposure map the brightest and
+    the median luminance to 0.85 of the tone curve.
+    """
+    a, b, c, d, e, f = _ACES
+    t = _ACES_LIMIT
+    bright = max(np.roots([a - t * d, b - t * e, c - t * f]).real)
+    luminance = np.maximum(pixels, 0) @ _LUMINANCE
+    brightest = float(luminance.max())
+    if not brightest > 0:
+        return 0.0, 1.0, 2
+    median = max(float(np.median(luminance)), brightest * 2.0**-_MOST_STOPS)
+    start, stop = float(np.log2(bright / brightest)), float(np.log2(bright / median))
+    stop = max(stop, start + 1)
+    return round(start, 3), round(stop, 3), max(2, int(np.ceil(stop - start)))
+
+
+def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
+    """Compare two converged images as an eye does that flips between them.
+
+    Raises ImageError if FLIP is not installed, or pixels are not finite, to which it gives good scores.
+    """
+    try:
+        import flip_evaluator
+    except ImportError:
+        raise ImageError("FLIP is not installed: pip install 'mitsuba-subdivision[figures]'") from None
+    if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
+        raise ImageError("FLIP does not see pixels that are not finite; expected finite images")
+    start, stop, count = flip_exposures(reference.pixels)
+    # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
+    arrays = [np.ascontiguousarray(np.maximum(image.pixels, 0), dtype=np.float32) for image in (reference, test)]
+    errors, _, _ = flip_evaluator.evaluate(
+        *arrays,
+        "HDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"},
+    )
+    errors = np.asarray(errors, dtype=np.float64)[..., 0]
+    mean, p95 = float(errors.mean()), float(np.percentile(errors, 95))
+    numbers = {"flip_mean": mean, "flip_p95": p95, "exposures": [start, stop, count]}
+    failed = mean > tolerances.flip_mean or p95 > tolerances.flip_p95
+    line = (
+        f"mean {mean:.2g}, 95th percentile {p95:.2g}; "
+        f"at most {tolerances.flip_mean:.2g} and {tolerances.flip_p95:.2g} expected"
+    )
+    worst = pixel_of_largest(errors) if failed else None
+    return TierResult("flip", Status.FAIL if failed else Status.PASS, [line], numbers, worst, {"flip": errors})
