@@ -11,8 +11,16 @@ from mitsuba_subdivision import ControlCage, LimitSurface, example_file
 from mitsuba_subdivision.__main__ import parser
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
 from mitsuba_subdivision.figures import FIGURES, FigureError, FigureOptions, peers
+from mitsuba_subdivision.figures.cages import (
+    INFINITE,
+    TITLES,
+    _tagged,
+    area_share,
+    extraordinary_count,
+    labels,
+    regular_elements,
+)
 from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence, refinement_step, sub_domain
-from mitsuba_subdivision.figures.creases import INFINITE, TITLES, _tagged, labels
 from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
 from mitsuba_subdivision.figures.normal_error import offset_cage
@@ -20,7 +28,6 @@ from mitsuba_subdivision.figures.output import write_figure
 from mitsuba_subdivision.figures.own_cage import around_vertices, frame
 from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
 from mitsuba_subdivision.figures.staging import project, visible
-from mitsuba_subdivision.figures.subdivision import area_share, extraordinary_count, regular_elements
 from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, normals_by, sample
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
@@ -51,7 +58,7 @@ def coarse(monkeypatch):
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
     monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     constants = {
-        "creases": {"RATE": 3},
+        "cages": {"CREASE_RATE": 3},
         "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
         "scenes": {"COLUMNS": 96, "ROWS": 96},
         "zebra": {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},

@@ -46,7 +46,9 @@ class Figure:
 
 
 FIGURES: dict[str, Figure] = {
-    "subdivision": Figure("subdivision.draw", "a cage and its refinements, irregular patches grey", ("spp", "cage")),
+    "subdivision": Figure(
+        "cages.draw_subdivision", "a cage and its refinements, irregular patches grey", ("spp", "cage")
+    ),
     "refinement": Figure(
         "characteristic.draw_refinement", "control points of a patch before and after one refinement", (), COLUMN
     ),
@@ -59,7 +61,7 @@ FIGURES: dict[str, Figure] = {
     "artifact": Figure("artifact.draw", "normals by (11), (12) and (13), rendered", ("spp", "scheme", "cage")),
     "error": Figure("normal_error.draw", "normal error against level by (11), (12), (13)", ("cage",)),
     "schemes": Figure("scenes.draw_schemes", "one cage under the three schemes", ("spp",)),
-    "creases": Figure("creases.draw", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
+    "creases": Figure("cages.draw_creases", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
     "shading": Figure("scenes.draw_shading", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     "displacement": Figure(
         "scenes.draw_displacement", "a jar before and after it is displaced, and its triangles", ("spp",)

@@ -17,11 +17,11 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
+from .cages import edge_curves
 from .characteristic import patch_of_valence
 from .output import FigureError, FigureOptions, panels, scientific, show, write_figure
 from .own_cage import around_vertices, frame
 from .staging import in_8_bits, load_stage, project, render, staged
-from .subdivision import edge_curves
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
 NEEDLE_RADIUS = 0.3

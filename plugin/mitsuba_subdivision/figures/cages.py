@@ -1,13 +1,15 @@
-"""Subdivision of a Catmull-Clark cage: irregular patches shrink, and the number of extraordinary points stays."""
+"""Figures of Catmull-Clark cages beside their limit surfaces: refinements of a cage, and creases of a chess piece."""
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from .. import example_file
@@ -15,9 +17,22 @@ from ..cage import ControlCage
 from ..evaluation.patch_tree import lattice_stencils
 from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
+from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
-from .own_cage import in_ball, read
-from .staging import load_stage, make_mesh, on_white, project, render, staged, visible, visible_runs
+from .own_cage import fitted, in_ball, read
+from .staging import (
+    edge_rods,
+    load_stage,
+    make_mesh,
+    on_white,
+    paint,
+    project,
+    render,
+    render_panels,
+    staged,
+    visible,
+    visible_runs,
+)
 
 LEVELS = 4
 # Of the ball that fills the picture, for cages of users.
@@ -28,8 +43,31 @@ EDGE_SEGMENTS = 24
 # Segments per edge of a patch of the last level, for its area and for the render of the limit surface.
 RATE = 6
 
+# Of the figure of creases.
+TITLES = {
+    "smooth": "smooth\ntags ignored",
+    "own": "semi-sharp\nthe cage's own tags",
+    "infinite": "infinitely sharp\nevery crease",
+}
+CAGE_TITLE = "control cage"
+# Height of the images, in widths.
+HEIGHT = 1.55
+CREASE_RATE = 24
+INFINITE = 10
+MATERIAL = {
+    "type": "principled",
+    "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]},
+    "roughness": 0.3,
+    "specular": 0.5,
+    "clearcoat": 0.6,
+    "clearcoat_gloss": 0.95,
+}
+# Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
+PALE = "#e4e4e1"
+EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
 
-def draw(options: FigureOptions) -> list[Path]:
+
+def draw_subdivision(options: FigureOptions) -> list[Path]:
     """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
     stage = load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(example_file("cages/propeller.obj"))]
@@ -56,7 +94,7 @@ def draw(options: FigureOptions) -> list[Path]:
         along = np.linspace(0, 1, (EDGE_SEGMENTS >> level) + 1)[None, :, None]
         lines = (1 - along) * ends[0][:, None] + along * ends[1][:, None]
         points = np.concatenate([cage.positions[_is_extraordinary(t)], _centres(cage)[t.face_sizes != 4]])
-        _draw(axis, scene, pixels, lines, points, 0.55 - 0.12 * level, options.resolution)
+        _draw_cage(axis, scene, pixels, lines, points, 0.55 - 0.12 * level, options.resolution)
         axis.set(title=f"level {level}", xlabel=f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
         rendered.append(pixels)
     options.report("limit surface")
@@ -66,7 +104,7 @@ def draw(options: FigureOptions) -> list[Path]:
     pixels = render(scene, options, "limit surface")
     lines = edge_curves(limit, t.edge_half_edge, EDGE_SEGMENTS >> (LEVELS - 1))
     points = edge_curves(limit, t.vertex_half_edge[_is_extraordinary(t)], 1)[:, 0]
-    _draw(axes[-1], scene, pixels, lines, points, 0.17, options.resolution)
+    _draw_cage(axes[-1], scene, pixels, lines, points, 0.17, options.resolution)
     axes[-1].set(title="limit surface", xlabel=f"regular but for {counts.pop()} points")
     rendered.append(pixels)
     return write_figure(options, "subdivision", figure, rendered, levels=LEVELS)
@@ -140,7 +178,7 @@ def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
     return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
 
 
-def _draw(
+def _draw_cage(
     axis: Axes,
     scene: mi.Scene,
     pixels: NDArray[np.float32],
@@ -157,3 +195,75 @@ def _draw(
     axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
     # The part of the square image that the surface fills.
     axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
+
+
+def draw_creases(options: FigureOptions) -> list[Path]:
+    """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
+    cage = ControlCage.from_file(example_file("cages/rook.obj"))
+    if options.cage:
+        cage = fitted(read(options.cage), cage.positions.min(axis=0), cage.positions.max(axis=0))
+        if not cage.tags.edges.any():
+            raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
+    stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
+    scenes = {CAGE_TITLE: staged(stage, **_cage_shapes(cage))}
+    for name, title in TITLES.items():
+        shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": CREASE_RATE}
+        scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
+    figure, axes = panels(options, *rows_of(options, len(scenes)))
+    rendered = render_panels(options, axes, scenes.items())
+    _draw_legend(axes[0, 0], cage)
+    return write_figure(options, "creases", figure, rendered, pictures=[CAGE_TITLE, *TITLES])
+
+
+def _tagged(cage: ControlCage, name: str) -> ControlCage:
+    """The cage without creases, with its own, or with all of them infinitely sharp, by a name in `TITLES`."""
+    if name == "own":
+        return cage
+    creases = cage.tags.creases(cage.topology)
+    creases[:, 2] = 0 if name == "smooth" else INFINITE
+    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, creases=creases)
+
+
+def _cage_shapes(cage: ControlCage) -> SceneNode:
+    """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
+    faces = np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1])
+    fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
+    # Each triangle has three vertices of its own, so that no normals are averaged.
+    positions = cage.positions[np.array(fans).ravel()]
+    shapes: SceneNode = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
+    topology, half_edges = cage.topology, cage.topology.edge_half_edge
+    ends = np.stack([topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]], axis=1)
+    sharpness = cage.tags.edges[half_edges]
+    looks = [EDGES[max(least for least in EDGES if least <= value)] for value in sharpness]
+    return shapes | edge_rods(cage, ends, sharpness, looks)
+
+
+def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
+    """Ranges of the sharpness of creases by their least values in `EDGES`."""
+    ends = [*EDGES, np.inf]
+    ranges = {}
+    for least, end in itertools.pairwise(ends):
+        values = np.unique(sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)])
+        if len(values):
+            ends_of_range = dict.fromkeys(f"{value:g}" for value in values[[0, -1]])
+            ranges[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends_of_range)
+    return ranges
+
+
+def _draw_legend(axis: Axes, cage: ControlCage) -> None:
+    """Draw the colours of sharpness below the cage."""
+    shown = labels(cage.tags.edges)
+    handles = [Line2D([], [], color=EDGES[least][0], linewidth=2, label=label) for least, label in shown.items()]
+    handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
+    legend = axis.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        ncols=len(handles),
+        handlelength=0.9,
+        handletextpad=0.3,
+        columnspacing=0.9,
+        borderaxespad=0.1,
+    )
+    # Captions of other panels reserve the room for it.
+    legend.set_in_layout(False)
