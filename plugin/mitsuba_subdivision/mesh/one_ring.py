@@ -79,14 +79,15 @@ class OneRing:
     def _arrived(self, topology: Topology, half_edges: NDArray[np.integer]) -> dict[Walk, NDArray[np.integer]]:
         """Return the half-edges where the walks to all faces end, and those on the way."""
         arrived = {(0, 0): half_edges}
+        for corner in range(self.faces[-1][0]):
+            arrived[corner + 1, 0] = topology.next[arrived[corner, 0]]
         for corner, turns in self.faces:
-            for before in range(corner):
-                if (before + 1, 0) not in arrived:
-                    arrived[before + 1, 0] = topology.next[arrived[before, 0]]
             step, turn = (1, topology.turn) if turns > 0 else (-1, topology.turn_back)
-            for turned in range(0, turns, step):
-                if (corner, turned + step) not in arrived:
-                    arrived[corner, turned + step] = turn(arrived[corner, turned])
+            known = turns
+            while (corner, known) not in arrived:
+                known -= step
+            for turned in range(known, turns, step):
+                arrived[corner, turned + step] = turn(arrived[corner, turned])
         return arrived
 
 
