@@ -23,6 +23,7 @@ from ..mesh.ragged import chunks_of
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 from .stitching import SideSamples, inner_counts, inner_steps, stitched
+from .uniform_grid import first_sides
 
 # Greatest depth of tiles around extraordinary points: single precision does not resolve smaller ones.
 DEEPEST = 24
@@ -66,13 +67,9 @@ class PatchFrames:
             has_copies = not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex)))
             if has_copies:
                 start = control_of_vertex.astype(np.int32)[start]
-            # Border edges with the same end points are the two sides of a crease.
-            ends = np.stack([start[border], start[t.next[border]]]).astype(np.int64)
-            pairs = ends.min(axis=0) * (int(control_of_vertex.max()) + 1) + ends.max(axis=0)
-            _, first, pair_index = np.unique(pairs, return_index=True, return_inverse=True)
-            edge[border] = border[first[pair_index]]
+            edge[border] = first_sides(t, border, start)
             is_backward[border] = start[border] != start[edge[border]]
-            has_copies |= len(first) < len(border)
+            has_copies |= bool((edge[border] != border).any())
         return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)
 
 

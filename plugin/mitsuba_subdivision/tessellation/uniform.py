@@ -15,7 +15,7 @@ from ..patches import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .memory import require_memory
 from .quad_grid import QuadGrid
-from .uniform_grid import GridPart, TriangleGrid, UniformGrid
+from .uniform_grid import GridPart, TriangleGrid, UniformGrid, first_sides
 from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
 
 # Most vertices of a tessellation: buffer sizes have 32 bits, and there are two triangles, of three indices, per vertex.
@@ -130,24 +130,10 @@ def _copies(patches: PatchTable, grid: UniformGrid, control_of_vertex: IntArray)
     first_copy[control_of_vertex[used]] = used
     later = used[first_copy[control_of_vertex[used]] != used]
     at_corners = grid.corner_vertex[np.stack([later, first_copy[control_of_vertex[later]]])]
-    return np.concatenate([at_corners, _copies_inside_edges(grid, border, control_of_vertex)], axis=1)
-
-
-def _copies_inside_edges(grid: UniformGrid, border: IntArray, control_of_vertex: IntArray) -> IntArray:
-    """Copies inside border edges that join the same control points, as the sides of a crease do.
-
-    The sides are two edges in opposite directions, or more where the cage is not a manifold. A crease of one edge
-    between darts has two sides as well, although its ends have no copies.
-    """
-    t = grid.topology
-    start, end = control_of_vertex[t.face_vertices[border]], control_of_vertex[t.face_vertices[t.next[border]]]
-    keys = np.minimum(start, end) * t.vertex_count + np.maximum(start, end)
-    order = np.argsort(keys, kind="stable")
-    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    first = np.repeat(order[begins], np.diff(begins, append=len(order)))
-    original, copy = first[first != order], order[first != order]
-    steps = np.arange(1, grid.rate)
-    originals = grid.along(border[original], steps)
-    is_reversed = (start[original] != start[copy])[:, None]
-    originals = np.where(is_reversed, originals[:, ::-1], originals)
-    return np.stack([grid.along(border[copy], steps), originals]).reshape(2, -1)
+    # A crease of one edge between darts has two sides, although its ends have no copies.
+    start, steps = control_of_vertex[t.face_vertices], np.arange(1, grid.rate)
+    original = first_sides(t, border, start)
+    copy, original = border[original != border], original[original != border]
+    originals = grid.along(original, steps)
+    originals = np.where((start[original] != start[copy])[:, None], originals[:, ::-1], originals)
+    return np.concatenate([at_corners, np.stack([grid.along(copy, steps), originals]).reshape(2, -1)], axis=1)

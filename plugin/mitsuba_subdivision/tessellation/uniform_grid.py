@@ -341,3 +341,15 @@ def slices_of(indices: IntArray, size: int) -> Iterator[IntArray]:
     length = max(1, VERTICES_AT_ONCE // size)
     for begin in range(0, len(indices), length):
         yield indices[begin : begin + length]
+
+
+def first_sides(topology: Topology, border: IntArray, start: IntArray) -> IntArray:
+    """The first of the half-edges ``border`` that join the same points as each of them, as the sides of a crease do.
+
+    ``start``, ``(n_h,)``, is the point at which half-edges begin. The sides run in opposite directions; there may be
+    more of them where the cage is not a manifold.
+    """
+    ends = np.stack([start[border], start[topology.next[border]]]).astype(np.int64)
+    pairs = ends.min(axis=0) * (int(start.max(initial=0)) + 1) + ends.max(axis=0)
+    _, first, pair = np.unique(pairs, return_index=True, return_inverse=True)
+    return border[first[pair]]
