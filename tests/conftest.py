@@ -44,6 +44,13 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _old_objects():
+    """Let the garbage collector leave what earlier modules have cached, which it takes half a second to visit."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_runtest_setup(item):
     is_alone = item.path.parent.name in IN_ONE_THREAD and not item.get_closest_marker("threads")
     # A picture that a test before still writes ends with a call of Python, for which Dr.Jit would wait for ever.
