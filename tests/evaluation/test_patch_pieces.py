@@ -51,27 +51,6 @@ def all_signatures():
 SIGNATURES = all_signatures()
 
 
-def test_pieces_cover_the_domain_once_and_lie_inside_and_stencils_sum_to_one():
-    uv = np.random.default_rng(1).random((200, 2))
-    for signature in SIGNATURES:
-        found = pieces(signature)
-        areas = [1 / np.linalg.det(piece.domain.matrix) for piece in found]
-        assert min(areas) > 0
-        assert sum(areas) == 1
-        inside = np.array([SQUARE.inside(piece.domain(uv)) for piece in found])
-        assert ((inside > 0).sum(axis=0) == 1).all()
-        count = one_ring(signature).vertex_count
-        for piece in found:
-            assert (SQUARE.inside(piece.domain.inverse()(SQUARE.corners)) >= 0).all()
-            sums = [piece.stencils.sum(axis=1)]
-            own = 16
-            if piece.patch is not None:
-                own = one_ring(piece.patch.signature).vertex_count
-                sums += [piece.patch.matrix.sum(axis=1), piece.patch.children.sum(axis=2).ravel()]
-            assert piece.stencils.shape == (own, count)
-            np.testing.assert_allclose(np.concatenate(sums), 1, rtol=0, atol=ROUNDING)
-
-
 def test_a_piece_has_at_most_one_extraordinary_point_at_its_origin_and_all_of_the_element_have_one():
     """They sit at corners of the element and, for a polygon's sub-quad, at the middle of the polygon."""
     corners = [tuple(corner) for corner in SQUARE.corners.tolist()]

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from mitsuba_subdivision.patches.one_ring_codes import FEW_CODES, row_codes
+from mitsuba_subdivision.patches.patch_table import FEW_CODES, row_codes
 
 
 @pytest.mark.parametrize("count", [1, 7, 500])

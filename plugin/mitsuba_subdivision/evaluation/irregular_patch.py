@@ -110,13 +110,6 @@ class IrregularPatch:
         """Whether one direction contracts more slowly than the other, as on borders."""
         return self.basis.moduli[2] < self.basis.moduli[1] * (1 - CLUSTER_WIDTH)
 
-    def coordinates(self, control_points: FloatArray, evaluator: Evaluator) -> FloatArray:
-        """Return what `rows` are multiplied by: control points C ``(.., K, 3)``, or eigen-coordinates ``V⁻¹ C``."""
-        if evaluator == "power":
-            return control_points
-        # Computed once for each element, so in double precision, and rounded once.
-        return (self.basis.inverse @ control_points).astype(control_points.dtype)
-
     def rows(
         self,
         uv: FloatArray,  # (s, 2) float64
@@ -124,7 +117,7 @@ class IrregularPatch:
         dtype: DTypeLike,  # Type of all arithmetic after the child's parameters
         derivatives: int = 1,
     ) -> SampleRows:
-        """Compute coefficients of samples over the `coordinates`.
+        """Compute coefficients of samples over the eigen-coordinates ``V⁻¹ C``, or for "power" the control points.
 
         At the extraordinary point itself, (4), (9) and second derivatives are undefined: NaN.
         """

@@ -19,7 +19,7 @@ from enum import IntEnum
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
@@ -180,26 +180,19 @@ class PatchTree:
         # (m, R) float64: maps the control points of a regular patch, in the order of the scheme's lattice, to
         # coefficients
         form: FloatArray,
-        dtype: DTypeLike = np.float64,  # Type of the result; sums are float64
-        # Cache of the children's coefficients by the same form. Sharing it among the elements of a cage saves
-        # half of the time. It is not kept by default, as these arrays are by far the largest.
+        # Cache of the coefficients of children, which many parts share. It is not kept, as these arrays are by far the
+        # largest.
         known: dict[PatchTree, FloatArray] | None = None,
-    ) -> NDArray[np.floating]:
+    ) -> FloatArray:
         """Compute coefficients of the regular pieces over the element's one-ring. Returns (r, m, K)."""
-        known = {} if known is None else known
-        coefficients = np.empty((self.regular_count, len(form), self.control_count), dtype=dtype)
-        if self.piece is not None:
-            coefficients[:] = form @ self.piece.stencils if len(coefficients) else 0
-            return coefficients
-        end = 0
-        for number, child in enumerate(self.child_elements):
+        if self.piece is not None and self.piece.patch is None:
+            return (form @ self.piece.stencils)[None]
+        known, coefficients = {} if known is None else known, [np.empty((0, len(form), self.control_count))]
+        for child, stencils in self.children:
             if child not in known:
-                known[child] = child.coefficients(form, np.float64, known)
-            child_coefficients = known[child]
-            begin, end = end, end + len(child_coefficients)
-            if len(child_coefficients):
-                coefficients[begin:end] = child_coefficients @ self.child(number)[1]
-        return coefficients
+                known[child] = child.coefficients(form, known)
+            coefficients.append(known[child] @ stencils)
+        return np.concatenate(coefficients)
 
 
 # The limit is several times the number of elements of a cage with some hundred classes of semi-sharp one-rings.
