@@ -6,8 +6,11 @@
     displacement.py          uses them as heights
 
 The parameter ``cage_NAME`` contains the control values of the attribute NAME, flat. The buffer ``vertex_NAME`` contains
-its values at the vertices of the tessellation: the product of a sparse weight matrix and the control values. In
-spectral variants, colours are stored as coefficients of spectra.
+its values at the vertices of the tessellation: the product of a sparse weight matrix and the control values.
+
+In spectral variants, Mitsuba's meshes store colours as coefficients of smooth spectra. Mitsuba looks them up in a table
+when an attribute is added to a mesh [Jakob and Hanika 2019]. Here they are looked up in kernels, because colours may
+change and be differentiated.
 """
 
 from __future__ import annotations
@@ -21,14 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from ..device_arrays import take_over
-from ..kernels.array_types import FloatBuffer
-from ..mesh.shared import SharedArray
+from ..device_arrays import take_over, upload
+from ..kernels.array_types import Float, FloatBuffer, Index, Mask, Value
+from ..mesh.shared import Shared, SharedArray
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
 from .device_state import is_recording
 from .parameter_table import errors_about
-from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
@@ -42,8 +44,13 @@ RESERVED = ("positions", "normals")
 # Numbers of components that Mitsuba's attribute lookups support.
 WIDTHS = (1, 3)
 
-# Callback for an attribute's name and the gradient by its values, after reverse mode has reached these.
-OnBackward = Callable[[str, FloatBuffer], None]
+TABLE = "data/srgb.coeff"
+# Sizes in bytes of the magic number at the beginning of the file, and of the resolution that follows.
+_MARK, _WORD = 4, 4
+# Last coefficient of the spectra of black and white; the others are zero.
+_BLACK, _WHITE = -8192.0, 8192.0
+# Lower bound of the largest component of a colour, by which the other components are divided.
+_DARKEST = 1e-6
 
 
 class CageAttributes:
@@ -60,7 +67,10 @@ class CageAttributes:
         variant: Variant,
         surface: LimitSurface,
         names: Iterable[str],  # Names of the attributes that `traverse` exposes
+        # Called with an attribute's name and the gradient by its values, after reverse mode has reached these
+        on_backward: Callable[[str, FloatBuffer], None],
     ) -> None:
+        self._on_backward = on_backward
         self._source = surface.cage.source.name
         self._float = variant.Float if dr.is_jit_v(variant.Float) else None
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
@@ -78,14 +88,15 @@ class CageAttributes:
             if holds_spectra(variant, mesh_name(name), channel.values.shape[1])
         }
         self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
-        self._followers: list[tuple[str, Callable[[FloatBuffer], None]]] = []
+        # Functions that take each new array of an attribute's values.
+        self._followers: dict[str, list[Callable[[FloatBuffer], None]]] = {}
         # Updated values of attributes, as watched for reverse-mode passes.
         self._moved: dict[str, FloatBuffer] = {}
         self._computed: dict[str, set[int]] = {}
 
     def add_follower(self, name: str, take: Callable[[FloatBuffer], None], *, moves: bool = False) -> None:
         """Call ``take`` with each new array of an attribute's values. ``moves``: whether these displace vertices."""
-        self._followers.append((name, take))
+        self._followers.setdefault(name, []).append(take)
         if moves:
             self.moving.add(f"{PREFIX}{name}")
 
@@ -104,7 +115,7 @@ class CageAttributes:
         self._locations = attributes.locate or table.locations
         self._weights: dict[tuple, Any] = {}
 
-    def update(self, keys: Iterable[str], on_backward: OnBackward) -> list[str]:
+    def update(self, keys: Iterable[str]) -> list[str]:
         """Apply the parameters of this object that are named in ``keys``.
 
         Returns list of str: names of the attributes. Raises ValueError if the number of values has changed, or one is
@@ -117,15 +128,15 @@ class CageAttributes:
         for name in names:
             values = self.values[f"{PREFIX}{name}"]
             self._computed[name] = computed_ones(values) if dr.grad_enabled(values) else set()
-            self._move(name, on_backward)
+            self._move(name)
         return names
 
-    def renew(self, name: str, gradient: FloatBuffer, on_backward: OnBackward) -> None:
+    def renew(self, name: str, gradient: FloatBuffer) -> None:
         """Attach an attribute's followers and buffers to its values again, after reverse mode has reached these."""
         lost = self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"])
         if lost and not is_recording() and dr.any(gradient != 0):
             warn_of_lost(self._source, f"{PREFIX}{name}")
-        self._move(name, on_backward)
+        self._move(name)
 
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
         """Mesh buffers of the given attributes, by default of all, by name of the buffer."""
@@ -174,14 +185,14 @@ class CageAttributes:
             self._weights[key] = weights
         return self._weights[key]
 
-    def _move(self, name: str, on_backward: OnBackward) -> None:
-        values = self.values[f"{PREFIX}{name}"]
+    def _move(self, name: str) -> None:
+        values, on_backward = self.values[f"{PREFIX}{name}"], self._on_backward
         if dr.grad_enabled(values):
+            # The operation, which these values keep alive, must not keep this object alive.
             values = dr.custom(Watched, {name: values}, lambda gradients: on_backward(name, gradients[name]))[name]
         self._moved[name] = values
-        for follower_name, take in self._followers:
-            if follower_name == name:
-                take(values)
+        for take in self._followers.get(name, ()):
+            take(values)
 
     def _require_values(self, name: str) -> None:
         values, (count, size) = self.values[f"{PREFIX}{name}"], self._channels[name].values.shape
@@ -217,3 +228,96 @@ def mesh_attributes(cage: ControlCage) -> dict[str, int]:
         else:
             sizes[name] = size
     return sizes
+
+
+def holds_spectra(variant: Variant, mesh_name: str, size: int) -> bool:
+    """Whether Mitsuba stores spectra for a mesh attribute of this name and number of components.
+
+    Mitsuba looks for "color" only; USD's "displayColor" is a colour, too.
+    """
+    return bool(variant.is_spectral) and size == 3 and "color" in mesh_name.lower()
+
+
+class SpectralUpsampling:
+    """Conversion of colours to coefficients of spectra, differentiable in JIT variants."""
+
+    @classmethod
+    def shared(cls, variant: Variant) -> SpectralUpsampling:
+        """The object of a variant, shared by its shapes while it is referenced."""
+        return _UPSAMPLING.get(variant, lambda: cls(variant))
+
+    def __init__(
+        self,
+        variant: Variant,  # Spectral variant
+    ) -> None:
+        self._variant = variant
+        if not dr.is_jit_v(variant.Float):
+            return
+        # Mitsuba's stub declares this function as an object.
+        file_resolver: Any = mi.file_resolver
+        with open(str(file_resolver().resolve(TABLE)), "rb") as file:
+            content = file.read()
+        self._resolution = size = int(np.frombuffer(content, "<u4", 1, _MARK)[0])
+        values = np.frombuffer(content, "<f4", size + 9 * size**3, _MARK + _WORD)
+        self._levels, self._table = (upload(variant.Float, array) for array in (values[:size], values[size:]))
+
+    def stored(self, colors: FloatBuffer) -> FloatBuffer:
+        """Convert a mesh's flat buffer of colours to a flat buffer of coefficients."""
+        variant = self._variant
+        if dr.is_jit_v(variant.Float):
+            return dr.ravel(variant.Color3f(self(dr.unravel(variant.Color3f, colors))))
+        mesh = variant.Mesh("", len(colors) // 3, 0)
+        mesh.add_attribute("vertex_color", 3, np.asarray(colors).tolist())
+        return np.array(mesh.attribute_buffer("vertex_color"))
+
+    def __call__(self, color: Value) -> Value:
+        """Convert colours to coefficients on the device."""
+        variant, last = self._variant, self._resolution - 1
+        r, g, b = (dr.clip(component, 0, 1) for component in color)
+        # The table has a part for each component that is the largest, or the last one of the largest.
+        is_blue = b >= dr.maximum(r, g)
+        is_green = ~is_blue & (g >= r)
+        largest = dr.maximum(dr.select(is_blue, b, dr.select(is_green, g, r)), _DARKEST)
+        first = dr.select(is_blue, r, dr.select(is_green, b, g)) * (last / largest)
+        second = dr.select(is_blue, g, dr.select(is_green, r, b)) * (last / largest)
+
+        index = variant.UInt32
+        x = dr.minimum(index(dr.detach(first)), last - 1)
+        y = dr.minimum(index(dr.detach(second)), last - 1)
+        z = self._interval(dr.detach(largest))
+        level = dr.gather(variant.Float, self._levels, z)
+        height = (largest - level) / (dr.gather(variant.Float, self._levels, z + 1) - level)
+        part = dr.select(is_blue, index(2), dr.select(is_green, index(1), index(0)))
+
+        def along_x(y: Index, z: Index) -> Value:
+            row = ((part * (last + 1) + z) * (last + 1) + y) * (last + 1) + x
+            begin, end = (dr.gather(variant.Color3f, self._table, row + i) for i in range(2))
+            return dr.lerp(begin, end, first - x)
+
+        def along_y(z: Index) -> Value:
+            return dr.lerp(along_x(y, z), along_x(y + 1, z), second - y)
+
+        coefficients = dr.lerp(along_y(z), along_y(z + 1), height)
+        # Greys have constant spectra with a closed form.
+        is_grey = (r == g) & (g == b)
+        grey = dr.replace_grad(self._grey(dr.detach(b)), coefficients)  # type: ignore[func-returns-value]  # The stub is wrong.
+        return dr.select(is_grey, grey, coefficients)
+
+    def _interval(self, largest: Float) -> Index:
+        """Index of the last level that is not above ``largest``."""
+        last = self._resolution - 1
+
+        def is_above(level: Index) -> Mask:
+            return dr.gather(self._variant.Float, self._levels, level) <= largest
+
+        return dr.binary_search(1, last, is_above) - 1
+
+    def _grey(self, value: Float) -> Value:
+        is_inside = (value > 0) & (value < 1)
+        clamped = dr.select(is_inside, value, 0.5)
+        constant = dr.select(is_inside, (clamped - 0.5) / dr.sqrt(clamped * (1 - clamped)), 0)
+        constant = dr.select(value <= 0, _BLACK, dr.select(value >= 1, _WHITE, constant))
+        return self._variant.Color3f(0, 0, constant)
+
+
+_UPSAMPLING: Shared[SpectralUpsampling] = Shared()

@@ -25,9 +25,8 @@ from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
 from ..variants import Variant
-from .cage_attributes import WIDTHS, mesh_name
+from .cage_attributes import WIDTHS, SpectralUpsampling, holds_spectra, mesh_name
 from .placement import Placement
-from .spectral_colors import SpectralUpsampling, holds_spectra
 
 if TYPE_CHECKING:
     from ..tessellation import VertexTable

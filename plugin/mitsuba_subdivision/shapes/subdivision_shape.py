@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -22,6 +21,7 @@ from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
 from .placement import Placement, RecentredPoints, checked_matrix
 from .registration import on_shallow_stack
+from .tessellation_parameters import Tessellation
 from .vertices import MovingVertices, Triangles, require_control_points
 
 if TYPE_CHECKING:
@@ -91,7 +91,13 @@ def make_subdivision(
                         self._exact,
                     )
             attributes = mesh_attributes(surface.cage)
-            self._cage = self._cage_attributes(attributes)
+            exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
+            self._cage = CageAttributes(variant, surface, exposed, on_backward_of(self.renew_attribute))
+            if self._exact is not None:
+                for name, values in self._exact.values.items():
+                    self._cage.add_follower(name, values.set)
+            if self._displacement is not None:
+                self._cage.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
             self.control_points = mapped(kind, surface.cage.positions)
             if is_jit:
                 # Copied to Dr.Jit's own memory, as frozen functions replace the array.
@@ -121,24 +127,12 @@ def make_subdivision(
                 self.add_attribute(mesh_name(name), size, [])
             self._assemble(moves_points=False)
 
-        def _cage_attributes(self, names: Collection[str]) -> CageAttributes:
-            """Attributes of the cage, with exact shading and displacement as their followers."""
-            surface = self._parameters.surface
-            attributes = CageAttributes(
-                variant, surface, [name for name in (TEXCOORDS, *names) if name in surface.attribute_names]
-            )
-            if self._exact is not None:
-                for name, values in self._exact.values.items():
-                    attributes.add_follower(name, values.set)
-            if self._displacement is not None:
-                attributes.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
-            return attributes
-
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
             """Select triangles and the evaluator of their vertices."""
             parameters, surface = self._parameters, self._parameters.surface
-            displacement_bound = None if self._displacement is None else self._displacement.bound()
-            table = self._tessellation.table(surface, control_points, to_world, displacement_bound)
+            is_adaptive = self._tessellation.limit is not None
+            bound = self._displacement.bound() if self._displacement is not None and is_adaptive else None
+            table = self._tessellation.table(surface, control_points, to_world, bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
             if self._exact is None or self._has_textured_emitter:
                 attributes = surface.attribute_table(table)
@@ -203,25 +197,12 @@ def make_subdivision(
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
             # Check parameters before anything changes.
-            self._require_lengths(keys)
-            if "control_points" in keys:
-                self._require_control_points()
-            to_world = checked_matrix(self.to_world) if "to_world" in keys and not is_recording() else None
-            if to_world is not None and bool(np.linalg.det(to_world[:3, :3]) < 0) != self._has_turned_faces:
-                self._require_unfrozen()
-            scale = None
-            if "displacement_scale" in keys and self._displacement is not None:
-                with errors_about("displacement_scale"):
-                    scale = self._displacement.checked_scale()
-            tessellation = self._tessellation
-            if tessellation.limit in keys:
-                self._require_unfrozen()
-                tessellation = tessellation.with_error(np.array(self._error).ravel())
+            to_world, scale, tessellation = self._checked(keys)
+            attributes = self._cage.update(keys)
+            self._texture_scene = None
             if "faces" in keys:
                 # Mitsuba discards the silhouette edges of old faces.
                 self._has_outlines = False
-            attributes = self._cage.update(keys, on_backward_of(self.renew_attribute))
-            self._texture_scene = None
             if (_MOVING | {tessellation.limit} | self._cage.moving).isdisjoint(keys):
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
@@ -255,12 +236,30 @@ def make_subdivision(
             # With the moved buffers among the keys, Mitsuba does not replace normals by averages of triangle normals.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
-        def _require_lengths(self, keys: list[str]) -> None:
-            """Check the lengths of vertex buffers that a user has assigned: Mitsuba reads as many values as before."""
+        def _checked(self, keys: list[str]) -> tuple[NDArray[np.float64] | None, float | None, Tessellation]:
+            """Check the parameters with the names ``keys``.
+
+            Returns the matrix of ``to_world`` and the scale of the displacement, None if they are not among these or
+            cannot be read, and the tessellation, another one if its limit is among these.
+            """
+            # Mitsuba reads as many values of vertex buffers that a user has assigned as before.
             names = [name for name in self._lengths if name in keys and name.startswith("vertex_")]
             for name, values in self._get_buffers(*names).items():
                 if len(values) != self._lengths[name]:
                     raise ValueError(f'parameter "{name}": {len(values)} numbers; expected {self._lengths[name]}')
+            if "control_points" in keys:
+                self._require_control_points()
+            to_world = checked_matrix(self.to_world) if "to_world" in keys and not is_recording() else None
+            if to_world is not None and bool(np.linalg.det(to_world[:3, :3]) < 0) != self._has_turned_faces:
+                self._require_unfrozen()
+            scale, tessellation = None, self._tessellation
+            if "displacement_scale" in keys and self._displacement is not None:
+                with errors_about("displacement_scale"):
+                    scale = self._displacement.checked_scale()
+            if tessellation.limit in keys:
+                self._require_unfrozen()
+                tessellation = tessellation.with_error(np.array(self._error).ravel())
+            return to_world, scale, tessellation
 
         def _require_unfrozen(self) -> None:
             """Check that no frozen function has read the triangles, which are about to be replaced."""
@@ -305,7 +304,7 @@ def make_subdivision(
         def renew_attribute(self, name: str, gradient: FloatBuffer) -> None:
             """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
             with dr.resume_grad():
-                self._cage.renew(name, gradient, on_backward_of(self.renew_attribute))
+                self._cage.renew(name, gradient)
                 self._replace_gradients(self._cage.buffers([name]))
                 if self._vertices.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
                     self._attach_vertices()
