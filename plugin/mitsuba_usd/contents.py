@@ -30,7 +30,7 @@ class TextureContents:
     @property
     def channels(self) -> list[int]:
         """Indices of the channel's letters among "rgba"."""
-        return ["rgba".index(each) for each in self.channel]
+        return ["rgba".index(letter) for letter in self.channel]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,19 +59,19 @@ Input = float | list[float] | str | Source
 
 def parts(given: Input) -> list[Source]:
     """An input itself, unless it is constant, and all that it depends on, each once."""
-    found: dict[int, Source] = {}
+    known: dict[int, Source] = {}
     rest = [given]
     while rest:
-        each = rest.pop()
-        if not isinstance(each, (float, int, list, str)) and id(each) not in found:
-            found[id(each)] = each
-            rest.extend(each.inputs.values() if isinstance(each, NodeContents) else ())
-    return list(found.values())
+        part = rest.pop()
+        if not isinstance(part, (float, int, list, str)) and id(part) not in known:
+            known[id(part)] = part
+            rest.extend(part.inputs.values() if isinstance(part, NodeContents) else ())
+    return list(known.values())
 
 
 def leaves(given: Input) -> list[Source]:
     """Pictures, attributes and texture coordinates that an input depends on."""
-    return [each for each in parts(given) if not isinstance(each, NodeContents) or each.category == "texcoord"]
+    return [part for part in parts(given) if not isinstance(part, NodeContents) or part.category == "texcoord"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,23 +91,22 @@ class MaterialContents:
 
     def textures(self) -> list[TextureContents]:
         """Pictures that it reads."""
-        return [each for each in self._leaves() if isinstance(each, TextureContents)]
+        return [leaf for leaf in self._leaves() if isinstance(leaf, TextureContents)]
 
     def primvars(self) -> set[str]:
         """Names of the attributes that it reads."""
-        return {each.name for each in self._leaves() if isinstance(each, PrimvarContents)}
+        return {leaf.name for leaf in self._leaves() if isinstance(leaf, PrimvarContents)}
 
     def texcoords(self) -> list[str]:
         """Names of the texture coordinates that it reads, each once."""
-        names = (
-            str(each.inputs["name"]) if isinstance(each, NodeContents) else each.texcoords
-            for each in self._leaves()
-            if not isinstance(each, PrimvarContents)
-        )
-        return list(dict.fromkeys(names))
+        names: dict[str, None] = {}
+        for leaf in self._leaves():
+            if not isinstance(leaf, PrimvarContents):
+                names[str(leaf.inputs["name"]) if isinstance(leaf, NodeContents) else leaf.texcoords] = None
+        return list(names)
 
     def _leaves(self) -> Iterator[Source]:
-        return (each for given in self.inputs.values() for each in leaves(given))
+        return (leaf for given in self.inputs.values() for leaf in leaves(given))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +182,8 @@ class CameraContents:
         """Whether it has an image."""
         numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance, *self.shutter])
         lengths = np.array([*self.aperture, self.focal_length])
-        finite = all(np.isfinite(each).all() for each in (self.to_world, numbers, lengths))
-        return finite and bool((lengths > 0).all())
+        is_finite = all(np.isfinite(values).all() for values in (self.to_world, numbers, lengths))
+        return is_finite and bool((lengths > 0).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,10 +207,10 @@ class SceneContents:
     @property
     def placed_shapes(self) -> list[tuple[ShapeContents, NDArray[np.float64]]]:
         """Shapes and their matrices to the world, those of a group once for each of its instances."""
-        found = [(each, each.to_world) for each in self.shapes]
+        placed = [(shape, shape.to_world) for shape in self.shapes]
         for instance in self.instances:
-            found += [(each, instance.to_world @ each.to_world) for each in self.groups[instance.group]]
-        return found
+            placed += [(shape, instance.to_world @ shape.to_world) for shape in self.groups[instance.group]]
+        return placed
 
     @property
     def is_lit(self) -> bool:

@@ -45,24 +45,22 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
     """A scene where instances of large shapes are shapes of their own, if there are many instances."""
     if len(contents.instances) < LEAST_INSTANCES:
         return contents
-    is_large = [
-        bool(group) and sum(len(each.cage.face_sizes) for each in group) >= LARGE * len(group)
-        for group in contents.groups
-    ]
+    sizes = [[len(shape.cage.face_sizes) for shape in group] for group in contents.groups]
+    is_large = [bool(group) and sum(group) >= LARGE * len(group) for group in sizes]
     copies = [
-        replace(shape, name=f"{each.name}{shape.name}", to_world=each.to_world @ shape.to_world)
-        for each in contents.instances
-        if is_large[each.group]
-        for shape in contents.groups[each.group]
+        replace(shape, name=f"{instance.name}{shape.name}", to_world=instance.to_world @ shape.to_world)
+        for instance in contents.instances
+        if is_large[instance.group]
+        for shape in contents.groups[instance.group]
     ]
     # Two triangles for four corners, with one segment on each edge.
-    if TRIANGLE_BYTES * sum(len(each.cage.face_vertices) for each in copies) / 2 > _allowed_bytes():
+    if TRIANGLE_BYTES * sum(len(copy.cage.face_vertices) for copy in copies) / 2 > _allowed_bytes():
         return contents
     return replace(
         contents,
         shapes=[*contents.shapes, *copies],
         groups=[[] if is_large[number] else group for number, group in enumerate(contents.groups)],
-        instances=[each for each in contents.instances if not is_large[each.group]],
+        instances=[instance for instance in contents.instances if not is_large[instance.group]],
     )
 
 
@@ -81,24 +79,34 @@ def with_copies(
     Copies that need different rates are different shapes. If all would take more than `MOST_BYTES`, their highest rate
     gives way, down to the lowest; if that is not enough, instances stay.
     """
-    placed = _of_instances(contents, rates)
+    are_many = len(contents.instances) >= LEAST_INSTANCES
+    of_group: dict[int, list[NDArray]] = {}
+    for instance in contents.instances if are_many else []:
+        of_group.setdefault(instance.group, []).append(instance.to_world)
+    placed: list[_Copies] = []
+    for number, matrices in sorted(of_group.items()):
+        for shape in contents.groups[number]:
+            needed = rates.get(shape, np.ones(len(matrices), np.int64))
+            placed.append(_Copies(f"/copies_{number}{shape.name}", shape, np.stack(matrices) @ shape.to_world, needed))
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
         if len(shape.cage.face_sizes) < LARGE:
             of_cage.setdefault((id(shape.cage), id(shape.shown_faces)), []).append(shape)
-    many = [each for each in of_cage.values() if len(each) >= LEAST_INSTANCES]
-    for alike in many:
-        needed = np.concatenate([rates.get(each, np.ones(1, np.int64)) for each in alike])
-        placed.append(_Copies(f"/copies{alike[0].name}", alike[0], np.stack([each.to_world for each in alike]), needed))
+    together: set[ShapeContents] = set()
+    for alike in of_cage.values():
+        if len(alike) >= LEAST_INSTANCES:
+            together.update(alike)
+            needed = np.concatenate([rates.get(shape, np.ones(1, np.int64)) for shape in alike])
+            to_world = np.stack([shape.to_world for shape in alike])
+            placed.append(_Copies(f"/copies{alike[0].name}", alike[0], to_world, needed))
     if not placed:
         return contents, {}
-    highest = max(int(each.rates.max()) for each in placed)
-    allowed = _allowed_bytes()
+    highest, allowed = max(int(copies.rates.max()) for copies in placed), _allowed_bytes()
     limits = range(highest, min(lowest, highest) - 1, -1)
     most = next((most for most in limits if _bytes(placed, most, shading) <= allowed), None)
     if most is None:
         count = len(contents.instances)
-        faces = sum(len(each.rates) * len(each.shape.cage.face_sizes) for each in placed)
+        faces = sum(len(copies.rates) * len(copies.shape.cage.face_sizes) for copies in placed)
         seconds = MEASURED_SECONDS * (count / MEASURED_INSTANCES) ** 2
         notes.add(
             f"copies with {faces:,} faces would take about {_bytes(placed, limits[-1], shading) / 1e9:.0f} GB as one "
@@ -107,30 +115,14 @@ def with_copies(
             placed[0].shape.name,
         )
         return contents, {}
-    found: dict[ShapeContents, int] = {}
-    for each in placed:
-        of_copies = np.minimum(each.rates, most)
+    joined: dict[ShapeContents, int] = {}
+    for copies in placed:
+        of_copies = np.minimum(copies.rates, most)
         for rate in np.unique(of_copies).tolist():
-            found[_copied(each.shape, each.to_world[of_copies == rate], each.name)] = rate
-    alone = [shape for shape in contents.shapes if not any(shape in alike for alike in many)]
-    kept: dict[str, Any] = {} if len(contents.instances) < LEAST_INSTANCES else {"groups": [], "instances": []}
-    return replace(contents, shapes=[*alone, *found], **kept), found
-
-
-def _of_instances(contents: SceneContents, rates: Mapping[ShapeContents, IntArray]) -> list[_Copies]:
-    """Copies in place of instances; none if they are few."""
-    if len(contents.instances) < LEAST_INSTANCES:
-        return []
-    of_group: list[list[NDArray]] = [[] for _ in contents.groups]
-    for each in contents.instances:
-        of_group[each.group].append(each.to_world)
-    found = []
-    for number, (group, placed) in enumerate(zip(contents.groups, of_group, strict=True)):
-        for shape in group if placed else []:
-            matrices = np.stack(placed) @ shape.to_world
-            needed = rates.get(shape, np.ones(len(placed), np.int64))
-            found.append(_Copies(f"/copies_{number}{shape.name}", shape, matrices, needed))
-    return found
+            joined[_copied(copies.shape, copies.to_world[of_copies == rate], copies.name)] = rate
+    kept: dict[str, Any] = {"groups": [], "instances": []} if are_many else {}
+    alone = [shape for shape in contents.shapes if shape not in together]
+    return replace(contents, shapes=[*alone, *joined], **kept), joined
 
 
 def _allowed_bytes() -> float:
@@ -139,14 +131,14 @@ def _allowed_bytes() -> float:
 
 def _bytes(placed: list[_Copies], most: int, shading: str) -> float:
     """Memory of copies as one mesh, with rates up to the given one."""
-    found = 0.0
-    for each in placed:
-        cage, is_smooth = each.shape.cage, each.shape.cage.scheme is not None
+    total = 0.0
+    for copies in placed:
+        cage, is_smooth, count = copies.shape.cage, copies.shape.cage.scheme is not None, len(copies.rates)
         corners, faces = int(cage.face_sizes.sum()), len(cage.face_sizes)
-        squares = float(np.square(np.minimum(each.rates, most)).sum())
-        triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * len(each.rates)
-        found += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * len(each.rates) if is_smooth else 0)
-    return found
+        squares = float(np.square(np.minimum(copies.rates, most)).sum())
+        triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * count
+        total += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * count if is_smooth else 0)
+    return total
 
 
 def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> ShapeContents:
@@ -157,7 +149,8 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
     # Corners of the faces in each copy; faces of mirrored ones are turned over.
     is_mirrored = np.linalg.det(linear) < 0
     corners = np.where(is_mirrored[:, None], reversed_order(cage.face_sizes), np.arange(len(cage.face_vertices)))
-    vertex, face = len(cage.positions), len(cage.face_sizes)
+    # Numbers of the first vertex and face of each copy.
+    vertex, face = (step * np.arange(count)[:, None] for step in (len(cage.positions), len(cage.face_sizes)))
     normals = shape.normals
     if normals is not None:
         of_copies = normals @ np.linalg.inv(linear)
@@ -165,30 +158,23 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
     copied = CageContents(
         positions.reshape(-1, 3),
         np.tile(cage.face_sizes, count),
-        (cage.face_vertices[corners] + _firsts(count, vertex)).ravel(),
-        creases=_tiled(cage.creases, np.array([vertex, vertex, 0]), count),
-        corners=_tiled(cage.corners, np.array([vertex, 0]), count),
-        holes=(cage.holes + _firsts(count, face)).ravel(),
-        texcoords=None if cage.texcoords is None else _attribute(cage.texcoords, corners, count),
-        attributes={name: _attribute(each, corners, count) for name, each in cage.attributes.items()},
+        (cage.face_vertices[corners] + vertex).ravel(),
+        creases=(cage.creases + vertex[..., None] * np.array([1, 1, 0])).reshape(-1, 3),
+        corners=(cage.corners + vertex[..., None] * np.array([1, 0])).reshape(-1, 2),
+        holes=(cage.holes + face).ravel(),
+        texcoords=None if cage.texcoords is None else _attribute(cage.texcoords, corners),
+        attributes={name: _attribute(attribute, corners) for name, attribute in cage.attributes.items()},
         rules=cage.rules,
         scheme=cage.scheme,
         source=CageSource(f"{cage.source.name}, {count} copies"),
     )
-    shown = None if shape.shown_faces is None else (shape.shown_faces + _firsts(count, face)).ravel()
+    shown = None if shape.shown_faces is None else (shape.shown_faces + face).ravel()
     return replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, shown_faces=shown)
 
 
-def _firsts(count: int, step: int) -> IntArray:
-    return step * np.arange(count)[:, None]
-
-
-def _tiled(tags: NDArray[np.float64], step: NDArray, count: int) -> NDArray[np.float64]:
-    return (tags + step * np.arange(count)[:, None, None]).reshape(-1, tags.shape[1])
-
-
-def _attribute(given: Attribute, corners: IntArray, count: int) -> Attribute:
+def _attribute(given: Attribute, corners: IntArray) -> Attribute:
+    """An attribute of all copies, with the face corners ``(n, n_h)``."""
     if given.interpolation != "face_varying":
-        return Attribute(np.tile(given.values, (count, 1)), given.interpolation)
+        return Attribute(np.tile(given.values, (len(corners), 1)), given.interpolation)
     indices = np.arange(len(given.values)) if given.indices is None else given.indices
     return Attribute(given.values, "face_varying", indices[corners].ravel())

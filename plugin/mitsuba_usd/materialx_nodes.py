@@ -97,8 +97,8 @@ def _mixed(background: Values, foreground: Values, amount: Values) -> Values:
 
 
 def _stacked(values: tuple[Values, ...]) -> Values:
-    shape = np.broadcast_shapes(*(each.shape[:-1] for each in values))
-    return np.concatenate([np.broadcast_to(each, (*shape, each.shape[-1])) for each in values], axis=-1)
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in values))
+    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in values], axis=-1)
 
 
 def _converted(n: SimpleNamespace) -> Values:
@@ -333,7 +333,7 @@ def affine(texture: Input, factor: Any, offset: Any) -> TextureContents | None:
         scales[texture.channels], offsets[texture.channels] = factor, offset
     except ValueError:
         return None
-    scale, bias, fallback = (np.asarray(each) for each in (texture.scale, texture.bias, texture.fallback))
+    scale, bias, fallback = map(np.asarray, (texture.scale, texture.bias, texture.fallback))
     return replace(
         texture,
         scale=(scale * scales).tolist(),

@@ -95,8 +95,8 @@ def _hashed(*integers: NDArray[np.int64] | int) -> Hash:
     """Bob Jenkins' final mix of two or three integers."""
     start = np.uint32((0xDEADBEEF + (len(integers) << 2) + 13) & 0xFFFFFFFF)
     a, b, c = (
-        np.asarray(np.asarray(each, dtype=np.int64) & 0xFFFFFFFF).astype(np.uint32) + start
-        for each in (*integers, 0, 0)[:3]
+        np.asarray(np.asarray(integer, dtype=np.int64) & 0xFFFFFFFF).astype(np.uint32) + start
+        for integer in (*integers, 0, 0)[:3]
     )
     a, b, c = np.broadcast_arrays(a, b, c)
     c = (c ^ b) - _turned(b, 14)

@@ -245,6 +245,8 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
 
 Number = Callable[[str, float], float]
 Polygons = tuple[NDArray[np.float64], "NDArray[np.float64] | None", IntArray, IntArray]
+# Points and normals along the profile of a surface of revolution, as (distance, z).
+Line = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _cube(number: Number) -> Polygons:
@@ -260,32 +262,34 @@ def _plane(number: Number) -> Polygons:
     return points, None, np.array([4]), np.arange(4)
 
 
-def _sphere(number: Number) -> Polygons:
-    return _revolved([_arc(number("radius", 1.0), -90, 90, 0.0)])
+def _cylinder(radius: float, half: float) -> list[Line]:
+    return [
+        _line((0, -half), (radius, -half)),
+        _line((radius, -half), (radius, half)),
+        _line((radius, half), (0, half)),
+    ]
 
 
-def _cylinder(number: Number) -> Polygons:
-    radius, half = number("radius", 1.0), number("height", 2.0) / 2
-    lower, upper = (radius, -half), (radius, half)
-    return _revolved([_line((0, -half), lower), _line(lower, upper), _line(upper, (0, half))])
+def _capsule(radius: float, half: float) -> list[Line]:
+    side = _line((radius, -half), (radius, half))
+    return [_arc(radius, -90, 0, -half), side, _arc(radius, 0, 90, half)]
 
 
-def _cone(number: Number) -> Polygons:
-    radius, half = number("radius", 1.0), number("height", 2.0) / 2
-    return _revolved([_line((0, -half), (radius, -half)), _line((radius, -half), (0, half))])
-
-
-def _capsule(number: Number) -> Polygons:
-    radius, half = number("radius", 0.5), number("height", 1.0) / 2
-    return _revolved([_arc(radius, -90, 0, -half), _line((radius, -half), (radius, half)), _arc(radius, 0, 90, half)])
+def _cone(radius: float, half: float) -> list[Line]:
+    return [_line((0, -half), (radius, -half)), _line((radius, -half), (0, half))]
 
 
 GPRIMS: dict[str, Callable[[Number], Polygons]] = {
-    "Cube": _cube, "Plane": _plane, "Sphere": _sphere, "Cylinder": _cylinder, "Cone": _cone, "Capsule": _capsule,
-}  # fmt: skip
+    "Cube": _cube,
+    "Plane": _plane,
+    "Sphere": lambda number: _revolved([_arc(number("radius", 1.0), -90, 90, 0.0)]),
+    "Cylinder": lambda number: _revolved(_cylinder(number("radius", 1.0), number("height", 2.0) / 2)),
+    "Cone": lambda number: _revolved(_cone(number("radius", 1.0), number("height", 2.0) / 2)),
+    "Capsule": lambda number: _revolved(_capsule(number("radius", 0.5), number("height", 1.0) / 2)),
+}
 
 
-def _arc(radius: float, start: float, end: float, height: float) -> tuple[NDArray, NDArray]:
+def _arc(radius: float, start: float, end: float, height: float) -> Line:
     angle = np.radians(np.linspace(start, end, ALONG + 1))
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = radius * normals + [0, height]
@@ -294,14 +298,14 @@ def _arc(radius: float, start: float, end: float, height: float) -> tuple[NDArra
     return points, normals
 
 
-def _line(start: tuple[float, float], end: tuple[float, float]) -> tuple[NDArray, NDArray]:
+def _line(start: tuple[float, float], end: tuple[float, float]) -> Line:
     points = np.array([start, end], dtype=np.float64)
     along = points[1] - points[0]
     normal = np.array([along[1], -along[0]]) / (np.linalg.norm(along) or 1)
     return points, np.array([normal, normal])
 
 
-def _revolved(parts: list[tuple[NDArray, NDArray]]) -> Polygons:
+def _revolved(parts: list[Line]) -> Polygons:
     """Turn lines of points and normals, ``(distance, z)`` from below to above, around the z axis."""
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)

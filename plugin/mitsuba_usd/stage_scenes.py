@@ -127,9 +127,9 @@ class StageScenes:
         opens, closes = first.camera.shutter if first.camera else (0.0, 0.0)
         if opens >= closes:
             times = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
-            found = times if first.camera else "there is no camera"
+            problem = times if first.camera else "there is no camera"
             raise CageError(
-                f"{self.name}: {found}; expected a camera whose shutter opens before it closes, and render settings "
+                f"{self.name}: {problem}; expected a camera whose shutter opens before it closes, and render settings "
                 "without disableMotionBlur"
             )
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
@@ -191,7 +191,7 @@ class StageScenes:
         segments = segments_of(contents, self._surfaces, *seen, shading)
         rates: dict[ShapeContents, int] = {}
         if mi.Float is not float:
-            most = {shape: np.minimum(each, MOST_SEGMENTS) for shape, each in segments.items()}
+            most = {shape: np.minimum(needed, MOST_SEGMENTS) for shape, needed in segments.items()}
             contents, rates = with_copies(contents, most, shading, notes)
         triangles = triangles_for_picture(contents, segments, seen[0], self._parameters, follows_sensor=follows_sensor)
         return contents, triangles | {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}
@@ -204,10 +204,10 @@ class StageScenes:
         copies = Counter(shape for shape, _ in contents.placed_shapes)
         rates = {shape: np.full(count, rate) for shape, count in copies.items() if shape.cage.scheme is not None}
         shading = self._parameters.get("shading", "vertex")
-        contents, found = with_copies(contents, rates, shading, notes, lowest=1 if self._has_free_rates else rate)
+        contents, joined = with_copies(contents, rates, shading, notes, lowest=1 if self._has_free_rates else rate)
         if not self._has_free_rates:
             return contents, self._parameters
-        return contents, {**self._parameters, "tessellation_rate": min([rate, *found.values()])}
+        return contents, {**self._parameters, "tessellation_rate": min([rate, *joined.values()])}
 
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
@@ -260,14 +260,14 @@ class StageScenes:
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
         """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
         needed: dict[str, float] = {}
-        if not any(each.textures() for each in first.materials):
+        if not any(material.textures() for material in first.materials):
             return needed
         numbers = (None,) if self._files is None else self._files.numbers
         at = (self._read(number, d) if d else self.at(number) for number, d in product(numbers, self._delays(first)))
         # Lists of shapes are the same object as long as only the camera moves.
         for _, alike in groupby(at, lambda contents: contents.shapes):
             frames = list(alike)
-            seen = [self._sensor(each, first, rest, StageWarnings()) for each in frames]
+            seen = [self._sensor(frame, first, rest, StageWarnings()) for frame in frames]
             for file, texels in texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed

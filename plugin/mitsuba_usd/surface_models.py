@@ -294,8 +294,8 @@ def edge_color(reflectivity: Input, at_82_degrees: Input) -> Input:
     r = constant(reflectivity, 3)
     target = constant(at_82_degrees) * schlick_reflectance(r, COSINE_82)
     edges = np.linspace(0, 1, 257)[:, None]
-    found = conductor_reflectance(*conductor(r, edges), COSINE_82)
-    return edges[np.abs(found - target).argmin(axis=0), 0].tolist()
+    reflected = conductor_reflectance(*conductor(r, edges), COSINE_82)
+    return edges[np.abs(reflected - target).argmin(axis=0), 0].tolist()
 
 
 def has_white_edges(base: Input, edge: Input) -> bool:
@@ -303,8 +303,8 @@ def has_white_edges(base: Input, edge: Input) -> bool:
     if not (is_constant(base) and is_constant(edge)):
         return is_all(edge, 1)
     color = constant(base, 3)
-    found = conductor_reflectance(*conductor(color, constant(edge, 3)), COSINE_82)
-    return is_all(edge, 1) or bool(np.abs(found - schlick_reflectance(color, COSINE_82)).max() < _VISIBLE)
+    reflected = conductor_reflectance(*conductor(color, constant(edge, 3)), COSINE_82)
+    return is_all(edge, 1) or bool(np.abs(reflected - schlick_reflectance(color, COSINE_82)).max() < _VISIBLE)
 
 
 def _below_coat(coat: Input, ior: Input) -> Input:

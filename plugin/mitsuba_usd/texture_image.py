@@ -84,27 +84,30 @@ def _tiles(path: str) -> dict[tuple[int, int], str]:
         there = {name: os.path.join(folder, name) for name in os.listdir(folder or ".")}
     before, after = pattern.split(UDIM, 1)
     is_tile = re.compile(f"{re.escape(before)}(\\d{{4}}){re.escape(after)}")
-    found = {}
+    tiles = {}
     for name, full in there.items():
         match = is_tile.fullmatch(name)
         v, u = divmod(int(match[1]) - _FIRST_TILE, _TILES_IN_ROW) if match else (-1, 0)
         if 0 <= v < _TILE_ROWS:
-            found[u, v] = full
-    return found
+            tiles[u, v] = full
+    return tiles
 
 
 def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
     """One image of all tiles; smaller ones are enlarged to the size of the largest."""
     uv = np.array(list(tiles))
     first, (columns, rows) = uv.min(axis=0), np.ptp(uv, axis=0) + 1
-    height, width, channels = np.max([each.shape for each in tiles.values()], axis=0)
-    dtype = max((each.dtype for each in tiles.values()), key=lambda each: (each.kind == "f", each.itemsize))
+    height, width, channels = np.max([tile.shape for tile in tiles.values()], axis=0)
+    dtype = max((tile.dtype for tile in tiles.values()), key=lambda dtype: (dtype.kind == "f", dtype.itemsize))
     pixels = np.zeros((rows, height, columns, width, channels), dtype=dtype)
     is_there = np.zeros((rows, height, columns, width), dtype=bool)
-    for (u, v), tile in tiles.items():
+    for (u, v), of_file in tiles.items():
         row, column = rows - 1 - (v - first[1]), u - first[0]
-        alike = tile if tile.shape[2] == channels else with_alpha(tile)[..., :channels]
-        pixels[row, :, column] = _resized(alike, (height, width), dtype)
+        tile = of_file if of_file.shape[2] == channels else with_alpha(of_file)[..., :channels]
+        if tile.shape[:2] != (height, width) or tile.dtype != dtype:
+            values = _resampled(tile.astype(np.float32) / np.float32(_full(tile.dtype)), (height, width))
+            tile = (values if dtype.kind == "f" else np.rint(values * _full(dtype))).astype(dtype)
+        pixels[row, :, column] = tile
         is_there[row, :, column] = True
     to_uv = np.diag([1 / columns, 1 / rows, 1.0])
     to_uv[:2, 2] = -first / (columns, rows)
@@ -125,14 +128,6 @@ def with_alpha(picture: NDArray) -> NDArray:
     return np.concatenate([color, alpha], axis=2)
 
 
-def _resized(tile: NDArray, size: tuple[int, int], dtype: np.dtype) -> NDArray:
-    """A tile of another size ``(height, width)`` and type."""
-    if tile.shape[:2] == size and tile.dtype == dtype:
-        return tile
-    values = _resampled(tile.astype(np.float32) / np.float32(_full(tile.dtype)), size)
-    return values.astype(dtype) if dtype.kind == "f" else np.rint(values * _full(dtype)).astype(dtype)
-
-
 def _resampled(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     if values.shape[:2] == size:
         return values
@@ -148,11 +143,7 @@ def _full(dtype: np.dtype) -> int:
 
 def is_srgb_image(pixels: NDArray, color_space: str) -> bool:
     """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
-    return _is_srgb(color_space, pixels.dtype, pixels.shape[2])
-
-
-def _is_srgb(color_space: str, dtype: np.dtype, channels: int) -> bool:
-    return color_space == "sRGB" or (color_space == "auto" and dtype == np.uint8 and channels >= 3)
+    return color_space == "sRGB" or (color_space == "auto" and pixels.dtype == np.uint8 and pixels.shape[2] >= 3)
 
 
 def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDArray:
@@ -187,7 +178,7 @@ def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str)
     chroma = OpenEXR.InputFile(io.BytesIO(content)).header().get("chromaticities")
     if chroma is None:
         return pixels
-    named = np.array([(each.x, each.y) for each in (chroma.red, chroma.green, chroma.blue, chroma.white)])
+    named = np.array([(color.x, color.y) for color in (chroma.red, chroma.green, chroma.blue, chroma.white)])
     from_xyz = np.linalg.inv(_to_xyz(_REC_709))
     if np.square(named - _REC_709).sum() < _SAME_PRIMARIES or (is_xyz and color_space == "raw"):
         return pixels
@@ -197,7 +188,7 @@ def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str)
         matrix = np.linalg.inv(from_xyz @ _to_xyz(named))
     else:
         # From what is white under one light to what is white under the other, by Bradford's cones.
-        before, after = (_BRADFORD @ _to_xyz(each) @ np.ones(3) for each in (named, _REC_709))
+        before, after = (_BRADFORD @ _to_xyz(primaries) @ np.ones(3) for primaries in (named, _REC_709))
         adaptation = np.linalg.inv(_BRADFORD) @ np.diag(after / before) @ _BRADFORD
         matrix = from_xyz @ adaptation @ np.linalg.inv(from_xyz)
     color = pixels[..., :3].astype(np.float32) @ matrix.T.astype(np.float32)
@@ -228,7 +219,7 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
         # Mitsuba tells what is wrong.
         return None
     with opened as image:
-        is_srgb = _is_srgb(color_space, np.dtype(np.uint8), len(image.getbands()))
+        is_srgb = color_space == "sRGB" or (color_space == "auto" and len(image.getbands()) >= 3)
         scale = min(1 << max(halvings(image.size, needed, most) - is_srgb, 0), _MOST_SCALE)
         if scale == 1 or image.mode not in ("L", "RGB") or any(side % scale for side in image.size):
             return None
@@ -297,8 +288,8 @@ def _half(values: NDArray) -> NDArray:
     """Half an image of 16 bits or of floats."""
     height, width = values.shape[:2]
     if height % 2 or width % 2:
-        found = _resampled(values.astype(np.float32), ((height + 1) // 2, (width + 1) // 2))
-        return np.rint(found).astype(values.dtype) if values.dtype.kind == "u" else found
+        half = _resampled(values.astype(np.float32), ((height + 1) // 2, (width + 1) // 2))
+        return np.rint(half).astype(values.dtype) if values.dtype.kind == "u" else half
     rows = values[::2].astype(np.uint32 if values.dtype.kind == "u" else np.float32) + values[1::2]
     sums = rows[:, ::2] + rows[:, 1::2]
     return ((sums + 2) // 4).astype(values.dtype) if values.dtype.kind == "u" else sums / np.float32(4)

@@ -53,7 +53,7 @@ FORMATS = {
 
 def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
     """Read a file of any known format; the parameters are those of `ControlCage.from_file`."""
-    found = FORMATS[_known_suffix(path, FORMATS)]
+    known = FORMATS[_known_suffix(path, FORMATS)]
     # What else keeps a file from being opened is an OSError of the reader.
     if os.path.isdir(path):
         raise CageError(f'"{path}" is a folder; expected a file')
@@ -62,12 +62,12 @@ def read_file(path: str | Path, prim: str | None, time: float | None, rules: Map
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise CageError(f'"{path}" is a link that leads back to itself; expected a file') from None
-    read = function_named(found.read)
-    if found.has_prims:
+    read = function_named(known.read)
+    if known.has_prims:
         return read(path, prim, time, rules)
     for name, value in (("prim", prim), ("time", time)):
         if value is not None:
-            suffixes = ", ".join(suffix for suffix, known in FORMATS.items() if known.has_prims)
+            suffixes = ", ".join(suffix for suffix, other in FORMATS.items() if other.has_prims)
             raise CageError(f'"{path}": {name} {value!r} was given; expected it for USD files only ({suffixes})')
     return read(path)
 

@@ -33,11 +33,9 @@ def joined(
 ) -> CageContents:
     """Contents of one cage with the vertices and faces of all meshes, one mesh after the other.
 
-    Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width. Warns if
-    they are not kept.
-
-    Returns CageContents: with a source that names vertices and faces by their mesh and their numbers there. Raises
-    CageError if meshes have different rules or schemes, or an index is out of the range of its own mesh.
+    Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width, else
+    there is a warning. The source names vertices and faces by their mesh and their numbers there. Raises CageError if
+    meshes have different rules or schemes, or an index is out of the range of its own mesh.
     """
     if len(meshes) == 1:
         return meshes[0]
@@ -81,11 +79,7 @@ def _common(rule: str, meshes: Sequence[CageContents], values: Sequence[Value]) 
 
 
 def _require_own_indices(mesh: CageContents) -> None:
-    """Raise an error if an index is out of the mesh's range or data has the wrong length.
-
-    In the joined arrays, such an index would mean a part of another mesh, and the data of all later meshes would begin
-    too early or too late.
-    """
+    """Raise an error if an index would be one of another mesh, or data would shift those of later meshes."""
     source, vertex_count = mesh.source.name, len(mesh.positions)
     require_range(mesh.face_vertices, vertex_count, f"{source}: face corners have")
     require_range(mesh.holes, len(mesh.face_sizes), f"{source}: holes have")
@@ -95,12 +89,12 @@ def _require_own_indices(mesh: CageContents) -> None:
         where = f'{source}: attribute "{shortened(name)}" has'
         if attribute.indices is not None:
             require_range(attribute.indices, len(attribute.values), where)
-        found = len(attribute.values if attribute.indices is None else attribute.indices)
+        count = len(attribute.values if attribute.indices is None else attribute.indices)
         expected, per = vertex_count, "vertex"
         if attribute.interpolation == "face_varying":
             expected, per = len(mesh.face_vertices), "face corner"
-        if found != expected:
-            raise CageError(f"{where} {found} values or indices; expected {expected}, one per {per}")
+        if count != expected:
+            raise CageError(f"{where} {count} values or indices; expected {expected}, one per {per}")
 
 
 def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:

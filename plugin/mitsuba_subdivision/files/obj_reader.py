@@ -37,12 +37,9 @@ def read_obj(path: str | Path) -> CageContents:
 
     All other statements are skipped. A backslash at the end of a line continues the line, except in a comment.
 
-    Raises CageError if the file is malformed; the message names the line. The cage itself is not validated. Raises
-    OSError if the file cannot be read.
-
-    Warns if a tag is not supported. Warns if face corners have indices of texture coordinates, but some have none, or
-    there are no ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture
-    coordinates.
+    Raises CageError if the file is malformed; the message names the line. The cage itself is not validated. Warns if a
+    tag is not supported. Warns if face corners have indices of texture coordinates, but some have none, or there are no
+    ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture coordinates.
     """
     with open(path, "rb") as file:
         obj = ObjText.split(f'"{path}"', file.read())
@@ -67,15 +64,15 @@ def read_obj(path: str | Path) -> CageContents:
             return indices - 1
         # Negative indices count backwards from the statements above that of the face.
         above = np.repeat(np.cumsum(counted)[is_face], sizes)[rows]
-        found = np.where(indices > 0, indices - 1, indices + above)
-        wrong = np.flatnonzero((indices == 0) | (found < 0) | (found >= count))[:1]
+        absolute = np.where(indices > 0, indices - 1, indices + above)
+        wrong = np.flatnonzero((indices == 0) | (absolute < 0) | (absolute >= count))[:1]
         for k in wrong:
             expected = f"1 to {count} (the file has {count} {nouns[1]})"
             if indices[k] < 0:
                 expected = f"-{above[k]} to -1 ({above[k]} {nouns[1]} are above this line)"
             place = first + run_starts(corners != SPACE)[rows[k]]
             raise obj.error(place, f"{nouns[0]} index {indices[k]} is out of range; expected {expected}")
-        return found
+        return absolute
 
     vertices, with_texcoord, texcoord_indices = indices
     vertices = zero_based(vertices, is_vertex, ("vertex", "vertices"), np.arange(len(vertices)))

@@ -152,8 +152,8 @@ def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> 
     width, has_sharpness, expected = _LIST_TAGS[name]
     count = len(integers) // width
     if not count or len(integers) % width or len(floats) not in ((1, count) if has_sharpness else (0,)):
-        found = f"tag {name} has {len(integers)} integers and {len(floats)} floats"
-        raise CageError(f"{where}: {found}; expected {expected}")
+        problem = f"tag {name} has {len(integers)} integers and {len(floats)} floats"
+        raise CageError(f"{where}: {problem}; expected {expected}")
     sharpness = np.broadcast_to(floats, (count,))[:, None] if has_sharpness else np.zeros((count, 0))
     return np.concatenate([np.array(integers, np.float64).reshape(count, width), sharpness], axis=1)
 

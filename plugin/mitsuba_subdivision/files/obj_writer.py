@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import Attribute, CageContents
+from ..cage.contents import CageContents
 from ..whole_file import whole_file
 from .formats import warn_of_losses
 from .obj_tags import rules_without_tag, tag_statements
@@ -21,16 +21,13 @@ ROWS = 1 << 16
 def write_obj(contents: CageContents, path: str | Path) -> None:
     """Write a cage to an OBJ file, with creases, corners, holes and rules as OpenSubdiv's tags.
 
-    Numbers have all digits that distinguish float64 numbers. The file appears whole or not at all.
-
-    Raises OSError if the file cannot be written. Warns if the cage has more than OBJ files can hold: attributes, a
-    scheme, texture coordinates that are not face-varying, several materials of one face, or names of materials that are
-    not one line of text.
+    Numbers have all digits that distinguish float64 numbers. Raises OSError if the file cannot be written. Warns if the
+    cage has more than OBJ files can hold: attributes, a scheme, texture coordinates that are not face-varying, several
+    materials of one face, or names of materials that are not one line of text.
     """
-    texcoords = contents.texcoords
+    texcoords, owner = contents.texcoords, contents.material_of_face
     if texcoords is not None and texcoords.interpolation != "face_varying":
         texcoords = None
-    owner = contents.material_of_face
     warn_of_losses(
         path,
         {
@@ -42,8 +39,24 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
             **dict.fromkeys(rules_without_tag(contents), True),
         },
     )
-    with whole_file(Path(path)) as beside:
-        beside.write_bytes(_cage_text(contents, texcoords).encode())
+    indices, corner = contents.face_vertices + 1, " %d"
+    if texcoords is not None:
+        rows = np.arange(len(indices)) if texcoords.indices is None else texcoords.indices
+        indices, corner = np.stack([indices, rows + 1], axis=1).ravel(), " %d/%d"
+    form = {size: "f" + corner * size + "\n" for size in np.unique(contents.face_sizes).tolist()}
+    faces = [form[size] for size in contents.face_sizes.tolist()]
+    # The last name is of faces without a material, whose index is -1.
+    names = [*(name.replace("%", "%%") if _is_possible(name) else "" for name in contents.materials), ""]
+    of_face = np.array(names, dtype=object)[owner]
+    for face in np.flatnonzero(of_face != np.append([""], of_face[:-1])):
+        faces[face] = f"usemtl {of_face[face]}\n{faces[face]}"
+    with whole_file(Path(path)) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.write(f"# {len(contents.positions)} vertices, {len(faces)} faces\n")
+        stream.writelines(_number_statements("v", np.asarray(contents.positions, np.float64)))
+        if texcoords is not None:
+            stream.writelines(_number_statements("vt", np.asarray(texcoords.values, np.float64)))
+        stream.write("".join(faces) % tuple(indices.tolist()))
+        stream.write(tag_statements(contents))
 
 
 def write_obj_triangles(
@@ -54,10 +67,7 @@ def write_obj_triangles(
     texcoords: NDArray | None,
     attributes: Mapping[str, NDArray],
 ) -> None:
-    """Write triangles to an OBJ file; see `formats.write_triangles`.
-
-    Numbers have all digits that distinguish numbers of their type, float32 or float64.
-    """
+    """Write triangles to an OBJ file, with all digits of their type; see `formats.write_triangles`."""
     warn_of_losses(path, {f'attribute "{name}"': True for name in attributes})
     with whole_file(Path(path)) as beside, beside.open("w", encoding="ascii", newline="\n") as stream:
         stream.write(f"# {len(positions)} vertices, {len(triangles)} triangles\n")
@@ -71,28 +81,6 @@ def write_obj_triangles(
             stream.write(("f %s %s %s\n" * len(rows)) % tuple(corners[rows.ravel()].tolist()))
 
 
-def _cage_text(contents: CageContents, texcoords: Attribute | None) -> str:
-    vertex_count, face_count = len(contents.positions), len(contents.face_sizes)
-    header = f"# {vertex_count} vertices, {face_count} faces\n"
-    vertices = ("v %r %r %r\n" * vertex_count) % tuple(contents.positions.ravel().tolist())
-    indices, corner, texcoord_lines = contents.face_vertices + 1, " %d", ""
-    if texcoords is not None:
-        values = texcoords.values
-        texcoord_lines = ("vt %r %r\n" * len(values)) % tuple(values.ravel().tolist())
-        rows = np.arange(len(indices)) if texcoords.indices is None else texcoords.indices
-        indices, corner = np.stack([indices, rows + 1], axis=1).ravel(), " %d/%d"
-    sizes = contents.face_sizes.tolist()
-    form = {size: "f" + corner * size + "\n" for size in set(sizes)}
-    lines = [form[size] for size in sizes]
-    # The last name is of faces without a material, whose index is -1.
-    names = [*(name.replace("%", "%%") if _is_possible(name) else "" for name in contents.materials), ""]
-    of_face = np.array(names, dtype=object)[contents.material_of_face]
-    for face in np.flatnonzero(of_face != np.append([""], of_face[:-1])):
-        lines[face] = f"usemtl {of_face[face]}\n{lines[face]}"
-    faces = "".join(lines) % tuple(indices.tolist())
-    return header + vertices + texcoord_lines + faces + tag_statements(contents)
-
-
 def _is_possible(name: str) -> bool:
     """Whether a ``usemtl`` statement with this name of a material is read back as it was."""
     is_comment = re.search(r"(^|\s)#(\s|$)", name)
@@ -101,8 +89,7 @@ def _is_possible(name: str) -> bool:
 
 def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:
     # 9 digits distinguish all float32 numbers. Of float64 numbers, Python itself writes the fewest digits that do.
-    number = " %r" if values.dtype == np.float64 else " %.9g"
-    form = keyword + number * values.shape[1] + "\n"
+    form = keyword + (" %r" if values.dtype == np.float64 else " %.9g") * values.shape[1] + "\n"
     for start in range(0, len(values), ROWS):
         rows = values[start : start + ROWS]
         yield (form * len(rows)) % tuple(rows.ravel().tolist())

@@ -58,9 +58,8 @@ def read_ply(path: str | Path) -> CageContents:
     Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
     or "" for negative numbers.
 
-    Raises CageError if the package plyfile is missing, or the file is malformed. The cage itself is not validated.
-    Raises OSError if the file cannot be read. Warns if faces have other data, or vertices have lists, which are not
-    read.
+    Raises CageError if the package plyfile is missing, or the file is malformed, OSError if it cannot be read. The cage
+    itself is not validated. Warns if faces have other data, or vertices have lists, which are not read.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
     header = content[: max(0, content.find(b"end_header"))]
@@ -121,8 +120,8 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
 def _contents(elements: dict[str, PlyElement], name: str, lines: dict[str, IntArray]) -> CageContents:
     for wanted in ("vertex", "face"):
         if wanted not in elements or not len(elements[wanted].data):
-            found = _listed([f"{element.name} ({len(element.data)})" for element in elements.values()]) or "none"
-            raise CageError(f'{name}: there is no element "{wanted}" with rows; the file has {found}')
+            there = _listed([f"{element.name} ({len(element.data)})" for element in elements.values()]) or "none"
+            raise CageError(f'{name}: there is no element "{wanted}" with rows; the file has {there}')
     vertex, face = elements["vertex"], elements["face"]
     numbers, lists = _properties(vertex)
     for axis in _POSITION:

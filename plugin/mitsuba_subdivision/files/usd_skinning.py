@@ -75,13 +75,10 @@ class Skinning:
         query = self._cache.GetSkinningQuery(prim) if root else None
         if query and binding.GetInheritedSkeleton() and (query.HasJointInfluences() or query.HasBlendShapes()):
             return query
-        names = (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar(), binding.GetBlendShapesAttr())
-        if any(each.HasAuthoredValue() for each in names):
-            self._report(
-                "joints and blend shapes are ignored where USD does not evaluate them, as without a SkelRoot above or "
-                "a skeleton",
-                prim.GetPath(),
-            )
+        bound = (binding.GetJointIndicesPrimvar(), binding.GetJointWeightsPrimvar(), binding.GetBlendShapesAttr())
+        if any(attribute.HasAuthoredValue() for attribute in bound):
+            what = "joints and blend shapes are ignored where USD does not evaluate them"
+            self._report(f"{what}, as without a SkelRoot above or a skeleton", prim.GetPath())
         return None
 
     def _skeleton(self, prim: Usd.Prim) -> UsdSkel.SkeletonQuery:
@@ -101,8 +98,8 @@ class Skinning:
         shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
         parts = shapes.ComputeSubShapeWeights(mapper.Remap(weights))
         moved = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
-        arguments = (shapes.ComputeBlendShapePointIndices(), shapes.ComputeSubShapePointOffsets(), moved)
-        if not shapes.ComputeDeformedPoints(*parts, *arguments):
+        offsets = shapes.ComputeBlendShapePointIndices(), shapes.ComputeSubShapePointOffsets()
+        if not shapes.ComputeDeformedPoints(*parts, *offsets, moved):
             self._report("blend shapes that do not match their mesh are ignored", prim.GetPath())
             return points
         return np.array(moved, dtype=np.float64)

@@ -37,8 +37,6 @@ ALL = "*"
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
-# The function of the library that reports composition errors, which `open_stage` names.
-_REPORTS_COMPOSITION = "_ReportErrors"
 
 
 def require_usd(name: str, use: str = "reads") -> None:
@@ -139,7 +137,9 @@ def usd_messages_of(name: str) -> Iterator[None]:
         reports = delegate.TakeUncoalescedDiagnostics()
     finally:
         del delegate
-    texts = [_clear(each.commentary) for each in reports if not each.sourceFunction.endswith(_REPORTS_COMPOSITION)]
+    # The function of the library that reports composition errors.
+    others = [report for report in reports if not report.sourceFunction.endswith("_ReportErrors")]
+    texts = [_clear(report.commentary) for report in others]
     if texts:
         count = len(set(texts)) - 1
         more = f" (and {count} other messages)" if count else ""
