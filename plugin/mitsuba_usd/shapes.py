@@ -73,11 +73,13 @@ class CachedSurface:
         return frame_table(self.surface) if self.surface.cage.face_count < DENSE else None
 
     @cached_property
-    def _used(self) -> IntArray:
-        """Vertices of faces that are not holes."""
+    def _used(self) -> NDArray[np.bool_]:
+        """Mask of the vertices of faces that are not holes."""
         cage = self.surface.cage
-        is_shown = np.isin(np.arange(cage.face_count), cage.holes, invert=True)
-        return np.unique(cage.face_vertices[np.repeat(is_shown, cage.face_sizes)])
+        is_shown, used = np.ones(cage.face_count, dtype=bool), np.zeros(cage.vertex_count, dtype=bool)
+        is_shown[cage.holes] = False
+        used[cage.face_vertices[np.repeat(is_shown, cage.face_sizes)]] = True
+        return used
 
 
 class Surfaces:

@@ -11,15 +11,7 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
-from mitsuba_subdivision.files.formats import FORMATS, Format, function_named, triangle_writers
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_every_function_of_the_table_exists(suffix):
-    found = FORMATS[suffix]
-    names = [name for name in (found.read, found.write, found.write_triangles) if name is not None]
-    assert len(names) == (1 if suffix == ".usdz" else 3)
-    assert all(callable(function_named(name)) for name in names)
+from mitsuba_subdivision.files.formats import FORMATS, Format, triangle_writers
 
 
 def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):

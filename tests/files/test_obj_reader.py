@@ -257,22 +257,6 @@ def test_texture_coordinates_survive_saving(tmp_path, np_rng):
     assert same(ControlCage.from_file(tmp_path / "torus.obj").contents, cage.contents)
 
 
-def test_every_cut_of_a_file_reads_or_names_the_file(obj_file):
-    cage = torus(3, 3)
-    path = obj_file("")
-    cage.save(path)
-    content = path.read_bytes()
-    for length in range(0, len(content), 7):
-        path.write_bytes(content[:length])
-        try:
-            found = read_quietly(path)
-        except CageError as error:
-            assert str(error).startswith(f'"{path}"')  # noqa: PT017
-        else:
-            assert len(found.positions) == 9
-            assert 1 <= len(found.face_sizes) <= 9
-
-
 def test_names_of_materials_may_have_a_number_sign(tmp_path):
     # Quadrilaterals side by side.
     quads = "".join(f"v {i} 0 0 # {i}\nv {i} 1 0\n" for i in range(6))

@@ -85,9 +85,10 @@ def read_obj(path: str | Path) -> CageContents:
     elif len(with_texcoord):
         nouns = "texture coordinate", "texture coordinates"
         texcoord_indices = zero_based(texcoord_indices, is_texcoord, nouns, with_texcoord)
-        without = np.setdiff1d(np.arange(len(vertices)), with_texcoord)
-        if len(without):
-            faces = np.unique(np.repeat(np.arange(len(sizes)), sizes)[without])
+        is_without = np.ones(len(vertices), dtype=bool)
+        is_without[with_texcoord] = False
+        if is_without.any():
+            faces = np.unique(np.repeat(np.arange(len(sizes)), sizes)[is_without])
             line = obj.lines(obj.statement_start[is_face][faces[0]])
             warn(
                 f"{obj.name}: {len(faces)} of {len(sizes)} faces have corners without texture coordinates, the first "
