@@ -48,6 +48,14 @@ def test_points_are_those_of_the_tagged_cage_refined(name, method, np_rng):
         np.testing.assert_allclose(samples, expected, rtol=0, atol=ROUNDING)
 
 
+@pytest.mark.core
+def test_creases_begin_as_sharp_as_their_edges_are_in_the_mean_and_no_sharper_than_the_highest():
+    cage = named_cages.cube()
+    cage = tagged(cage, creases=[(*edge, s) for edge, s in zip(cage.edges, (0.5, 1, 2.5, 10, 0, 2), strict=False)])
+    unknown = UnknownCreases(cage, cage.edges[:6], np.arange(6) // 2, HIGHEST, None)
+    np.testing.assert_array_equal(unknown.initial, [0.75, 2.75, 1])
+
+
 @EVERY_CAGE
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
 def test_derivatives_are_differences(name, method, np_rng):

@@ -121,6 +121,12 @@ def test_passes_and_merge_give_what_one_command_gives(tmp_path):
     assert (tmp_path / "merged.exr").read_bytes() == (tmp_path / "whole.exr").read_bytes()
 
 
+def test_no_fewer_samples_are_taken_than_asked_for(tmp_path):
+    path = tmp_path / "whole.exr"
+    assert main(["render", SCENE, *SMALL, "--spp", "44", "--batch", "8", "-o", str(path), "--passes", "1"]) == 0
+    assert (load_image(path).estimate.count == 48).all()
+
+
 @pytest.fixture(scope="module")
 def passes(tmp_path_factory):
     """Passes 1 to 3 of 3, and ones that do not belong to them."""
