@@ -142,7 +142,7 @@ def test_carried_there_and_back_is_where_it_was_or_at_the_border(name, np_rng):
         # The side of the neighbour that it has come in by is the nearest; the place as far beyond that side.
         sides = np.array([beside(domain, k, np.zeros(1), 0)[0] for k in range(domain.corner_count)])
         normals = np.array([beside(domain, k, np.zeros(1), 1)[0] for k in range(domain.corner_count)]) - sides
-        depths = np.stack(distances(domain, uv), axis=1)
+        depths = np.stack(domain.edge_distances(*uv.T), axis=1)
         entered = depths.argmin(axis=1)
         back = uv - 2 * depths[np.arange(len(uv)), entered][:, None] * normals[entered]
         again, there = carried(kernel, locations(kernel.types, found, back))
@@ -150,11 +150,6 @@ def test_carried_there_and_back_is_where_it_was_or_at_the_border(name, np_rng):
         kept = has_neighbour & (elements.face[found] != elements.face[half_edge])
         np.testing.assert_array_equal(here[0][kept], expected[0][kept])
         np.testing.assert_allclose(here[1][kept], expected[1][kept], rtol=0, atol=10 * ROUNDING)
-
-
-def distances(domain, uv):
-    u, v = uv.T
-    return (v, 1 - u - v, u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
 
 
 def as_seen_from_first(surface, half_edge, uv):

@@ -93,7 +93,7 @@ class ElementWalk:
         return Location(carried.half_edge, *clamped(self.domain, carried.u, carried.v))
 
     def is_border(self, location: Location, side: Index, active: Mask = True) -> Mask:
-        """Whether a side of elements, in the order of `distances`, has no neighbour: on borders and creases."""
+        """Whether a side in the order of `ParameterDomain.edge_distances` has no neighbour, at borders and creases."""
         edge, is_spoke = self._edge_on_side(location.half_edge, self.row(location.half_edge, active), side)
         if is_spoke is not None:
             active = active & ~is_spoke
@@ -101,7 +101,7 @@ class ElementWalk:
 
     def _nearest_side(self, u: Float, v: Float) -> tuple[Index, Float, Float]:
         """The nearest side of the domain, the signed distance from it, and the position along it."""
-        depth, *depths = distances(self.domain, u, v)
+        depth, *depths = self.domain.edge_distances(u, v)
         # Positions run from the corner of the same number.
         t, *ts = (u, v, 1 - (u + v)) if self.domain.corner_count == 3 else (u, v, 1 - u, 1 - v)
         side = self.types.index(0)
@@ -190,11 +190,6 @@ class TriangleLocations:
         is_whole, per_corner = (walk.row(first, active)[CODE] & WHOLE) != 0, max(self._corner_count, 1)
         corner = dr.select(is_whole, 0, number // per_corner)
         return first + corner, dr.select(is_whole, number, self._whole_count + number % per_corner)
-
-
-def distances(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, ...]:
-    """Signed distances of parameters from each side of a domain, positive inside."""
-    return (v, 1 - (u + v), u) if domain.corner_count == 3 else (v, 1 - u, 1 - v, u)
 
 
 def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:

@@ -9,7 +9,7 @@ import drjit as dr
 
 from .algebra import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
 from .array_types import Float, Mask, Vector3
-from .locations import ElementWalk, Location, distances
+from .locations import ElementWalk, Location
 from .piece_kernel import PatchValues, Piece
 
 # Maximum number of Newton steps; about five are usual.
@@ -23,7 +23,7 @@ SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
 CONVEX, PARALLEL = 1e-4, 1e-6
 # Largest distance of points on a side of the domain from it, in parameters of an element.
 ON_SIDE = 1e-6
-# Directions of the sides of a domain by its number of corners, in the order of `distances`.
+# Directions of the sides of a domain by its number of corners, in the order of `ParameterDomain.edge_distances`.
 _SIDES = {3: ((1, 0), (1, -1), (0, 1)), 4: ((1, 0), (0, 1), (1, 0), (0, 1))}
 
 
@@ -123,8 +123,8 @@ def _step(
 def _border(walk: ElementWalk, location: Location, du: Float, dv: Float) -> tuple[Float, Float, Mask]:
     """Direction of the border that a step would cross, and whether it crosses none."""
     types = walk.types
-    inside = distances(walk.domain, location.u, location.v)
-    after = distances(walk.domain, location.u + du, location.v + dv)
+    inside = walk.domain.edge_distances(location.u, location.v)
+    after = walk.domain.edge_distances(location.u + du, location.v + dv)
     side, least_distance = types.index(len(inside)), types.float(0)
     for k, (distance, distance_after) in enumerate(zip(inside, after, strict=True)):
         leaves = (distance <= ON_SIDE) & (distance_after < least_distance) & (distance_after < distance)

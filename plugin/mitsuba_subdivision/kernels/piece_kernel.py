@@ -35,7 +35,7 @@ from ..patches.piece_table import (
 )
 from .algebra import Monomials, added, combined, cross, like, selected
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
-from .locations import ElementWalk, distances, doublings, in_child, turn_matrix, turned
+from .locations import ElementWalk, doublings, in_child, turn_matrix, turned
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
@@ -138,7 +138,7 @@ class Piece:
         """Whether parameters offset by ``du`` and ``dv`` lie in the piece, or within a tolerance of it."""
         s, t = self._parameters(du, dv)
         centre_s, centre_t = self.kernel.centre
-        return reduce(dr.minimum, distances(self.kernel.domain, s + centre_s, t + centre_t)) >= -tolerance
+        return reduce(dr.minimum, self.kernel.domain.edge_distances(s + centre_s, t + centre_t)) >= -tolerance
 
     def values(self, du: Float = 0, dv: Float = 0, derivatives: int = 1) -> PatchValues:
         """Evaluate at parameters offset by ``du`` and ``dv``, which may lie outside of the piece.
