@@ -215,6 +215,18 @@ def test_figures_have_the_options_that_the_command_line_knows():
         assert set(figure.formats) <= set(FigureOptions.formats)
 
 
+def test_a_command_does_not_wait_for_what_others_import():
+    """The program's own help neither, which lists all."""
+    program = """import sys
+from mitsuba_subdivision.commands import COMMANDS, parser
+assert all(name in parser(["info"]).format_help() for name in COMMANDS)
+print([name for name in sys.modules if name.startswith("mitsuba_subdivision.")])"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert "mitsuba_subdivision.commands.info" in done.stdout
+    assert not re.search(r"\.(studio|regression|figures|commands\.render)\b", done.stdout)
+
+
 @pytest.mark.parametrize("words", [["info", "cube.obj"], ["info", "missing.obj"], ["--help"]])
 def test_a_closed_pipe_is_no_error(folder, words):
     # The status is what it is where somebody listens, and nothing is said.
