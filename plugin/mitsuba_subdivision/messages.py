@@ -1,4 +1,7 @@
-"""Messages of the command line: results on standard output, all others on standard error."""
+"""Messages of the command line, results on standard output and all others on standard error; and progress of long work.
+
+Progress is a line on a terminal that is erased at the end; a pipe or a file gets none.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,20 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TextIO
-
-from .progress import wipe
+from typing import TextIO, TypeVar
 
 PROGRAM = "mitsuba-subdivision"
+# Seconds before a line of progress appears.
+PATIENCE = 1.0
 # Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 
 # Mitsuba's message about an error in a plugin has the whole traceback in it.
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*(?:[\w.]+: )?")
+
+T = TypeVar("T")
 
 
 def print_result(text: object) -> None:
@@ -58,6 +63,28 @@ def flushed_output() -> Iterator[None]:
             _print(None, stream)
 
 
+def counted(items: Sequence[T], what: str) -> Iterator[T]:
+    """Iterate over items, and count them; ``what`` they are begins with a capital letter."""
+    if not _is_terminal():
+        return iter(items)
+    # Only here, as it takes some time to import.
+    from tqdm import tqdm
+
+    return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE))
+
+
+@contextmanager
+def timed(what: str) -> Iterator[Callable[[str], None]]:
+    """Show a line for work of few long steps. The function handed out names the current step, after ``what``."""
+    if not _is_terminal():
+        yield lambda step: None  # noqa: ARG005
+        return
+    from tqdm import tqdm
+
+    with tqdm(desc=what, bar_format="{desc} ({elapsed})", leave=False) as line:
+        yield lambda step: line.set_description_str(f"{what} {step}")
+
+
 def _text_of(error: BaseException) -> str:
     # Dr.Jit's own message refers to the one of the error that it was raised from.
     while error.__cause__ is not None and "(see above)" in str(error):
@@ -76,10 +103,21 @@ def _print(text: object, stream: TextIO | None) -> None:
         return
     try:
         if text is not None:
-            wipe()
+            _wipe()
             print(text, file=stream)
         stream.flush()
     except BrokenPipeError:
         # Otherwise Python tries once more when it ends.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _wipe() -> None:
+    """Clear the line of the terminal, if there is one, for a message in its place."""
+    if _is_terminal():
+        sys.stderr.write("\r\x1b[K")
+        sys.stderr.flush()
+
+
+def _is_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()

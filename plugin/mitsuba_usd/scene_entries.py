@@ -9,7 +9,7 @@ from typing import Any
 
 import mitsuba as mi
 from mitsuba_subdivision.cage import CageError
-from mitsuba_subdivision.progress import counted
+from mitsuba_subdivision.messages import counted
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.variants import SceneNode
 

@@ -25,7 +25,7 @@ from mitsuba_subdivision.cage import (
     same_topology,
 )
 from mitsuba_subdivision.mesh import IntArray, ragged
-from mitsuba_subdivision.progress import counted
+from mitsuba_subdivision.messages import counted
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.studio import PolygonMesh, box_corners, frame_table, points_at, set_parameters
 from mitsuba_subdivision.surface import LimitSurface

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.cage import CageError, in_digits, same
 from mitsuba_subdivision.files import require_usd
-from mitsuba_subdivision.progress import timed
+from mitsuba_subdivision.messages import timed
 from mitsuba_subdivision.studio import (
     DEFAULT_SPP,
     DEFAULT_VIEW,

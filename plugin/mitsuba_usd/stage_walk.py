@@ -28,7 +28,7 @@ from mitsuba_subdivision.files import (
     usd_messages_of,
     value_at,
 )
-from mitsuba_subdivision.progress import timed
+from mitsuba_subdivision.messages import timed
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 

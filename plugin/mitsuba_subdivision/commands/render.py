@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.formats import FORMATS
-from ..messages import print_remark, print_result
-from ..progress import counted
+from ..messages import counted, print_remark, print_result
 from ..regression.image import METADATA_ATTRIBUTE
 from ..regression.scene import BOX, kept_search_folders, load_scene
 from ..shapes.parameter_table import SHADINGS

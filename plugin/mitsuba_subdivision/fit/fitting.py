@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..progress import counted
+from ..messages import counted
 from ..refinement.cage_refinement import CageRefinement
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface

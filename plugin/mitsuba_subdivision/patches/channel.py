@@ -19,7 +19,7 @@ from ..evaluation.patch_tree import patch_tree
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.cuts import seams, value_mesh
 from ..mesh.shared import Content, Shared
-from ..progress import counted
+from ..messages import counted
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable

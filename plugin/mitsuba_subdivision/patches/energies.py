@@ -18,7 +18,7 @@ from ..evaluation.patch_tree import patch_trees
 from ..evaluation.polynomials import regular_bernstein
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
-from ..progress import counted
+from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .patch_table import PatchTable

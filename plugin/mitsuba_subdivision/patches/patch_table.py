@@ -22,7 +22,7 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology, VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.shared import Content, Shared
 from ..mesh.signature import NEAR_FACES, Signature, near_behind, signature_at
-from ..progress import counted
+from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 

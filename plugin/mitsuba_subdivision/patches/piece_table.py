@@ -14,7 +14,7 @@ from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, PieceMap, TreeA
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
-from ..progress import counted
+from ..messages import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 

@@ -15,7 +15,7 @@ from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_do
 from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
 from ..mesh.connectivity import IntArray, Topology
-from ..progress import counted
+from ..messages import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
 

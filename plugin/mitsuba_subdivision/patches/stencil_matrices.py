@@ -10,7 +10,7 @@ import numpy as np
 from ..evaluation.element import derivative_stencils, element_stencils
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
-from ..progress import counted
+from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import StencilTable
 from .patch_table import PatchTable, RefinedPatches

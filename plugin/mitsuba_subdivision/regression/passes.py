@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..progress import timed
+from ..messages import timed
 from ..variants import set_variant
 from . import RegressionError
 from .image import NOTHING, Estimate, Image, Probe, combine

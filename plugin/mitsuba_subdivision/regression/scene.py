@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ..llvm import loaded_version
-from ..progress import timed
+from ..messages import timed
 from . import RegressionError
 
 BOX = "box"

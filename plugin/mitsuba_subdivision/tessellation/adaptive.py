@@ -14,8 +14,8 @@ from ..evaluation.patch_tree import patch_trees
 from ..evaluation.polynomials import times
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from ..messages import counted
 from ..patches import PatchTable
-from ..progress import counted
 from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .adaptive_grid import AdaptiveGrid, PatchFrames, Tiles, tile_type, whole_patches
