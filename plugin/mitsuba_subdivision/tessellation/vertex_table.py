@@ -90,28 +90,27 @@ class VertexTable:
         `SurfaceSamples`.
         """
         positions, normals = (np.empty((self.vertex_count, 3)) for _ in range(2))
-        # Refined control points are rounded before another one is subtracted.
-        least_extent = 0.0 if self.refinement is None else LEAST_EXTENT[64]
-        for part in self.polynomials:
-            evaluated = part.evaluated(
-                self.controls, self._refined(control_points), with_normals=True, least_extent=least_extent
-            )
-            for vertex, vertex_points, vertex_normals in evaluated:
-                positions[vertex], normals[vertex] = vertex_points, vertex_normals
+        for vertex, vertex_points, vertex_normals in self._evaluated(control_points, with_normals=True):
+            positions[vertex], normals[vertex] = vertex_points, vertex_normals
         positions[self.copies[0]] = positions[self.copies[1]]
         return positions, normals
 
     def interpolated(self, values: FloatArray) -> FloatArray:
         """``(vertex_count, k)`` limits of ``(control_count, k)`` values at the vertices, also evaluated for copies."""
         limits = np.empty((self.vertex_count, values.shape[1]))
-        for part in self.polynomials:
-            for vertex, vertex_values, _ in part.evaluated(self.controls, self._refined(values)):
-                limits[vertex] = vertex_values
+        for vertex, vertex_values, _ in self._evaluated(values, with_normals=False):
+            limits[vertex] = vertex_values
         return limits
 
-    def _refined(self, control_points: FloatArray) -> FloatArray:
-        """``(n, k)`` points that `controls` indexes, from ``(control_count, k)`` control points of the cage."""
-        return control_points if self.refinement is None else self.refinement @ control_points
+    def _evaluated(
+        self, control_points: FloatArray, *, with_normals: bool
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """`VertexPolynomials.evaluated`, of all polynomials."""
+        # Refined control points are rounded before another one is subtracted.
+        least_extent = 0.0 if self.refinement is None else LEAST_EXTENT[64]
+        points = control_points if self.refinement is None else self.refinement @ control_points
+        for part in self.polynomials:
+            yield from part.evaluated(self.controls, points, least_extent, with_normals=with_normals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +145,9 @@ class VertexPolynomials:
         self,
         controls: NDArray[np.uint32],  # `VertexTable.controls`
         points: FloatArray,  # (n, k) float64: points that these refer to
+        least_extent: float,  # Of patches, for `unit_normals`, relative to a control point
         *,
-        with_normals: bool = False,
-        least_extent: float = 0.0,  # As for `unit_normals`, relative to a control point; for refined control points
+        with_normals: bool,
     ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Evaluate all vertices, in runs: numbers ``(n,)``, points ``(n, k)`` and, if asked for, normals ``(n, 3)``.
 
