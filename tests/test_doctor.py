@@ -27,20 +27,20 @@ def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
     crashed = VariantReport(False, "the process crashed (SIGABRT)")
     monkeypatch.setattr(doctor, "try_variant", lambda *_: crashed)
     assert main(["doctor", "--json"]) == 1
-    found = json.loads(capsys.readouterr().out)
-    assert found["healthy"] is False
-    assert found["variants"]["llvm_ad_rgb"]["problem"] == "the process crashed (SIGABRT)"
-    assert set(found["llvm"]) == {"path", "version", "reason"}
-    assert set(found["versions"]) == {"mitsuba-subdivision", "Python", *doctor.PACKAGES}
+    report = json.loads(capsys.readouterr().out)
+    assert report["healthy"] is False
+    assert report["variants"]["llvm_ad_rgb"]["problem"] == "the process crashed (SIGABRT)"
+    assert set(report["llvm"]) == {"path", "version", "reason"}
+    assert set(report["versions"]) == {"mitsuba-subdivision", "Python", *doctor.PACKAGES}
     assert main(["doctor"]) == 1
     assert capsys.readouterr().out.endswith("there are PROBLEMS, listed above\n")
 
 
 def test_a_missing_package_and_a_surface_at_the_wrong_place_are_told(monkeypatch):
     monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "unheard-of-package"))
-    found = doctor.diagnose({})
-    assert not found.healthy
-    assert "unheard-of-package   MISSING" in str(found)
+    report = doctor.diagnose({})
+    assert not report.healthy
+    assert "unheard-of-package   MISSING" in str(report)
     monkeypatch.setattr(doctor, "CUBE_HEIGHT", 0.84)
     told = "the limit surface of a cube was rendered at the height 0.839506; expected 0.840000"
     assert doctor._wrong_height(68 / 81) == told
@@ -60,14 +60,14 @@ CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no 
 )
 def test_how_a_process_ends_is_told(monkeypatch, child, problem):
     monkeypatch.setattr(doctor, "_CHILD", child)
-    found = try_variant("scalar_rgb", seconds=0.5 if "sleep" in child else 60)
-    assert (found.works, found.problem) == (False, problem)
+    report = try_variant("scalar_rgb", seconds=0.5 if "sleep" in child else 60)
+    assert (report.works, report.problem) == (False, problem)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems search for LLVM by their own rules")
 def test_a_library_that_is_none_is_told(monkeypatch, tmp_path):
     (tmp_path / "libLLVM.so.20").write_text("no library")
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(tmp_path / "libLLVM.so.20"))
-    found = try_variant("llvm_ad_rgb")
-    assert found.works is False
-    assert found.problem.startswith(f'Dr.Jit could not use "{tmp_path}')
+    report = try_variant("llvm_ad_rgb")
+    assert report.works is False
+    assert report.problem.startswith(f'Dr.Jit could not use "{tmp_path}')

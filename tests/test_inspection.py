@@ -28,15 +28,15 @@ def test_predicted_triangles_are_those_of_the_tessellation(cage, scheme, rate):
 
 def test_a_sheet():
     tags = {"creases": [(6, 7, 10), (7, 12, 1.5)], "corners": [(18, 10), (17, 0.5)], "holes": [5]}
-    found = inspect(LimitSurface(sheet(4, 4, **tags)))
-    assert (found.vertex_count, found.edge_count, found.face_count) == (25, 40, 16)
-    assert found.face_sizes == {4: 16}
-    assert found.valences == {4: 9}
-    assert (found.boundary_edge_count, found.boundary_loop_count, found.component_count) == (16, 1, 1)
+    inspected = inspect(LimitSurface(sheet(4, 4, **tags)))
+    assert (inspected.vertex_count, inspected.edge_count, inspected.face_count) == (25, 40, 16)
+    assert inspected.face_sizes == {4: 16}
+    assert inspected.valences == {4: 9}
+    assert (inspected.boundary_edge_count, inspected.boundary_loop_count, inspected.component_count) == (16, 1, 1)
     once = ("infinitely sharp edges", "semi-sharp edges", "corners", "semi-sharp vertices", "holes")
     none = {"non-manifold edges": 0, "non-manifold vertices": 0}
-    assert found.sharp == {**dict.fromkeys(once, 1), "darts": 2, **none}
-    assert found.warnings == ()
+    assert inspected.sharp == {**dict.fromkeys(once, 1), "darts": 2, **none}
+    assert inspected.warnings == ()
 
 
 def test_the_box_is_that_of_the_vertices_of_faces(tmp_path, capsys):
@@ -53,20 +53,20 @@ def test_edges_of_many_faces_are_counted_once():
     # Three quads that share an edge, and a triangle that touches one of them in a vertex.
     faces = [[0, 1, 2, 3], [1, 0, 4, 5], [0, 1, 6, 7], [2, 8, 9]]
     cage = ControlCage(np.random.default_rng(1).random((10, 3)), faces, creases=[(0, 1, 1.5), (2, 3, 1.5)])
-    found = inspect(LimitSurface(cage))
-    assert (found.edge_count, found.boundary_edge_count, found.boundary_loop_count) == (13, 12, 1)
-    assert found.valences == {}
-    assert (found.sharp["non-manifold edges"], found.sharp["semi-sharp edges"]) == (1, 1)
-    assert found.sharp["non-manifold vertices"] == 3
+    inspected = inspect(LimitSurface(cage))
+    assert (inspected.edge_count, inspected.boundary_edge_count, inspected.boundary_loop_count) == (13, 12, 1)
+    assert inspected.valences == {}
+    assert (inspected.sharp["non-manifold edges"], inspected.sharp["semi-sharp edges"]) == (1, 1)
+    assert inspected.sharp["non-manifold vertices"] == 3
 
 
 def test_seams_and_pieces_are_counted():
     faces = [*faces_of(cube()), *(face + 8 for face in np.array(faces_of(cube())))]
     positions = np.concatenate([cube().positions, cube().positions + 5])
     seams, age = Attribute(np.zeros((48, 2)), "face_varying"), Attribute(np.zeros((16, 1)))
-    found = inspect(LimitSurface(ControlCage(positions, faces, texcoords=seams, attributes={"age": age})))
-    assert found.component_count == 2
-    assert found.attributes == {"texcoords": "face-varying with 24 seam edges, rule corners_plus1", "age": "vertex"}
+    inspected = inspect(LimitSurface(ControlCage(positions, faces, texcoords=seams, attributes={"age": age})))
+    assert inspected.component_count == 2
+    assert inspected.attributes == {"texcoords": "face-varying with 24 seam edges, rule corners_plus1", "age": "vertex"}
 
 
 # Of another sharpness each, so that all patches differ, and refinement has to follow them far down.
@@ -92,9 +92,9 @@ def test_what_will_look_odd_or_takes_long_is_told(cage, warning):
 def test_rules_are_told_where_they_are_not_the_default():
     assert inspect(LimitSurface(sheet(2, 2))).rules == {}
     given = {"crease_method": "chaikin", "triangle_rule": "smooth"}
-    found = inspect(LimitSurface(sheet(2, 2, **given, boundary="edge_only")))
-    assert found.rules == given
-    assert "rules:          crease_method chaikin, triangle_rule smooth\n" in str(found)
+    inspected = inspect(LimitSurface(sheet(2, 2, **given, boundary="edge_only")))
+    assert inspected.rules == given
+    assert "rules:          crease_method chaikin, triangle_rule smooth\n" in str(inspected)
 
 
 def test_the_command_prints_text_and_json_and_says_what_a_scheme_cannot_do(tmp_path, capsys):
@@ -107,8 +107,8 @@ def test_the_command_prints_text_and_json_and_says_what_a_scheme_cannot_do(tmp_p
     assert "boundary:       none, the cage is closed" in text
     assert "4: 192 triangles" in text
     assert main(["info", str(path), "--json", "--scheme", "doo_sabin"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["scheme"], found["name"]) == ("doo_sabin", str(path))
-    assert found["bounding_box"] == [[-1, -1, -1], [1, 1, 1]]
+    inspected = json.loads(capsys.readouterr().out)
+    assert (inspected["scheme"], inspected["name"]) == ("doo_sabin", str(path))
+    assert inspected["bounding_box"] == [[-1, -1, -1], [1, 1, 1]]
     assert main(["info", str(path), "--scheme", "loop"]) == 1
     assert "expects triangles only" in capsys.readouterr().err

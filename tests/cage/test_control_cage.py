@@ -121,9 +121,9 @@ def test_bare_arrays_have_a_row_for_each_vertex(np_rng):
     faces = given.face_vertices.reshape(-1, 4)
     for array in (values, values.tolist()):
         cage = ControlCage(given.positions, faces, texcoords=array, attributes={"pair": array})
-        for found in (cage.texcoords, cage.attributes["pair"]):
-            assert found.interpolation == "vertex"
-            np.testing.assert_array_equal(found.values, values)
+        for attribute in (cage.texcoords, cage.attributes["pair"]):
+            assert attribute.interpolation == "vertex"
+            np.testing.assert_array_equal(attribute.values, values)
     assert ControlCage(given.positions, faces).texcoords is None
 
 
@@ -181,9 +181,9 @@ def test_a_cage_of_its_own_contents_is_the_same(np_rng):
     for name in (*RULES, "scheme", "source"):
         assert getattr(again, name) == getattr(cage, name)
     pairs = [(again.texcoords, cage.texcoords), (again.attributes["weight"], cage.attributes["weight"])]
-    for found, expected in pairs:
-        assert found.interpolation == expected.interpolation
-        np.testing.assert_array_equal(found.values, expected.values)
+    for attribute, expected in pairs:
+        assert attribute.interpolation == expected.interpolation
+        np.testing.assert_array_equal(attribute.values, expected.values)
     np.testing.assert_array_equal(again.texcoords.indices, cage.texcoords.indices)
 
 

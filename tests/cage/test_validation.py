@@ -150,8 +150,8 @@ def test_creases_of_large_cages_are_found():
     plain = torus(256, 200)
     wanted = plain.face_vertices.reshape(-1, 4)[-3:, [0, 3]]
     cage = tagged(plain, creases=[(*edge, 10) for edge in wanted.tolist()])
-    found = np.sort(cage.tags.creases(cage.topology)[:, :2], axis=1)
-    np.testing.assert_array_equal(np.unique(found, axis=0), np.unique(np.sort(wanted, axis=1), axis=0))
+    creased = np.sort(cage.tags.creases(cage.topology)[:, :2], axis=1)
+    np.testing.assert_array_equal(np.unique(creased, axis=0), np.unique(np.sort(wanted, axis=1), axis=0))
 
 
 def test_tags_are_read_only_and_what_is_equal_everywhere_takes_no_memory():

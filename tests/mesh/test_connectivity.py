@@ -29,8 +29,8 @@ def test_neighbours_are_those_of_the_tables(any_cage, as_arrays):
     half_edges = np.arange(t.half_edge_count, dtype=np.int32)
     for name, table in (("turn", t.twin[t.prev]), ("turn_back", np.where(t.twin < 0, -1, t.next[t.twin]))):
         walk = getattr(t, name)
-        found = walk(half_edges) if as_arrays else [int(walk(h)) for h in half_edges.tolist()]
-        np.testing.assert_array_equal(found, table, err_msg=name)
+        neighbours = walk(half_edges) if as_arrays else [int(walk(h)) for h in half_edges.tolist()]
+        np.testing.assert_array_equal(neighbours, table, err_msg=name)
 
 
 def test_walks_go_on_from_where_they_arrived():
@@ -81,8 +81,8 @@ def test_refinement_differs_where_one_mesh_is_sharp():
     smooth = torus(5, 6)
     sharp = ControlCage(smooth.positions, smooth.face_vertices.reshape(-1, 4).tolist(), creases=[(13, 14, 2.0)])
     meshes = [cage.cut_mesh.topology for cage in (smooth, sharp)]
-    for expected, found in (meshes, meshes[::-1]):
-        *others, is_sharper = differences(expected, found)
+    for expected, other in (meshes, meshes[::-1]):
+        *others, is_sharper = differences(expected, other)
         assert not np.any(others)
         np.testing.assert_array_equal(is_sharper, sharp.cut_mesh.topology.semi_sharpness.edges > 0)
     assert not np.any(differences(*[meshes[0]] * 2))

@@ -71,8 +71,8 @@ def test_all_sides_of_an_edge_have_the_same_points():
     for peer in (book(3), book(4), joined(fidelity_cages.cube(), fidelity_cages.cube(), {0: 7, 1: 6})):
         surface = msub.LimitSurface(cage_of(peer))
         table = surface.sampling(4)
-        found = table.apply(surface.cage.positions)[0]
-        assert np.array_equal(found[table.copies[0]], found[table.copies[1]])
+        points = table.apply(surface.cage.positions)[0]
+        assert np.array_equal(points[table.copies[0]], points[table.copies[1]])
         # Whoever gives a position has its own.
         assert not np.isin(table.copies[1], table.copies[0]).any()
 
@@ -239,8 +239,8 @@ def test_strict_cages_are_manifolds(tmp_path):
 def test_every_scheme_takes_fans_that_share_a_vertex(scheme):
     peer = joined(fan(4, triangles=scheme == "loop"), fan(5, triangles=scheme == "loop"), {0: 0})
     surface = msub.LimitSurface(cage_of(peer), scheme)
-    found = surface.tessellate(3)
-    assert np.isfinite(found.positions).all()
+    tessellation = surface.tessellate(3)
+    assert np.isfinite(tessellation.positions).all()
     if scheme == "doo_sabin":
         # Each fan has a surface of its own.
         assert surface.patches.patch_count == 1 + 5
@@ -255,10 +255,10 @@ def test_data_that_is_linear_in_space_stays_so(interpolation):
     data = msub.Attribute(rows, interpolation, corners if interpolation == "face_varying" else None)
     surface = msub.LimitSurface(cage_of(peer, attributes={"place": data}, face_varying="none"))
     tessellation = surface.tessellate(4)
-    found = tessellation.attributes["place"]
-    assert np.isfinite(found).all()
+    places = tessellation.attributes["place"]
+    assert np.isfinite(places).all()
     if interpolation != "varying":
-        np.testing.assert_allclose(found, tessellation.positions[:, :2], atol=1e-14)
+        np.testing.assert_allclose(places, tessellation.positions[:, :2], atol=1e-14)
 
 
 @pytest.mark.parametrize("mode", ["none", "corners_only", "corners_plus1", "corners_plus2", "boundaries"])
@@ -285,8 +285,8 @@ def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, m
             fixed = [(row, 10) for row, v in vertex.items() if v in held or (is_linear[row] and v >= spine)]
             alone = msub.LimitSurface(tagged(alone, corners=fixed), scheme)
             element, uv = np_rng.integers(0, len(faces), 40), np_rng.random((40, 2)) / 2
-            found = surface.evaluate_attribute("a", faces[element], uv)
-            np.testing.assert_allclose(found, alone.evaluate(element, uv).p, rtol=0, atol=1e-14)
+            evaluated = surface.evaluate_attribute("a", faces[element], uv)
+            np.testing.assert_allclose(evaluated, alone.evaluate(element, uv).p, rtol=0, atol=1e-14)
     assert held_once == set(range(spine))
 
 
@@ -334,20 +334,20 @@ def test_what_is_no_manifold_is_so_by_definition(np_rng, monkeypatch):
             monkeypatch.setattr(manifold, "FEW_FACES", few_faces)
             assert manifold.is_manifold(mesh) == is_manifold, faces
         manifolds += is_manifold
-        separate, found = manifold.separated(mesh)
-        assert (found is not None) == bool(expected.vertices), faces
+        separate, non_manifold = manifold.separated(mesh)
+        assert (non_manifold is not None) == bool(expected.vertices), faces
         twins = np.full(mesh.half_edge_count, -1)
         twins[list(expected.twin)] = list(expected.twin.values())
         np.testing.assert_array_equal(separate.twin, twins)
-        if found is None:
+        if non_manifold is None:
             continue
-        assert set(np.flatnonzero(found.is_edge)) == expected.edges, faces
-        assert set(np.flatnonzero(found.has_one_face)) == expected.own_edges, faces
-        assert set(np.flatnonzero(found.is_vertex)) == expected.vertices, faces
-        assert set(np.flatnonzero(found.is_crease)) == expected.creases, faces
-        assert set(found.closed_fans) == expected.closed_fans, faces
-        np.testing.assert_array_equal(found.is_corner, found.is_vertex & ~found.is_crease)
-        assert len(np.unique(found.edge)) == mesh.edge_count
+        assert set(np.flatnonzero(non_manifold.is_edge)) == expected.edges, faces
+        assert set(np.flatnonzero(non_manifold.has_one_face)) == expected.own_edges, faces
+        assert set(np.flatnonzero(non_manifold.is_vertex)) == expected.vertices, faces
+        assert set(np.flatnonzero(non_manifold.is_crease)) == expected.creases, faces
+        assert set(non_manifold.closed_fans) == expected.closed_fans, faces
+        np.testing.assert_array_equal(non_manifold.is_corner, non_manifold.is_vertex & ~non_manifold.is_crease)
+        assert len(np.unique(non_manifold.edge)) == mesh.edge_count
         creases += len(expected.creases)
         closed_fans += len(expected.closed_fans)
     assert min(creases, closed_fans, manifolds) > 10

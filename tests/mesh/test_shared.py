@@ -29,8 +29,8 @@ def test_values_of_different_keys_are_made_at_the_same_time(pool):
         all_make.wait(LIMIT)
         return _Value()
 
-    found = list(pool.map(lambda key: shared.get(key, make), range(THREADS)))
-    assert len(set(found)) == THREADS
+    values = list(pool.map(lambda key: shared.get(key, make), range(THREADS)))
+    assert len(set(values)) == THREADS
 
 
 def test_a_value_that_several_threads_request_is_made_once(pool):

@@ -59,14 +59,14 @@ def largest_difference(before, after, refinement, rng, of_points=True):
     scale = (np.where(before.patches.is_whole[old], 0.5, 1) * np.where(is_middle, -1, 1))[:, None]
     here = old, scale * uv + np.where(is_middle, 0.5, 0)[:, None], np.maximum(corner, 0)
     there = element, uv, is_middle.astype(int)
-    found = []
+    differences = []
     if of_points:
         one, other = before.evaluate(*here), after.evaluate(*there)
-        found = [one.p - other.p, scale * one.dp_du - other.dp_du, scale * one.dp_dv - other.dp_dv]
+        differences = [one.p - other.p, scale * one.dp_du - other.dp_du, scale * one.dp_dv - other.dp_dv]
     assert before.attribute_names == after.attribute_names
     for name in before.attribute_names:
-        found.append(before.evaluate_attribute(name, *here) - after.evaluate_attribute(name, *there))
-    return max(np.abs(each).max() for each in found)
+        differences.append(before.evaluate_attribute(name, *here) - after.evaluate_attribute(name, *there))
+    return max(np.abs(difference).max() for difference in differences)
 
 
 def check_refined(surface, rng, of_points=True, times=1):

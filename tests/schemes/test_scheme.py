@@ -44,8 +44,8 @@ def test_regular_patches_reproduce_constant_and_linear_functions(name):
     constant, linear = weights.sum(axis=2), weights @ scheme.regular_lattice
     np.testing.assert_allclose(constant, [[1.0]] + 5 * [[0.0]] + np.zeros(len(uv)), rtol=0, atol=ROUNDED)
     np.testing.assert_allclose(linear[0] - uv, np.broadcast_to(linear[0, 0] - uv[0], uv.shape), rtol=0, atol=ROUNDED)
-    for found, expected in zip(linear[1:], ([1, 0], [0, 1], [0, 0], [0, 0], [0, 0]), strict=True):
-        np.testing.assert_allclose(found, np.broadcast_to(expected, uv.shape), rtol=0, atol=ROUNDED)
+    for row, expected in zip(linear[1:], ([1, 0], [0, 1], [0, 0], [0, 0], [0, 0]), strict=True):
+        np.testing.assert_allclose(row, np.broadcast_to(expected, uv.shape), rtol=0, atol=ROUNDED)
 
 
 # Back to back: every vertex has valence 2, and edges that cut off a corner have the same ends on both sides.

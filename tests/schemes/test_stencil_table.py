@@ -33,8 +33,8 @@ def test_table_of_a_sparse_array_gives_it_back():
     rows, columns, weights = scattered(9, 4, 20, seed=2)
     matrix = sparse.coo_array((weights, (rows, columns)), shape=(9, 4)).tocsr()
     table = StencilTable.from_matrix(matrix)
-    for found in (table.matrix.toarray(), table.dense(np.arange(9))):
-        np.testing.assert_array_equal(found, matrix.toarray())
+    for dense in (table.matrix.toarray(), table.dense(np.arange(9))):
+        np.testing.assert_array_equal(dense, matrix.toarray())
 
 
 def test_a_cage_of_few_classes_is_tessellated_without_scipy():
