@@ -125,6 +125,9 @@ def test_no_fewer_samples_are_taken_than_asked_for(tmp_path):
     path = tmp_path / "whole.exr"
     assert main(["render", SCENE, *SMALL, "--spp", "44", "--batch", "8", "-o", str(path), "--passes", "1"]) == 0
     assert (load_image(path).estimate.count == 48).all()
+    # Each of many passes has a batch.
+    assert main(["render", SCENE, *SMALL, "--spp", "8", "-o", str(path), "--passes", "8"]) == 0
+    assert (load_image(path).estimate.count == 8).all()
 
 
 @pytest.fixture(scope="module")

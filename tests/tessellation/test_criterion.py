@@ -233,6 +233,14 @@ def test_an_outline_in_view_is_noticed(direction, np_rng):
     assert np.count_nonzero(found) < 1.2 * np.count_nonzero(is_near)
 
 
+def test_pixels_are_as_small_as_at_the_nearest_point_of_a_box(np_rng):
+    centre, half = np_rng.normal(size=(3, 100)), np_rng.random((3, 100))
+    eye = np.array([0.5, -1, 1])
+    nearest = np.clip(eye[:, None], centre - half, centre + half)
+    expected = 1e-3 * np.linalg.norm(nearest - eye[:, None], axis=0)
+    np.testing.assert_allclose(Sensor(eye, 1e-3).pixel_size(centre - half, centre + half), expected, rtol=1e-12)
+
+
 def test_only_outlines_are_fine_where_only_they_are_asked_for():
     # As fine as the highest rate allows, without a warning: pictures by default settings ask for outlines of a tenth of
     # a pixel, and for few triangles first.
