@@ -37,11 +37,11 @@ def test_work_gives_its_result_or_its_error_and_another_thread_does_its_own():
     assert interruptible(lambda: 3) == 3
     with pytest.raises(ZeroDivisionError):
         interruptible(lambda: 1 / 0)
-    found = []
-    thread = threading.Thread(target=lambda: found.append(interruptible(threading.get_ident)))
+    result = []
+    thread = threading.Thread(target=lambda: result.append(interruptible(threading.get_ident)))
     thread.start()
     thread.join()
-    assert found == [thread.ident]
+    assert result == [thread.ident]
 
 
 def test_ctrl_c_does_not_wait_for_the_work():

@@ -42,7 +42,7 @@ def made(name, given, folder):
 
 
 def test_these_are_all_public_functions_that_ask_for_mitsuba():
-    found = set()
+    result = set()
     for name in msub.__all__:
         public = getattr(msub, name)
         members = {name: public}
@@ -53,8 +53,8 @@ def test_these_are_all_public_functions_that_ask_for_mitsuba():
             if not inspect.isfunction(function):
                 continue
             if {"mi", "variant", "float_type"} & {*inspect.signature(function).parameters}:
-                found.add(own)
-    assert found == {*FUNCTIONS}
+                result.add(own)
+    assert result == {*FUNCTIONS}
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

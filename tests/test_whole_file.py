@@ -73,9 +73,9 @@ def test_a_failed_write_leaves_what_was_there_and_names_its_own_file(tmp_path, b
             beside.write_text("ne")
             raise error(beside)
 
-    with pytest.raises(kind, match=message) as found:
+    with pytest.raises(kind, match=message) as result:
         fail()
-    assert ".part" not in str(found.value)
+    assert ".part" not in str(result.value)
     assert names(tmp_path) == before
     assert [(tmp_path / name).read_text() for name in before] == ["old"] * len(before)
 
@@ -103,9 +103,9 @@ def test_two_processes_write_one_file_without_mixing(tmp_path):
     try:
         while seen != {b"x", b"y"} and time.monotonic() < deadline:
             if path.exists():
-                found = path.read_bytes()
-                assert found == found[:1] * SIZE
-                seen.add(found[:1])
+                result = path.read_bytes()
+                assert result == result[:1] * SIZE
+                seen.add(result[:1])
             assert all(writer.poll() is None for writer in writers)
         assert seen == {b"x", b"y"}
     finally:

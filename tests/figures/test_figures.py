@@ -139,8 +139,8 @@ def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage)
     assert valence == 3 == cage.topology.vertex_face_count[0]
     assert cage.face_vertices.reshape(-1, 4)[:valence, 0].tolist() == [0] * valence
     assert len(cage.holes) < cage.face_count
-    for found, expected in zip(frame(LimitSurface(cage)), like, strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9)
+    for result, expected in zip(frame(LimitSurface(cage)), like, strict=True):
+        np.testing.assert_allclose(result, expected, atol=1e-9)
     # The same surface, but for where it lies: ratios of distances stay.
     original = ControlCage.from_file(own_cage)
     while original.face_count < cage.face_count:
@@ -366,10 +366,10 @@ def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path, answering):
     answers = {"p": points, "n": normals, "corners": quad, "version": np.array([3, 4, 1], dtype=np.int32)}
     # The last three words are both files and the level.
     said = f'while [ $# -gt 3 ]; do echo "$1"; shift; done > {tmp_path}/words; echo "$3" >> {tmp_path}/words'
-    found = peers.blender_mesh(answering("blender", said, **answers), cube(), 5)
-    assert np.array_equal(found[0], points.reshape(4, 3))
-    assert np.array_equal(found[1], normals.reshape(4, 3))
-    assert (found[2].tolist(), found[3]) == ([[0, 1, 2, 3]], "3.4")
+    result = peers.blender_mesh(answering("blender", said, **answers), cube(), 5)
+    assert np.array_equal(result[0], points.reshape(4, 3))
+    assert np.array_equal(result[1], normals.reshape(4, 3))
+    assert (result[2].tolist(), result[3]) == ([[0, 1, 2, 3]], "3.4")
     words = (tmp_path / "words").read_text().split()
     assert "--background" in words
     assert words[-3:] == [str(peers.BLENDER_SCRIPT), "--", "5"]

@@ -48,7 +48,7 @@ def dome(size=SIZE):
 
 
 def random_image(rng, batches=4, name="image", mean=None, rate=0.0, **changes):
-    found = estimate(rng, batches, mean, rate).stored()
+    result = estimate(rng, batches, mean, rate).stored()
     paired = estimate(np.random.default_rng(99), 1, mean).stored().mean
-    values = {"estimate": found, "paired": paired, "probe": dome(), "metadata": METADATA, **changes}
-    return Image(name, found.mean, **values)
+    values = {"estimate": result, "paired": paired, "probe": dome(), "metadata": METADATA, **changes}
+    return Image(name, result.mean, **values)

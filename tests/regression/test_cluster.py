@@ -28,10 +28,10 @@ def test_two_workers_give_the_bits_of_one_machine(variant_llvm_ad_rgb, address):
     loaded = load()
     alone = merge_passes([render_pass(loaded, SAMPLING, i + 1, PASSES, with_probe=True) for i in range(PASSES)])
     together = render_on_cluster(address, load, variant_llvm_ad_rgb, SAMPLING, PASSES, with_probe=True)
-    found, expected = (
+    result, expected = (
         (each.pixels, each.estimate.variance, each.paired, each.probe.position) for each in (together, alone)
     )
-    assert all(map(np.array_equal, found, expected))
+    assert all(map(np.array_equal, result, expected))
 
 
 def test_no_cluster_is_said():

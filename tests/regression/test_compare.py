@@ -25,8 +25,8 @@ def reference():
     return random_image(np.random.default_rng(1), 400, "reference")
 
 
-def statuses(found):
-    return {tier.name: tier.status.value for tier in found.tiers}
+def statuses(result):
+    return {tier.name: tier.status.value for tier in result.tiers}
 
 
 def is_within(worst, low, high):
@@ -65,12 +65,12 @@ def test_the_worst_pixel_is_none_that_only_one_image_hits_and_names_values_and_s
     y, x = np.argwhere(dome().hit)[0]
     normal = dome().normal.copy()
     normal[y, x], normal[16, 12] = 0, -normal[16, 12]
-    found = compare(reference, with_probe(np_rng, **dome_with("shape", (y, x), NOTHING), normal=normal))
-    assert statuses(found)["probe"] == "fail"
-    assert (found.worst.x, found.worst.y, found.worst.shown_by) == (12, 16, "probe")
+    result = compare(reference, with_probe(np_rng, **dome_with("shape", (y, x), NOTHING), normal=normal))
+    assert statuses(result)["probe"] == "fail"
+    assert (result.worst.x, result.worst.y, result.worst.shown_by) == (12, 16, "probe")
     element = dome().element[16, 12]
-    assert f"element {element}, triangle {element} of shape 0, (u, v) = (" in str(found.worst)
-    assert f"{reference.pixels[16, 12, 0]:.6g}" in str(found.worst)
+    assert f"element {element}, triangle {element} of shape 0, (u, v) = (" in str(result.worst)
+    assert f"{reference.pixels[16, 12, 0]:.6g}" in str(result.worst)
 
 
 def test_evidence_is_of_the_scale_that_is_clearest(reference):
@@ -84,8 +84,8 @@ def test_evidence_is_of_the_scale_that_is_clearest(reference):
 
 @pytest.mark.core
 def test_unchanged_images_pass(reference, np_rng):
-    found = compare(reference, random_image(np_rng, 4, "test"))
-    assert (statuses(found), found.exit_status) == ({"probe": "pass", "paired": "pass", "tile": "pass"}, 0)
+    result = compare(reference, random_image(np_rng, 4, "test"))
+    assert (statuses(result), result.exit_status) == ({"probe": "pass", "paired": "pass", "tile": "pass"}, 0)
     assert compare(reference, reference).worst is None
 
 
@@ -144,9 +144,9 @@ def test_tiles_at_the_edge_end_with_the_picture():
 def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference, np_rng):
     """Unless the probe differs."""
     test = random_image(np_rng, mean=1.5 * truth(), paired=reference.paired)
-    found = compare(reference, test)
-    assert statuses(found) == {"probe": "pass", "paired": "pass", "tile": "pass"}
-    assert "same bits" in found.tier("tile").lines[0]
+    result = compare(reference, test)
+    assert statuses(result) == {"probe": "pass", "paired": "pass", "tile": "pass"}
+    assert "same bits" in result.tier("tile").lines[0]
     turned = replace(test, probe=replace(test.probe, normal=-test.probe.normal))
     assert statuses(compare(reference, turned)) == {"probe": "fail", "paired": "pass", "tile": "fail"}
     assert statuses(compare(reference, test, ["paired", "tile"]))["tile"] == "fail"
@@ -156,9 +156,9 @@ def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference
 def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
     mean = truth()
     mean[8 : 8 + side, 8 : 8 + side] *= factor
-    found = compare(reference, random_image(np_rng, 8, mean=mean), ["tile"]).tier("tile")
-    assert found.status is Status.FAIL
-    assert found.worst[0] >= 4
+    result = compare(reference, random_image(np_rng, 8, mean=mean), ["tile"]).tier("tile")
+    assert result.status is Status.FAIL
+    assert result.worst[0] >= 4
 
 
 def test_the_relative_error_of_a_grey_image_has_a_closed_form():
@@ -186,8 +186,8 @@ def test_angles_between_normals_are_those_of_a_turn(degrees):
 
 def test_probes_that_hit_nothing_are_alike(reference, np_rng):
     sky = replace(dome(), **{name: np.full_like(dome().shape, NOTHING) for name in ("shape", "triangle", "element")})
-    found = compare(replace(reference, probe=sky), random_image(np_rng, 4, probe=sky), ["probe"])
-    assert found.status is Status.PASS
+    result = compare(replace(reference, probe=sky), random_image(np_rng, 4, probe=sky), ["probe"])
+    assert result.status is Status.PASS
 
 
 def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
@@ -199,8 +199,8 @@ def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
 
 
 def test_more_scenes_ask_for_more_evidence(reference, np_rng):
-    found = (compare(reference, random_image(np_rng), ["tile"], suite_size=count).tier("tile") for count in (1, 10))
-    of_one, of_ten = (tier.numbers["scales"]["8"]["limit"] for tier in found)
+    result = (compare(reference, random_image(np_rng), ["tile"], suite_size=count).tier("tile") for count in (1, 10))
+    of_one, of_ten = (tier.numbers["scales"]["8"]["limit"] for tier in result)
     assert of_one == pytest.approx(1 - (1 - 0.01 / 4) ** (1 / (16 * 3)))
     assert of_ten == pytest.approx(of_one / 10, rel=2e-3)
 
@@ -218,9 +218,9 @@ def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, ro
     pixels = reference.pixels.copy()
     pixels[3, 5, 1] = value
     broken = replace(reference, pixels=pixels)
-    found = compare(broken, random_image(np_rng)) if role == "reference" else compare(reference, broken)
-    assert (statuses(found), found.worst.x, found.worst.y) == ({"finite": "fail"}, 5, 3)
-    assert found.tier("finite").lines == [f"the {role} is not: G = {value} at x = 5, y = 3"]
+    result = compare(broken, random_image(np_rng)) if role == "reference" else compare(reference, broken)
+    assert (statuses(result), result.worst.x, result.worst.y) == ({"finite": "fail"}, 5, 3)
+    assert result.tier("finite").lines == [f"the {role} is not: G = {value} at x = 5, y = 3"]
 
 
 PROBES = {
@@ -238,9 +238,9 @@ PROBES = {
 @pytest.mark.core
 @pytest.mark.parametrize(("changes", "status", "word"), PROBES.values(), ids=PROBES)
 def test_probe(reference, np_rng, changes, status, word):
-    found = compare(reference, with_probe(np_rng, **changes()), ["probe"]).tier("probe")
-    assert found.status.value == status
-    assert word in found.lines[0]
+    result = compare(reference, with_probe(np_rng, **changes()), ["probe"]).tier("probe")
+    assert result.status.value == status
+    assert word in result.lines[0]
 
 
 def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do(reference, np_rng):
@@ -255,9 +255,9 @@ def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do
         normal = dome().normal.copy()
         normal[16 + y, 16 + x] *= -1
         changed = with_probe(np_rng, normal=normal, **dome_with("shape", (16, 16), NOTHING))
-        found = compare(reference, changed, ["probe"])
+        result = compare(reference, changed, ["probe"])
         is_near = any(max(abs(y - b), abs(x - a)) <= 1 for b, a in silhouette)
-        assert found.tier("probe").status is (Status.PASS if is_near else Status.FAIL), (y, x)
+        assert result.tier("probe").status is (Status.PASS if is_near else Status.FAIL), (y, x)
 
 
 @pytest.mark.parametrize(("other", "what"), [("angle_p999", "maximum"), ("angle_max", "99.9th percentile")])
@@ -265,17 +265,17 @@ def test_the_worst_normal_is_none_at_a_silhouette(reference, np_rng, other, what
     """Its own is turned more than those of some pixels in the middle."""
     normal = rotated(20)
     normal[tuple(np.argwhere(dome().hit)[0])] *= -1
-    found = compare(reference, with_probe(np_rng, normal=normal), ["probe"], LIMITS.with_values({other: 180}))
-    assert f"degrees between normals, {what}" in found.tier("probe").lines[0]
-    assert is_within(found.worst, 12, 20)
+    result = compare(reference, with_probe(np_rng, normal=normal), ["probe"], LIMITS.with_values({other: 180}))
+    assert f"degrees between normals, {what}" in result.tier("probe").lines[0]
+    assert is_within(result.worst, 12, 20)
 
 
 def test_one_pixel_in_a_thousand_may_hit_another_triangle(reference, np_rng):
     for count, status in ((1, Status.PASS), (2, Status.WARN)):
         triangle = dome().triangle.copy()
         triangle[16, 16 : 16 + count] += 1
-        found = compare(reference, with_probe(np_rng, triangle=triangle), ["probe"]).tier("probe")
-        assert (found.status, found.numbers["triangle_fraction"]) == (status, count / SIZE**2)
+        result = compare(reference, with_probe(np_rng, triangle=triangle), ["probe"]).tier("probe")
+        assert (result.status, result.numbers["triangle_fraction"]) == (status, count / SIZE**2)
 
 
 def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np_rng):
@@ -284,18 +284,18 @@ def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np
     paired[7, 9] *= 1.001
     mean[16:24, 16:24] *= 2
     other = {**METADATA, "environment": {"llvm": "1", "processor": "b"}}
-    found = compare(reference, random_image(np_rng, mean=mean, paired=paired, metadata=other))
-    assert statuses(found) == {"probe": "pass", "paired": "warn", "tile": "fail"}
-    assert (found.tier("paired").worst, found.worst.shown_by) == ((7, 9), "tile")
-    assert is_within(found.worst, 16, 24)
+    result = compare(reference, random_image(np_rng, mean=mean, paired=paired, metadata=other))
+    assert statuses(result) == {"probe": "pass", "paired": "warn", "tile": "fail"}
+    assert (result.tier("paired").worst, result.worst.shown_by) == ((7, 9), "tile")
+    assert is_within(result.worst, 16, 24)
 
 
 def test_paired_differences_fail_and_say_where_but_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
     paired = reference.paired.copy()
     paired[7, 9, 2] *= 1.001
-    found = compare(reference, random_image(np_rng, paired=paired))
-    assert statuses(found) == {"probe": "pass", "paired": "fail", "tile": "pass"}
-    assert (found.worst.x, found.worst.y, found.exit_status) == (9, 7, 2)
+    result = compare(reference, random_image(np_rng, paired=paired))
+    assert statuses(result) == {"probe": "pass", "paired": "fail", "tile": "pass"}
+    assert (result.worst.x, result.worst.y, result.exit_status) == (9, 7, 2)
     rounded = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
     assert compare(reference, rounded, ["paired"]).exit_status == 0
     assert compare(reference, rounded, ["paired"], replace(LIMITS, paired_relative=0)).exit_status == 2
@@ -313,9 +313,9 @@ def test_differences_of_dark_pixels_are_relative_to_a_thousandth_of_the_mean(ref
 def test_another_environment_downgrades_to_the_tile_tier(reference, np_rng):
     other = {**METADATA, "environment": {"llvm": "19", "processor": "a"}}
     changed = {"paired": 1.001 * reference.paired, "metadata": other}
-    found = compare(reference, random_image(np_rng, **changed), ["paired"])
-    assert (statuses(found), found.exit_status) == ({"paired": "warn", "tile": "pass"}, 1)
-    assert "llvm 19 here, 23 in the reference" in str(found)
+    result = compare(reference, random_image(np_rng, **changed), ["paired"])
+    assert (statuses(result), result.exit_status) == ({"paired": "warn", "tile": "pass"}, 1)
+    assert "llvm 19 here, 23 in the reference" in str(result)
     same = compare(reference, random_image(np_rng, metadata=other), ["paired"])
     assert statuses(same) == {"paired": "pass"}
     # Without a variance, there is none to fall back on.
@@ -335,9 +335,9 @@ SKIPPED = {"paired": "skipped", "tile": "pass"}
     ],
 )
 def test_other_samples_downgrade_to_the_tile_tier_and_other_files_are_named(reference, np_rng, change, expected, said):
-    found = compare(reference, random_image(np_rng, metadata={**METADATA, **change}), ["paired"])
-    assert statuses(found) == expected
-    assert said in str(found)
+    result = compare(reference, random_image(np_rng, metadata={**METADATA, **change}), ["paired"])
+    assert statuses(result) == expected
+    assert said in str(result)
 
 
 UNUSABLE = {

@@ -46,9 +46,9 @@ def test_metadata_keep_their_digits_and_their_order_does_not_change_the_bytes(tm
 def test_any_file_with_r_g_b_is_an_image_and_standard_error_is_where_it_was_after_reading(tmp_path):
     before = os.fstat(2)
     write_exr(tmp_path / "a.exr", PIXELS)
-    found = load_image(tmp_path / "a.exr")
-    assert np.array_equal(found.pixels, PIXELS)
-    assert found.estimate is found.probe is found.paired is None
+    result = load_image(tmp_path / "a.exr")
+    assert np.array_equal(result.pixels, PIXELS)
+    assert result.estimate is result.probe is result.paired is None
     (tmp_path / "broken.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-20])
     with pytest.raises(ImageError, match=r"broken\.exr"):
         read_channels(tmp_path / "broken.exr")
@@ -71,10 +71,10 @@ def write(path, *content):
 
 
 def channels(**changes):
-    found = dict.fromkeys("RGB", PIXELS[..., 0])
-    found |= {f"variance.{name}": PIXELS[..., 0] for name in "RGB"} | {"N": np.full((2, 4), 3)}
-    found |= changes
-    return {name: values for name, values in found.items() if values is not None}
+    result = dict.fromkeys("RGB", PIXELS[..., 0])
+    result |= {f"variance.{name}": PIXELS[..., 0] for name in "RGB"} | {"N": np.full((2, 4), 3)}
+    result |= changes
+    return {name: values for name, values in result.items() if values is not None}
 
 
 UNUSABLE = {

@@ -32,8 +32,8 @@ def test_shares_have_every_batch_once():
 
 def test_samples_come_in_whole_batches_of_which_there_are_four():
     for spp, *expected in ((256, 4, 64), (100, 4, 25), (1, 4, 1), (200, 4, 50), (300, 5, 64)):
-        found = Sampling.of_spp(spp)
-        assert [found.batches, found.batch] == expected
+        result = Sampling.of_spp(spp)
+        assert [result.batches, result.batch] == expected
 
 
 def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
@@ -130,26 +130,26 @@ def test_any_split_gives_mean_and_variance_of_all(np_rng, split, offset):
     rest, parts = iter(every), []
     for size in split:
         parts.append(combine(next(rest) for _ in range(size)))
-    found = combine(parts)
+    result = combine(parts)
     means = np.stack([batch.mean for batch in every])
-    assert np.allclose(found.mean, means.mean(axis=0), rtol=1e-14)
+    assert np.allclose(result.mean, means.mean(axis=0), rtol=1e-14)
     # Of E[x^2] - E[x]^2 nothing would be left at an offset of a million.
-    assert np.allclose(found.variance, 16 * means.var(axis=0, ddof=1), rtol=1e-8)
-    assert (found.count == 12 * 16).all()
-    assert found.batches == 12
+    assert np.allclose(result.variance, 16 * means.var(axis=0, ddof=1), rtol=1e-8)
+    assert (result.count == 12 * 16).all()
+    assert result.batches == 12
 
 
 def test_samples_weigh_alike_in_batches_of_any_size(np_rng):
     small, large = batches(np_rng, 3, 4), batches(np_rng, 2, 50)
-    found = combine([*small, *large]).mean
+    result = combine([*small, *large]).mean
     expected = sum(batch.mean * batch.count[0, 0] for batch in [*small, *large]) / (3 * 4 + 2 * 50)
-    assert np.allclose(found, expected, rtol=1e-14)
+    assert np.allclose(result, expected, rtol=1e-14)
 
 
 def test_variance_is_that_of_a_sample_and_one_batch_tells_none(np_rng):
-    found = estimate(np_rng, 400).variance / (SPREAD * truth()) ** 2
+    result = estimate(np_rng, 400).variance / (SPREAD * truth()) ** 2
     # 399 degrees of freedom: 7 % a pixel; 3072 of them.
-    assert found.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / 399 / found.size))
+    assert result.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / 399 / result.size))
     assert BATCH > 1
     assert not combine(batches(np_rng, 1)).variance.any()
 

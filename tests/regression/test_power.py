@@ -30,15 +30,15 @@ def valence(request):
 
 @pytest.fixture
 def reference(valence, variant_llvm_ad_rgb):  # noqa: ARG001 - the variant must be set
-    found = load_image(REFERENCES / f"valence{valence}.exr")
+    result = load_image(REFERENCES / f"valence{valence}.exr")
     # The scenes below are loaded, with their parameters.
-    assert found.metadata["parameters"] == {"resolution": str(RESOLUTION)}
-    return replace(found, metadata={**found.metadata, "parameters": {}})
+    assert result.metadata["parameters"] == {"resolution": str(RESOLUTION)}
+    return replace(result, metadata={**result.metadata, "parameters": {}})
 
 
-def failing(found):
+def failing(result):
     # On another machine than the reference's, the paired tier only warns.
-    return {tier.name for tier in found.tiers if tier.status in (Status.FAIL, Status.WARN)}
+    return {tier.name for tier in result.tiers if tier.status in (Status.FAIL, Status.WARN)}
 
 
 # Stam's form is another number at each valence, the others change both scenes alike.
@@ -46,9 +46,9 @@ def failing(found):
     ("valence", "name"), [*((5, name) for name in DEFECTS), (3, "Stam's form")], indirect=["valence"]
 )
 def test_defects_are_caught(reference, valence, name):
-    found = compare_scene(reference, DEFECTS[name](valence))
-    assert found.status is Status.FAIL
-    assert failing(found) == CAUGHT_BY[name], str(found)
+    result = compare_scene(reference, DEFECTS[name](valence))
+    assert result.status is Status.FAIL
+    assert failing(result) == CAUGHT_BY[name], str(result)
 
 
 @pytest.mark.parametrize("valence", [3], indirect=True)
@@ -58,8 +58,8 @@ def test_defects_are_caught(reference, valence, name):
 def test_the_tile_tier_is_sure_of_one_per_cent_and_of_nothing(reference, valence, load, seeds, status):
     """At the usual 256 samples."""
     scene = load(valence)
-    found = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in range(seeds)]
-    assert [str(each) for each in found if each.status is not status] == []
+    result = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in range(seeds)]
+    assert [str(each) for each in result if each.status is not status] == []
 
 
 @pytest.mark.parametrize("valence", [5], indirect=True)

@@ -33,6 +33,6 @@ def test_writing_a_reference_again_gives_the_same_bytes(tmp_path, variant_llvm_a
     paths = [tmp_path / name / "reference.exr" for name in ("a", "b")]
     for path in paths:
         with variant_set(variant_llvm_ad_rgb):
-            found = render_reference(SCENES / "valence3.xml", path, {"resolution": 16}, Sampling.of_spp(256))
-            save_image(path, found)
+            result = render_reference(SCENES / "valence3.xml", path, {"resolution": 16}, Sampling.of_spp(256))
+            save_image(path, result)
     assert paths[0].read_bytes() == paths[1].read_bytes()

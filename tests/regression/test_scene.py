@@ -35,8 +35,8 @@ for seed in range(3):
 
 def test_rendering_works_after_errors_that_are_kept(variant_llvm_ad_rgb):  # noqa: ARG001 - skips where there is no LLVM
     command = [sys.executable, "-c", SCRIPT, str(SCENES / "valence3.xml")]
-    found = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
-    assert found.returncode == 0, found.stderr
+    result = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
@@ -79,12 +79,12 @@ def test_processors_of_one_name_are_told_apart_and_those_without_have_numbers():
     # A list of another form gives nothing.
     assert scenes._first_of("") == scenes._first_of("no colon\n") == ""
     # This one.
-    found = scenes.environment("scalar_rgb")["processor"]
+    result = scenes.environment("scalar_rgb")["processor"]
     information = Path("/proc/cpuinfo")
     if information.is_file():
-        assert found == scenes._first_of(information.read_text(encoding="utf-8", errors="replace"))
+        assert result == scenes._first_of(information.read_text(encoding="utf-8", errors="replace"))
     else:
-        assert found
+        assert result
 
 
 SIZE = 8

@@ -27,10 +27,10 @@ def test_denoising_removes_noise(model):
     pytest.importorskip("mitsuba_oidn")
     scene = studio_scene(model, size=SIZE, rate=2)
     expected, noisy = (render_pixels(load_scene(scene, None, BOX).scene, seed, spp) for seed, spp in ((1, 128), (2, 8)))
-    found = render_denoised(scene, 8, 2)
-    assert found.shape == expected.shape
-    np.testing.assert_array_equal(found[..., 3:], noisy[..., 3:])
-    error, before = (np.sqrt(np.mean((each - expected)[..., :3] ** 2)) for each in (found, noisy))
+    result = render_denoised(scene, 8, 2)
+    assert result.shape == expected.shape
+    np.testing.assert_array_equal(result[..., 3:], noisy[..., 3:])
+    error, before = (np.sqrt(np.mean((each - expected)[..., :3] ** 2)) for each in (result, noisy))
     assert error < LEFT * before
 
 

@@ -89,11 +89,11 @@ def texture(tmp_path):
 
 def at(picture, *places):
     texture, hit = mi.load_dict(picture), mi.SurfaceInteraction3f()
-    found = []
+    result = []
     for uv in places:
         hit.uv = uv
-        found.append(float(np.array(texture.eval(hit)).mean()))
-    return found
+        result.append(float(np.array(texture.eval(hit)).mean()))
+    return result
 
 
 NAME = "a b 01#.exr"
@@ -145,13 +145,13 @@ def test_a_changed_picture_is_saved_with_its_scene(tmp_path, texture):
     (tmp_path / "cube.obj").write_text("mtllib a.mtl\n" + (tmp_path / "cube.obj").read_text())
     scene = studio_scene(tmp_path / "cube.obj", size=(16, 12), spp=16, rate=2, shading="vertex")
     save_scene(scene, tmp_path / "saved.xml")
-    found = [mi.traverse(each) for each in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))]
+    result = [mi.traverse(each) for each in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))]
     for name in ("data", "to_uv"):
-        values = [each for parameters in found for key, each in parameters if key.endswith(f"base_color.{name}")]
+        values = [each for parameters in result for key, each in parameters if key.endswith(f"base_color.{name}")]
         one, other = (np.array(getattr(each, "matrix", each)) for each in values)
         np.testing.assert_allclose(other, one, atol=1e-3)
     # 0.5 + 0.25 c, in half floats.
-    data = np.sort(np.array(next(each for key, each in found[1] if key.endswith("base_color.data"))), axis=None)
+    data = np.sort(np.array(next(each for key, each in result[1] if key.endswith("base_color.data"))), axis=None)
     assert data[[0, -1]] == pytest.approx([0.5, 0.75], abs=1e-3)
 
 

@@ -79,9 +79,9 @@ def test_mitsubas_sensor_has_every_limit_point_on_its_film(up, view):
     reach = []
     for size in ((64, 48), (20, 90), (200, 10)):
         sensor = mi.load_dict(studio_scene(surface.cage, view=view, up=up, size=size)["sensor"])
-        found = mi.Interaction3f()
-        found.p = upload(mi.Point3f, points)
-        places = np.array(sensor.sample_direction(found, mi.Point2f(0))[0].uv).T / size
+        result = mi.Interaction3f()
+        result.p = upload(mi.Point3f, points)
+        places = np.array(sensor.sample_direction(result, mi.Point2f(0))[0].uv).T / size
         assert (places > MARGIN / 2).all()
         assert (places < 1 - MARGIN / 2).all()
         reach.append(np.ptp(places, axis=0).max())
@@ -190,15 +190,15 @@ def test_cages_in_memory_are_read_back_from_a_saved_scene(tmp_path, cage, suffix
     *_, written = save_scene(scene, tmp_path / "s.xml")
     assert (tmp_path / f"s_surface{suffix}").is_file()
     shapes = [
-        found
+        result
         for each in (scene, written)
-        for found in map(mi.traverse, load_scene(each).scene.shapes())
-        if "control_points" in found and len(found["control_points"]) == cage.positions.size
+        for result in map(mi.traverse, load_scene(each).scene.shapes())
+        if "control_points" in result and len(result["control_points"]) == cage.positions.size
     ]
-    keys = [set(found.keys()) for found in shapes]
+    keys = [set(result.keys()) for result in shapes]
     assert keys[0] == keys[1]
     for key in (key for key in keys[0] if key.startswith(("control_points", "cage_", "vertex_", "faces"))):
-        np.testing.assert_allclose(*(np.array(found[key]) for found in shapes), atol=1e-6, err_msg=key)
+        np.testing.assert_allclose(*(np.array(result[key]) for result in shapes), atol=1e-6, err_msg=key)
 
 
 @scalar
