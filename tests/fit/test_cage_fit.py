@@ -59,8 +59,8 @@ def test_a_box_is_found_from_a_cube(views):
     fit = made(cube(), views, smoothing=1.0, learning_rate=0.08, edge_spp=4).run(28)
     # What is left is noise of four samples.
     assert np.mean(fit.losses[-5:]) < 0.5 * fit.losses[0]
-    found, expected = (LimitSurface(cage).bounds() for cage in (fit.cage, scaled(cube(), FACTORS)))
-    sizes = [each.upper.max(axis=0) - each.lower.min(axis=0) for each in (found, expected)]
+    fitted, expected = (LimitSurface(cage).bounds() for cage in (fit.cage, scaled(cube(), FACTORS)))
+    sizes = [each.upper.max(axis=0) - each.lower.min(axis=0) for each in (fitted, expected)]
     np.testing.assert_allclose(*sizes, rtol=0.03)
 
 
@@ -123,10 +123,10 @@ def test_colours_at_the_cage_are_found_and_refined():
     fit = made(plain, views_of(target, **shown), **options).run(36)
     # Of those that no view sees nothing is known.
     seen = np.array([0, 1, 4, 5])
-    found = fit.cage.attributes["colour"].values
-    assert np.abs(found - colours)[seen].mean() < 0.3 * np.abs(0.5 - colours)[seen].mean()
+    fitted = fit.cage.attributes["colour"].values
+    assert np.abs(fitted - colours)[seen].mean() < 0.3 * np.abs(0.5 - colours)[seen].mean()
     fit.refine()
-    np.testing.assert_allclose(fit.cage.attributes["colour"].values[:8].mean(axis=0), found.mean(axis=0), atol=0.2)
+    np.testing.assert_allclose(fit.cage.attributes["colour"].values[:8].mean(axis=0), fitted.mean(axis=0), atol=0.2)
     assert len(fit.cage.attributes["colour"].values) == 26
     fit.step()
 
@@ -212,10 +212,10 @@ def test_callbacks_see_each_step_and_a_cage_keeps_its_tags(views, tmp_path):
     creased, seen = tagged(cube(), creases=[(0, 1, 2.0)]), []
     fit = made(creased, views, callbacks=[lambda fit: seen.append(len(fit.losses))]).run(3)
     assert seen == [1, 2, 3]
-    fit.cage.save(tmp_path / "found.obj")
-    found = ControlCage.from_file(tmp_path / "found.obj")
-    np.testing.assert_array_equal(found.tags.creases(found.topology), creased.tags.creases(creased.topology))
-    np.testing.assert_array_equal(found.positions, fit.control_points)
+    fit.cage.save(tmp_path / "saved.obj")
+    saved = ControlCage.from_file(tmp_path / "saved.obj")
+    np.testing.assert_array_equal(saved.tags.creases(saved.topology), creased.tags.creases(creased.topology))
+    np.testing.assert_array_equal(saved.positions, fit.control_points)
 
 
 PICTURE = np.zeros((SIZE, SIZE, 3))

@@ -66,8 +66,8 @@ def test_control_points_that_nothing_holds_stay(target):
 def test_refining_moves_nothing_and_tags_stay(target):
     creased = tagged(target.cage, creases=[(*target.cage.edges[0], 3.0)])
     points = LimitSurface(creased).sample(300, 1).p
-    found = PointFit(moved(creased), points, refine=[1]).run(2).cage
-    assert found.tags.creases(found.topology)[:, 2].tolist() == [2.0, 2.0]
+    cage = PointFit(moved(creased), points, refine=[1]).run(2).cage
+    assert cage.tags.creases(cage.topology)[:, 2].tolist() == [2.0, 2.0]
     fit = PointFit(moved(target.cage), points)
     before = LimitSurface(fit.cage).tessellate(4).positions
     fit.refine()
@@ -78,11 +78,11 @@ def test_refining_moves_nothing_and_tags_stay(target):
 
 def test_a_mesh_becomes_a_cage(target):
     mesh = target.tessellate(8)
-    found = to_mesh(moved(target.cage), mesh.positions, mesh.triangles, steps=10)
+    cage = to_mesh(moved(target.cage), mesh.positions, mesh.triangles, steps=10)
     # The mesh's triangles lie inside the surface.
     triangles = target.closest_point(mesh.positions[mesh.triangles].mean(axis=1)).distance.max()
     size = np.linalg.norm(np.ptp(target.cage.positions, axis=0))
-    assert distance(LimitSurface(found), target) < 2 * triangles / size
+    assert distance(LimitSurface(cage), target) < 2 * triangles / size
 
 
 def test_a_checkpoint_resumes_its_fit_and_no_other(target, tmp_path):
@@ -147,8 +147,8 @@ def test_an_anchor_of_great_weight_holds_every_control_point(target):
     ],
 )
 def test_a_schedule_has_these_numbers(given, numbers):
-    found = [Schedule.of(given, "rate")(step) for step in numbers]
-    np.testing.assert_allclose(found, list(numbers.values()), rtol=1e-15)
+    values = [Schedule.of(given, "rate")(step) for step in numbers]
+    np.testing.assert_allclose(values, list(numbers.values()), rtol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -59,12 +59,12 @@ def test_gradients_are_those_of_differences(np_rng):
     flat = upload(mi.Float, points)
     dr.enable_grad(flat)
     dr.backward(folds(cage)(flat))
-    found = np.array(dr.grad(flat))
+    gradient = np.array(dr.grad(flat))
     flat = points.ravel()
     moved = STEP * np.eye(points.size)
     expected = [(value(cage, flat + each) - value(cage, flat - each)) / (2 * STEP) for each in moved]
-    assert np.abs(found).max() > 0.1
-    np.testing.assert_allclose(found, expected, atol=DIFFERENCE)
+    assert np.abs(gradient).max() > 0.1
+    np.testing.assert_allclose(gradient, expected, atol=DIFFERENCE)
 
 
 def test_a_folded_cage_opens():
@@ -99,17 +99,17 @@ def test_a_step_is_that_of_mitsuba(surface, np_rng):
     theirs = mi.ad.LargeSteps(points, upload(mi.UInt32, cage.triangles), 3.0)
     their_step = upload(mi.Float, gradient[np.array(theirs.index)])
     expected = theirs.from_differential(theirs.to_differential(points) + their_step)
-    own = LargeSteps(cage.laplacian(), 3.0)
-    found = own.from_differential(own.to_differential(points) + upload(mi.Float, gradient))
-    np.testing.assert_allclose(np.array(found), np.array(expected), atol=SINGLE)
+    steps = LargeSteps(cage.laplacian(), 3.0)
+    moved = steps.from_differential(steps.to_differential(points) + upload(mi.Float, gradient))
+    np.testing.assert_allclose(np.array(moved), np.array(expected), atol=SINGLE)
 
 
 @pytest.mark.core
 def test_coordinates_and_points_are_inverse_and_derivatives_solve_the_same_system(surface, np_rng):
     """In reverse and in forward mode, as the matrix is symmetric."""
     points, steps = surface.cage.positions, LargeSteps(surface.cage.laplacian(), 3.0)
-    found = steps.from_differential(steps.to_differential(points))
-    np.testing.assert_allclose(np.array(found).reshape(-1, 3), points, atol=SINGLE)
+    again = steps.from_differential(steps.to_differential(points))
+    np.testing.assert_allclose(np.array(again).reshape(-1, 3), points, atol=SINGLE)
 
     steps = LargeSteps(surface.stiffness(), 2.0)
     dense = np.eye(surface.cage.vertex_count) + 2.0 * surface.stiffness().toarray()
@@ -120,8 +120,8 @@ def test_coordinates_and_points_are_inverse_and_derivatives_solve_the_same_syste
     dr.enable_grad(u, v)
     dr.backward(dr.dot(steps.from_differential(u), upload(mi.Float, given)))
     dr.set_grad(v, upload(mi.Float, given))
-    for found in (u.grad, dr.forward_to(steps.from_differential(v))):
-        np.testing.assert_allclose(np.array(found).reshape(-1, 3), expected, atol=SINGLE)
+    for solution in (u.grad, dr.forward_to(steps.from_differential(v))):
+        np.testing.assert_allclose(np.array(solution).reshape(-1, 3), expected, atol=SINGLE)
 
 
 def test_a_step_of_one_point_moves_what_is_around(surface):

@@ -66,11 +66,11 @@ def test_derivatives_are_differences(name, method, np_rng):
     inside = np_rng.integers(0, HIGHEST, count) + np_rng.uniform(0.2, 0.8, count)
     at_ends = np.array([0, 1, HIGHEST])[:count]
     for sharpness, at in ((inside, inside), (at_ends, at_ends + np.where(at_ends < HIGHEST, 2, -2) * STEP)):
-        for k, found in enumerate(unknown.derivatives(sharpness.astype(float), positions)):
+        for k, derivative in enumerate(unknown.derivatives(sharpness.astype(float), positions)):
             ahead, behind = (unknown.matrix(at + side * STEP * np.eye(count)[k]) @ positions for side in (1, -1))
             expected = (ahead - behind) / (2 * STEP)
             bar = DIFFERENCE if at is sharpness else 10 * STEP * max(1, np.abs(expected).max())
-            np.testing.assert_allclose(found, expected, rtol=0, atol=bar)
+            np.testing.assert_allclose(derivative, expected, rtol=0, atol=bar)
 
 
 @pytest.mark.parametrize("name", ["cube", "triangles"])
