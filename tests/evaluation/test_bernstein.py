@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from evaluation.common import EVERY_SCHEME_OBJECT, inside
-from mitsuba_subdivision.evaluation.polynomials import regular_bernstein, times
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis, times
 
 pytestmark = pytest.mark.core
 
@@ -13,25 +13,25 @@ ROUNDING = 5e-14
 
 @EVERY_SCHEME_OBJECT
 def test_functions_are_non_negative_and_sum_to_one(scheme, np_rng):
-    values = regular_bernstein(scheme).basis.values(inside(scheme, np_rng))
+    values = polynomial_basis(scheme).bernstein.values(inside(scheme, np_rng))
     assert values.min() >= 0
     np.testing.assert_allclose(values.sum(axis=1), 1, rtol=0, atol=ROUNDING)
 
 
 @EVERY_SCHEME_OBJECT
 def test_patches_are_the_schemes_and_weights_of_coefficients_non_negative(scheme, np_rng):
-    form, uv = regular_bernstein(scheme), inside(scheme, np_rng)
+    form, uv = polynomial_basis(scheme), inside(scheme, np_rng)
     expected = scheme.regular_basis(uv, 2)
-    own, (u, v) = form.of_controls, form.basis.derivatives
+    own, (u, v) = form.of_controls, form.bernstein.derivatives
     for product, wanted in zip((own, u @ own, v @ own, u @ u @ own, v @ u @ own, v @ v @ own), expected, strict=True):
-        np.testing.assert_allclose(form.basis.values(uv) @ product, wanted, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(form.bernstein.values(uv) @ product, wanted, rtol=0, atol=ROUNDING)
     # B-splines and box splines are means of Bernstein polynomials: the patch's hull contains its coefficients.
     assert own.min() >= 0
 
 
 @EVERY_SCHEME_OBJECT
 def test_halves_are_the_same_polynomials_over_copies_of_the_domain(scheme, np_rng):
-    basis = regular_bernstein(scheme).basis
+    basis = polynomial_basis(scheme).bernstein
     coefficients = np_rng.normal(size=(len(basis.indices), 3))
     uv = inside(scheme, np_rng)
     for child, halved in zip(scheme.domain.children, basis.halves, strict=True):
@@ -41,7 +41,7 @@ def test_halves_are_the_same_polynomials_over_copies_of_the_domain(scheme, np_rn
 
 @EVERY_SCHEME_OBJECT
 def test_coefficients_at_corners_are_values(scheme):
-    basis = regular_bernstein(scheme).basis
+    basis = polynomial_basis(scheme).bernstein
     np.testing.assert_array_equal(basis.values(scheme.domain.corners)[:, basis.corners], np.eye(len(basis.corners)))
 
 

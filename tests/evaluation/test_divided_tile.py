@@ -7,7 +7,7 @@ from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_tree import patch_trees
-from mitsuba_subdivision.evaluation.polynomials import regular_bernstein
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis
 from mitsuba_subdivision.schemes.domain import IDENTITY
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
@@ -45,7 +45,7 @@ def parts(scheme, signature):
 def test_pieces_and_corners_are_the_surface(name):
     surface = surface_named(name)
     scheme, signatures = classes(surface)
-    basis = regular_bernstein(scheme).basis
+    basis = polynomial_basis(scheme).bernstein
     uv = np.concatenate([scheme.domain.corners, scheme.domain.corners.mean(axis=0)[None]])
     for signature, points in zip(signatures[:MOST_CLASSES], points_of_patches(surface), strict=True):
         for domain, (tile, rows) in parts(scheme, signature):

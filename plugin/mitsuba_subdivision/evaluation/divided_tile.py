@@ -21,7 +21,7 @@ from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
 from .irregular_patch import IrregularPatch, level_rows, rest_rows, transition
 from .patch_tree import PartKind, PatchTree
-from .polynomials import regular_bernstein, times
+from .polynomials import polynomial_basis, times
 
 # Number of divisions before a tile is bounded by its pieces and the parts that are still undivided. For surfaces it
 # depends on `Scheme.has_convex_rules`: without convex rules the bound of undivided parts is some ten times looser.
@@ -45,7 +45,7 @@ class DividedTile:
         turn: int,
     ) -> None:
         self._scheme, self._source, self._turn = scheme, source, turn
-        self._bernstein = regular_bernstein(scheme).basis
+        self._bernstein = polynomial_basis(scheme).bernstein
         self.is_piece = source is None
         # Whether the tile has an extraordinary point at a corner, so that one child equals the tile.
         self.is_self_similar = isinstance(source, IrregularPatch)
@@ -185,7 +185,7 @@ def part_of_tile(
             return part_of_tile(child, child_stencils @ stencils)
         return _tile(scheme, element, 0), stencils
     if piece.patch is None:
-        return _tile(scheme, None, 0), regular_bernstein(scheme).of_controls @ piece.stencils @ stencils
+        return _tile(scheme, None, 0), polynomial_basis(scheme).of_controls @ piece.stencils @ stencils
     return _tile(scheme, piece.patch, element.turn), piece.coordinates @ stencils
 
 
@@ -196,7 +196,7 @@ _tile = lru_cache(maxsize=4096)(DividedTile)
 @lru_cache(maxsize=64)
 def _turned(scheme: Scheme, turn: int) -> FloatArray:
     """Return the ``(b, b)`` map from Bernstein coefficients to those of the polynomial in turned parameters."""
-    basis, domain = regular_bernstein(scheme).basis, scheme.domain
+    basis, domain = polynomial_basis(scheme).bernstein, scheme.domain
     return basis.coefficients(basis.values(domain.rotation(turn)(basis.indices / basis.degree)))
 
 

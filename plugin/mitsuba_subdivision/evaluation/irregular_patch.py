@@ -29,7 +29,7 @@ from .equations import (
     times_powers,
 )
 from .normals import limit_frame, uneven_frame
-from .polynomials import regular_bernstein
+from .polynomials import polynomial_basis
 
 # Two edge tangents are parallel if their determinant, relative to the square of their largest component, is not above
 # this.
@@ -218,4 +218,4 @@ def rest_rows(patch: IrregularPatch) -> FloatArray:
 
 
 def _rows(patch: IrregularPatch) -> FloatArray:
-    return regular_bernstein(patch.scheme).of_controls @ patch.eigen_children
+    return polynomial_basis(patch.scheme).of_controls @ patch.eigen_children

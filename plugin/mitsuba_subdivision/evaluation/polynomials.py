@@ -119,28 +119,6 @@ class BernsteinBasis:
         return np.array([int(np.flatnonzero((self.indices == corner).all(axis=1))[0]) for corner in corners])
 
 
-@dataclass(frozen=True, eq=False)
-class RegularBernstein:
-    """The regular patches of a scheme in Bernstein form."""
-
-    basis: BernsteinBasis
-    of_controls: FloatArray  # (b, R) float64: coefficients over a regular patch's control points
-    of_monomials: FloatArray  # (b, m) float64: coefficients over the coefficients of the `PolynomialBasis`
-
-
-@lru_cache(maxsize=16)
-def regular_bernstein(scheme: Scheme) -> RegularBernstein:
-    """Return the Bernstein form of a scheme's regular patches.
-
-    Raises SchemeError if the patches are not polynomial, see `polynomial_basis`.
-    """
-    polynomials = polynomial_basis(scheme)
-    degree = int(scheme.domain.extent(polynomials.powers).max())
-    basis = BernsteinBasis(scheme.domain, degree)
-    of_monomials = basis.coefficients(polynomials.monomials(basis.indices / degree))
-    return RegularBernstein(basis, _clean(of_monomials @ polynomials.matrix), of_monomials)
-
-
 def times(rows: FloatArray, points: FloatArray) -> FloatArray:
     """Multiply rows ``(r, b)`` by points ``(b, 3, n)`` without OpenBLAS threads; return ``(r, 3, n)``."""
     columns = points.reshape(len(points), -1)
@@ -165,9 +143,25 @@ class PolynomialBasis:
     formulas.
     """
 
-    centre: FloatArray  # (2,) float64: middle of the domain, ``(u_0, v_0)``
+    domain: ParameterDomain
     powers: IntArray  # (m, 2) int64: a and b of the monomials ``(u - u_0)^a (v - v_0)^b``. The first is the constant.
     matrix: FloatArray  # (m, R) float64: coefficients of the basis functions, in columns
+
+    @property
+    def centre(self) -> FloatArray:
+        """``(2,)`` float64, middle of the domain, ``(u_0, v_0)``."""
+        return self.domain.centre
+
+    @cached_property
+    def bernstein(self) -> BernsteinBasis:
+        """Bernstein basis of these polynomials."""
+        return BernsteinBasis(self.domain, int(self.domain.extent(self.powers).max()))
+
+    @cached_property
+    def of_controls(self) -> FloatArray:
+        """``(b, R)`` float64: Bernstein coefficients over a regular patch's control points."""
+        of_monomials = self.bernstein.coefficients(self.monomials(self.bernstein.indices / self.bernstein.degree))
+        return _clean(of_monomials @ self.matrix)
 
     def monomials(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, m)`` values of the monomials at ``(s, 2)`` parameters."""
@@ -192,18 +186,17 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
 
     Raises SchemeError if there are none: the basis is piecewise, or its degree is too high.
     """
-    centre = scheme.domain.centre
     along = np.linspace(0, 1, 2 * HIGHEST_POWER + 3)
     uv = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     uv = uv[scheme.domain.inside(uv) >= 0]
     powers: IntArray = np.indices((HIGHEST_POWER + 1,) * 2).reshape(2, -1).T
     basis_values = scheme.regular_basis(uv, 1)[0]
-    all_powers = PolynomialBasis(centre, powers, np.empty((len(powers), basis_values.shape[1])))
+    all_powers = PolynomialBasis(scheme.domain, powers, np.empty((len(powers), basis_values.shape[1])))
     matrix, *_ = np.linalg.lstsq(all_powers.monomials(uv), basis_values, rcond=INDEPENDENT)
     powers = powers[np.abs(matrix).max(axis=1) > NO_COEFFICIENT]
     # Solve again without the powers that do not occur, which is more accurate.
     values = replace(all_powers, powers=powers).monomials(uv)
-    basis = PolynomialBasis(centre, powers, np.linalg.lstsq(values, basis_values, rcond=INDEPENDENT)[0])
+    basis = PolynomialBasis(scheme.domain, powers, np.linalg.lstsq(values, basis_values, rcond=INDEPENDENT)[0])
     error = np.abs(values @ basis.matrix - basis_values).max()
     if error > ROUNDED or basis.powers[0].any():
         raise SchemeError(

@@ -103,14 +103,13 @@ def tree_arrays(
     # In nodes of tips, `first` is the index in `PatchTree.tips`.
     tip_nodes = np.flatnonzero(kinds == PartKind.TIP)
     for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
-        tip = _tip(scheme, piece.irregular_patch, piece_levels)
-        frames[node], levels[node] = tip.frame, tip.level_count
+        tip_pieces, tip_rows, first_rows, frames[node], levels[node] = _tip(scheme, piece.irregular_patch, piece_levels)
         first[node], first_block[node] = piece_count, block_count
-        maps.append(PieceMap(piece_count, None, tip.pieces @ piece.coordinates))
-        tip_blocks = (tip.blocks @ piece.coordinates).swapaxes(1, 2).copy()
-        tip_blocks[: len(tip.second_eigenvector), 0] = tip.second_eigenvector
+        maps.append(PieceMap(piece_count, None, tip_pieces @ piece.coordinates))
+        tip_blocks = (tip_rows @ piece.coordinates).swapaxes(1, 2).copy()
+        tip_blocks[: len(first_rows), 0] = first_rows
         blocks.append(tip_blocks)
-        piece_count, block_count = piece_count + len(tip.pieces), block_count + len(tip_blocks)
+        piece_count, block_count = piece_count + len(tip_pieces), block_count + len(tip_blocks)
     return TreeArrays(
         kinds,
         turns,
@@ -124,19 +123,16 @@ def tree_arrays(
     )
 
 
-class _Tip(NamedTuple):
-    """Polynomials of a tip over the eigen-coordinates."""
-
-    pieces: FloatArray  # (n, m, K) float64
-    blocks: FloatArray  # (b, m, K) float64
-    second_eigenvector: FloatArray  # (l, m) float64: row 0 of the first l blocks, see `TreeArrays.blocks`
-    frame: FrameKind
-    level_count: int  # As in `TreeArrays.levels`
-
-
 # A tip takes some megabytes at high valences.
 @lru_cache(maxsize=16)
-def _tip(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> _Tip:
+def _tip(
+    scheme: Scheme, patch: IrregularPatch, piece_levels: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FrameKind, int]:
+    """Return polynomials of a tip over the eigen-coordinates.
+
+    Returns those of the pieces ``(n, m, K)``; the blocks ``(b, m, K)``; row 0 of the first l blocks ``(l, m)``, see
+    `TreeArrays.blocks`; the kind of frame; and the number of levels, as in `TreeArrays.levels`.
+    """
     basis, polynomials = patch.basis, polynomial_basis(scheme)
     # The regular children's polynomials over the eigen-coordinates.
     rows: FloatArray = polynomials.matrix @ patch.eigen_children
@@ -156,7 +152,7 @@ def _tip(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> _Tip:
         blocks.append(_by_level(rows, patch, float(basis.moduli[2]), levels))
         frame, second_eigenvector = FrameKind.UNEVEN, rows[:, :, 1]
     second_eigenvector = np.tile(second_eigenvector, (len(levels), 1))
-    return _Tip(by_level[:piece_count], np.concatenate(blocks), second_eigenvector, frame, level_count)
+    return by_level[:piece_count], np.concatenate(blocks), second_eigenvector, frame, level_count
 
 
 def level_polynomials(scheme: Scheme, patch: IrregularPatch, level_count: int) -> FloatArray:

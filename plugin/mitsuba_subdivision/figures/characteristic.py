@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..evaluation.element import element_stencils
 from ..evaluation.irregular_patch import IrregularPatch, level_domains, level_rows
 from ..evaluation.patch_tree import irregular_patch, isolated_signature, patch_tree
-from ..evaluation.polynomials import regular_bernstein
+from ..evaluation.polynomials import polynomial_basis
 from ..evaluation.tree_arrays import PIECE_LEVELS
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
@@ -188,7 +188,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
     """Draw a face with two extraordinary vertices, its leaves, and the Bernstein coefficients of these as weights."""
     scheme = scheme_named("catmull_clark")
     signature = Signature("face", tuple(Fan((4,) * valence) for valence in VALENCES))
-    tree, form, ring = patch_tree(scheme, signature), regular_bernstein(scheme), one_ring(signature)
+    tree, form, ring = patch_tree(scheme, signature), polynomial_basis(scheme), one_ring(signature)
     # From the parameters of each leaf to those of the face; the level, 0 for regular leaves; rows of weights.
     leaves: list[tuple[AffineMap, int, FloatArray]] = [
         (AffineMap(*domain), 0, rows)
@@ -202,7 +202,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
             domains = level_domains(tip.irregular_patch, level)
             leaves += [(outward @ domain, level + 1, leaf) for domain, leaf in zip(domains, rows, strict=True)]
         rests.append(outward @ AffineMap(np.eye(2) * 2.0**-PIECE_LEVELS, np.zeros(2)))
-    count, size = ring.vertex_count, len(form.basis.indices)
+    count, size = ring.vertex_count, len(form.bernstein.indices)
     options.report(f"{count} control points, {len(leaves)} leaves of {size} coefficients")
     flat = _in_the_plane(ring.topology)
 

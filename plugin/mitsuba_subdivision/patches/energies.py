@@ -15,7 +15,7 @@ import numpy as np
 
 from ..evaluation.irregular_patch import IrregularPatch, level_rows
 from ..evaluation.patch_tree import patch_trees
-from ..evaluation.polynomials import regular_bernstein
+from ..evaluation.polynomials import polynomial_basis
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..messages import counted
@@ -97,15 +97,15 @@ def _basis_derivatives(
 
     Derivatives are by the parameters of each piece, as integrals over the surface do not depend on parameters.
     """
-    form, (element,) = regular_bernstein(scheme), patch_trees(scheme, [signature])
+    form, (element,) = polynomial_basis(scheme), patch_trees(scheme, [signature])
     coefficients = [element.coefficients(form.of_controls)]
     for tip in element.tips:
         for level in range(_level_count(tip.irregular_patch, derivative)):
             # The first eigenfunction is constant, and has no derivatives.
             coefficients.append(level_rows(tip.irregular_patch, level)[:, :, 1:] @ tip.coordinates[1:])
-    uv, weights = form.basis.domain.quadrature(order)
+    uv, weights = form.bernstein.domain.quadrature(order)
     joined = np.concatenate(coefficients)
-    derivatives = (form.basis.values(uv) @ form.basis.two_derivatives)[:, None] @ joined[None]
+    derivatives = (form.bernstein.values(uv) @ form.bernstein.two_derivatives)[:, None] @ joined[None]
     return derivatives.reshape(5, -1, joined.shape[2]), np.tile(weights, len(joined))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows, transition
 from ..evaluation.patch_tree import PatchTree, patch_trees
-from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
+from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IntArray, Topology
 from ..messages import counted
 from ..schemes.domain import FloatArray
@@ -151,7 +151,7 @@ class Tips(PartArrays):
         coefficients = rows.reshape(-1, rows.shape[2]) @ self.coordinates[:, 1:]
         by_child = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
         return PolynomialPieces(
-            regular_bernstein(self.patch.scheme).basis,
+            polynomial_basis(self.patch.scheme).bernstein,
             np.tile(self.half_edge, len(rows)),
             np.concatenate([self.matrices @ from_child.matrix for from_child in maps]),
             np.concatenate([self.matrices @ from_child.offset + self.offsets for from_child in maps]),
@@ -189,7 +189,7 @@ class SurfacePieces:
         table = patches if refined is None else refined.table
         if refined is not None:
             control_points = refined.matrix @ control_points
-        form, sizes = regular_bernstein(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
+        form, sizes = polynomial_basis(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
         trees = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
         # For each tree, arrays of parts: numbers by which pieces are sorted in the end, in the order of classes and
         # children; places as in `PolynomialPieces`; control points of the one-rings.
@@ -203,8 +203,8 @@ class SurfacePieces:
             matrices = np.where(is_quarter, 0.5, 1.0)[:, None, None] * np.eye(2)
             order, offsets = np.full(len(corners), float(number)), np.zeros((len(corners), 2))
             parts.append((tree, (order, corners.astype(np.int64), matrices, offsets, controls)))
-        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.basis.indices), 3))]
-        regular = [(np.empty(0), PolynomialPieces(form.basis, np.empty(0, dtype=np.int64), *empty))]
+        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.bernstein.indices), 3))]
+        regular = [(np.empty(0), PolynomialPieces(form.bernstein, np.empty(0, dtype=np.int64), *empty))]
         tips, child_order = [], 1.0
         while parts:
             children: list[tuple[PatchTree, tuple[NDArray, ...]]] = []
@@ -226,7 +226,7 @@ class SurfacePieces:
                 else:
                     origins, rows = controls[:, 0], form.of_controls @ tree.piece.stencils
                     coefficients = rows @ (controls - origins[:, None])
-                    regular.append((order, PolynomialPieces(form.basis, *places[0], origins, coefficients)))
+                    regular.append((order, PolynomialPieces(form.bernstein, *places[0], origins, coefficients)))
             parts = children
         joined = [_sorted(group) for group in alike(tips, lambda pair: pair[1].patch)]
         joined.sort(key=lambda pair: pair[0][0])

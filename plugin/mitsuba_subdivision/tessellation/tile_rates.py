@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.divided_tile import DividedTile
-from ..evaluation.polynomials import BernsteinBasis, regular_bernstein, times
+from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
@@ -60,7 +60,7 @@ class TileRates:
 
     @property
     def basis(self) -> BernsteinBasis:
-        return regular_bernstein(self.scheme).basis
+        return polynomial_basis(self.scheme).bernstein
 
     @property
     def _corner_count(self) -> int:
