@@ -6,7 +6,6 @@ Importing this package registers the shape ``subdivision`` in every variant, bef
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .deferred import deferred
@@ -102,6 +101,8 @@ def example_file(name: str) -> str:
     FileNotFoundError
         If there is none.
     """
+    from pathlib import Path
+
     package = Path(__file__).resolve().parent
     candidates = [package / "scenes", package.parents[1] / "scenes"]
     for folder in candidates:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import wraps
 from types import ModuleType
@@ -105,7 +106,9 @@ def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
     def call(*arguments: Any) -> None:
         depth = getattr(_stack, "depth", 0)
         if depth >= DEEPEST:
-            _in_own_thread(call, *arguments)
+            with ThreadPoolExecutor(1) as thread:
+                # Raises an error of the function, and keeps no reference to it.
+                thread.submit(copy_context().run, call, *arguments).result()
             return
         _stack.depth = depth + 1
         try:
@@ -114,20 +117,3 @@ def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
             _stack.depth = depth
 
     return call
-
-
-def _in_own_thread(function: Callable[..., None], *arguments: Any) -> None:
-    errors: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            function(*arguments)
-        except BaseException as error:
-            errors.append(error)
-
-    thread = threading.Thread(target=copy_context().run, args=(run,))
-    thread.start()
-    thread.join()
-    if errors:
-        # Remove the last reference to the error, whose traceback keeps its frames alive.
-        raise errors.pop()
