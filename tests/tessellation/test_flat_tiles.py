@@ -137,7 +137,7 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
     rates = TileRates(scheme, frames, Criterion(Measure.CHORD, error), 64)
     for tile, values, samples in tiles_of(surface, scheme):
         is_larger = sizes(samples, np.eye(3)) > error
-        tiles = whole_patches(np.zeros(len(is_larger)), np.zeros((len(is_larger), 4), dtype=bool))
+        tiles = whole_patches(np.zeros(len(is_larger)), 4)
         assert not rates.are_flat(tile, tiles, values)[is_larger].any()
         larger += np.count_nonzero(is_larger)
     assert larger

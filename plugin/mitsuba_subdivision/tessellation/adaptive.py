@@ -18,10 +18,10 @@ from ..messages import counted
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
-from .adaptive_grid import AdaptiveGrid, PatchFrames, Tiles, tile_type, whole_patches
+from .adaptive_grid import AdaptiveGrid, PatchFrames, Tiles, sides_of, tile_type, whole_patches
 from .criterion import Criterion
 from .memory import require_memory_for_triangles
-from .tile_rates import Part, TileRates, feature_edges, sides_on
+from .tile_rates import Part, TileRates, feature_edges
 from .uniform import checked_rate
 from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
 
@@ -135,16 +135,18 @@ def _whole_patches(
     coordinates = np.ascontiguousarray(points.T)
     elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
     pairs = list(zip(table.classes, elements, strict=True))
+    corners = [kind.corners if refined is None else refined.corners(kind) for kind in table.classes]
+    tiles = whole_patches(np.concatenate(corners), frames.domain.corner_count)
+    half_edge = sides_of(tiles, frames, 0).half_edge.reshape(tiles["sides"].shape)
+    tiles["sides"] = (half_edge >= 0) & features[half_edge]
     for patch_class, element in counted(pairs, "Tiles of patch classes"):
         identity = np.eye(element.control_count)
         kind, rows = part_of_tile(element, identity)
-        corners = patch_class.corners if refined is None else refined.corners(patch_class)
-        tiles = whole_patches(corners, sides_on(features, frames, corners))
-        for begin in range(0, len(corners), TILES_AT_ONCE):
-            block = slice(begin, begin + TILES_AT_ONCE)
-            controls = patch_class.controls[block].T
+        for begin in range(0, len(patch_class.controls), TILES_AT_ONCE):
+            controls = patch_class.controls[begin : begin + TILES_AT_ONCE].T
             values = np.stack([axis.take(controls, mode="clip") for axis in coordinates], axis=1)
-            yield Part(kind, tiles[block], values if rows is identity else times(rows, values))
+            block, tiles = tiles[: controls.shape[1]], tiles[controls.shape[1] :]
+            yield Part(kind, block, values if rows is identity else times(rows, values))
 
 
 def _chosen(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:

@@ -96,10 +96,10 @@ def tile_type(corner_count: int) -> np.dtype[np.void]:
     )
 
 
-def whole_patches(corners: IntArray, is_feature: NDArray[np.bool_]) -> Tiles:
-    """A tile for each patch that begins at ``corners``; ``is_feature``, ``(t, m)``, marks sides on feature edges."""
-    tiles = np.zeros(len(corners), dtype=tile_type(is_feature.shape[1]))
-    tiles["corner"], tiles["rates"], tiles["sides"] = corners, 1, is_feature
+def whole_patches(corners: IntArray, corner_count: int) -> Tiles:
+    """A tile for each patch that begins at ``corners``, without features."""
+    tiles = np.zeros(len(corners), dtype=tile_type(corner_count))
+    tiles["corner"], tiles["rates"] = corners, 1
     return tiles
 
 

@@ -16,7 +16,7 @@ from ..mesh.connectivity import IndexArray, IntArray
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .adaptive_grid import DEEPEST, PatchFrames, Tiles, child, half_edges_around, in_patch
+from .adaptive_grid import DEEPEST, PatchFrames, Tiles, child, in_patch
 from .criterion import (
     Cone,
     Criterion,
@@ -292,16 +292,3 @@ def _element_normals(patches: PatchTable, points: FloatArray) -> FloatArray:
         normals = np.stack([np.bincount(t.face, x, t.face_count) for x in corner_normals])
     length: FloatArray = np.sqrt(dot(normals, normals))
     return normals / np.where(length > 0, length, 1)
-
-
-def sides_on(edges: NDArray[np.bool_], frames: PatchFrames, corners: IntArray) -> NDArray[np.bool_]:
-    """``(p, m)`` whether the sides of the patches that begin at ``corners`` lie on the marked ``edges``, ``(n_h,)``."""
-    t, m = frames.topology, frames.domain.corner_count
-    is_whole = frames.is_whole[t.face[corners]]
-    is_on = np.zeros((len(corners), m), dtype=bool)
-    for side, half_edge in enumerate(half_edges_around(frames, corners)):
-        is_on[:, side] = is_whole & edges[half_edge]
-    # The first and the last side of a patch at a corner of a polygon are halves of edges.
-    is_on[:, 0] |= edges[corners]
-    is_on[:, -1] |= ~is_whole & edges[t.prev[corners]]
-    return is_on
