@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ SMALLEST = 2.0**-44
 NEARLY = 0.02
 # Points per run of a query, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
+
+_Parts = TypeVar("_Parts", PolynomialPieces, Tips)
 
 # Children of a node of `BoxTree`.
 WIDTH = 8
@@ -162,14 +164,7 @@ class _Best:
         """Find the least distance in pieces; without ``boxes``, compute those around the pieces."""
         for halving in range(MOST_CONVEX_HALVINGS + 1):
             if boxes is None:
-                lower, upper = pieces.box()
-                gaps = squared_gaps(
-                    self._points.take(point, axis=0), lower.take(piece, axis=0), upper.take(piece, axis=0)
-                )
-                is_near = gaps <= self.reach.take(point)
-                point = point[is_near]
-                used, piece = _numbered(piece[is_near], len(pieces))
-                pieces = pieces.chosen(used)
+                point, pieces, piece = self._near(point, pieces, piece, *pieces.box())
                 boxes = TurnedBoxes.around(pieces)
             points = self._points.take(point, axis=0)
             near, squared_distance, away = boxes.near(points, piece, self.reach.take(point))
@@ -186,6 +181,15 @@ class _Best:
             used, used_index = _numbered(piece[left], len(pieces))
             pieces, boxes = pieces.chosen(used).halved(), None
             point, piece = np.tile(point[left], 4), (used_index + len(used) * np.arange(4)[:, None]).ravel()
+
+    def _near(
+        self, point: IntArray, parts: _Parts, part: IntArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[IntArray, _Parts, IntArray]:
+        """Pairs of a point and a part whose box is within reach: points, the parts in use, and indices into these."""
+        gaps = squared_gaps(self._points.take(point, axis=0), lower.take(part, axis=0), upper.take(part, axis=0))
+        is_near = gaps <= self.reach.take(point)
+        used, used_index = _numbered(part[is_near], len(parts))
+        return point[is_near], parts.chosen(used), used_index
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, piece: IntArray) -> NDArray[np.bool_]:
         """Whether the nearest locations so far lie in their pieces and are minima along the surface."""
@@ -208,13 +212,9 @@ class _Best:
         tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
             reach = tips.reach(level)
-            lower, upper = (side.take(tip, axis=0) for side in (tips.points - reach, tips.points + reach))
-            is_near = squared_gaps(self._points[point], lower, upper) <= self.reach[point]
-            point, tip = point[is_near], tip[is_near]
+            point, tips, tip = self._near(point, tips, tip, tips.points - reach, tips.points + reach)
             if not len(point):
                 return
-            used, tip = _numbered(tip, len(tips))
-            tips = tips.chosen(used)
             pieces = tips.level(level)
             count = len(pieces) // len(tips)
             piece = (tip + len(tips) * np.arange(count)[:, None]).ravel()
