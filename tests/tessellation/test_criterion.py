@@ -282,9 +282,10 @@ def test_rates_follow_a_displacement(name):
         assert away.max() <= 1.5 * error * size
 
 
-def corners_on_sheet(heights, **criterion):
+def corners_on_sheet(scheme, heights, **criterion):
     """Corners ``(t, 3, 3)`` of triangles of a flat sheet that is displaced by a function of x and y."""
-    surface = LimitSurface(sheet(2, 2))
+    cage = sheet(2, 2)
+    surface = LimitSurface(cage if scheme == "catmull_clark" else ControlCage(cage.positions, cage.triangles), scheme)
 
     def places(start, uv):
         return surface._evaluate_from(start.astype(np.int64), uv, "stabilized", np.float64).p[:, :2]
@@ -295,23 +296,25 @@ def corners_on_sheet(heights, **criterion):
     return np.concatenate([xy, heights(xy)[..., None]], axis=2)
 
 
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 @pytest.mark.parametrize("bend", [(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, -2, 1)], ids=str)
-def test_a_flat_sheet_is_divided_where_its_heights_bend(bend):
+def test_a_flat_sheet_is_divided_where_its_heights_bend(bend, scheme):
     """Quadratic heights: their second derivatives by x, by both and by y are those of all tiles."""
 
     def heights(xy):
         return np.stack([xy[..., 0] ** 2 / 2, xy[..., 0] * xy[..., 1], xy[..., 1] ** 2 / 2], axis=-1) @ bend
 
-    corners = corners_on_sheet(heights, measure=Measure.CHORD, error=0.02)
+    corners = corners_on_sheet(scheme, heights, measure=Measure.CHORD, error=0.02)
     points = WEIGHTS @ corners
     away = np.abs(heights(points[..., :2]) - points[..., 2]).max()
     assert 0.002 < away <= 0.02
     assert len(corners) < 1200
 
 
+@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 @pytest.mark.parametrize("slope", [(3, 0), (0, 3), (2, 2)], ids=str)
-def test_edges_on_a_flat_sheet_are_short_where_its_heights_rise(slope):
-    corners = corners_on_sheet(lambda xy: xy @ slope, measure=Measure.EDGE, error=0.25)
+def test_edges_on_a_flat_sheet_are_short_where_its_heights_rise(slope, scheme):
+    corners = corners_on_sheet(scheme, lambda xy: xy @ slope, measure=Measure.EDGE, error=0.25)
     length = np.linalg.norm(np.diff(corners[:, [0, 1, 2, 0]], axis=1), axis=2).max()
     assert 0.12 < length <= 0.25 + ROUNDING
 

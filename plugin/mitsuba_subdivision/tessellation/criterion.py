@@ -145,18 +145,16 @@ class Criterion:
     def form_of_displacement(self, points: FloatArray, heights: FloatArray, corner_count: int) -> FloatArray:
         """``(3, t)`` contribution of a displacement to `form`, from its heights ``(n, n, t)`` over tiles, by v and u.
 
-        On triangles, samples above the diagonal count as well.
+        Heights that are not numbers lie outside a triangle, and do not count.
         """
         steps = len(heights) - 1
-        along_u, along_v = np.diff(heights, axis=1), np.diff(heights, axis=0)
+        u, v = (steps * np.diff(heights, axis=axis) for axis in (1, 0))
         if self.measure is Measure.EDGE:
-            a, c = (np.square(steps * along).max(axis=(0, 1)) for along in (along_u, along_v))
-            form = [a, np.sqrt(a * c), c]
+            form = _edge_heights(u, v, corner_count)
         else:
-            second = np.diff(along_u, axis=1), np.diff(along_v, axis=1), np.diff(along_v, axis=0)
-            form = [SQUARE_ERROR * steps**2 * np.abs(d).max(axis=(0, 1)) for d in second]
-        a, b, c = self._relative(np.stack(form), self.limit(points.min(axis=0), points.max(axis=0)))
-        return _isotropic(a + 2 * b + c) if corner_count == 3 else np.stack([a, b, c])
+            uu, uv, vv = (steps * np.diff(first, axis=axis) for first, axis in ((u, 1), (u, 0), (v, 0)))
+            form = _chord_heights(uu, uv, vv, corner_count)
+        return self._relative(form, self.limit(points.min(axis=0), points.max(axis=0)))
 
     def _relative(self, form: FloatArray, limit: FloatArray) -> FloatArray:
         with np.errstate(over="ignore"):
@@ -182,10 +180,7 @@ def _edge_form(du: FloatArray, dv: FloatArray, corner_count: int) -> FloatArray:
 def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, corner_count: int) -> FloatArray:
     """Bound of the distance of triangles, see `Criterion.form`, from the least length of both tangents."""
     if corner_count == 3:
-        # The second derivative along a direction is a mean plus a cosine and a sine of twice its angle.
-        uu, uv, vv = second
-        mean = (uu - uv + vv) * (2 / 3)
-        second = [mean, uu - mean, (uv - uu / 2) * (2 / sqrt(3))]
+        second = _by_angle(*second)
     # The distance from the surface is the normal component of the difference, plus an excess due to its tangential
     # component, over which the surface curves; at most the length of the difference.
     longest = [dot(d, d).max(axis=0) for d in second]
@@ -202,6 +197,32 @@ def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, c
     if corner_count == 3:
         return _isotropic(TRIANGLE_ERROR * (sizes[0] + np.hypot(sizes[1], sizes[2])))
     return SQUARE_ERROR * np.stack(sizes)
+
+
+def _edge_heights(u: FloatArray, v: FloatArray, corner_count: int) -> FloatArray:
+    """As `_edge_form`, from first differences ``(n, n - 1, t)`` and ``(n - 1, n, t)`` of heights."""
+    if corner_count == 3:
+        u, v = u[:-1], v[:, :-1]
+        return _isotropic(4 * np.nanmax(np.square([u, v, u - v]), axis=(0, 1, 2)))
+    a, c = (np.abs(d).max(axis=(0, 1)) for d in (u, v))
+    return np.stack([a**2, a * c, c**2])
+
+
+def _chord_heights(uu: FloatArray, uv: FloatArray, vv: FloatArray, corner_count: int) -> FloatArray:
+    """As `_chord_form`, from second differences ``(n, n - 2, t)``, ``(n - 1, n - 1, t)`` and ``(n - 2, n, t)``."""
+    if corner_count == 3:
+        mean, cosine, sine = _by_angle(uu[:-2], uv[:-1, :-1], vv[:, :-2])
+        return _isotropic(TRIANGLE_ERROR * np.nanmax(np.abs(mean) + np.hypot(cosine, sine), axis=(0, 1)))
+    return SQUARE_ERROR * np.stack([np.abs(d).max(axis=(0, 1)) for d in (uu, uv, vv)])
+
+
+def _by_angle(uu: FloatArray, uv: FloatArray, vv: FloatArray) -> list[FloatArray]:
+    """The second derivative along a direction in an equilateral triangle, by the direction's angle.
+
+    Returns its mean, and the factors of the cosine and the sine of twice the angle.
+    """
+    mean = (uu - uv + vv) * (2 / 3)
+    return [mean, uu - mean, (uv - uu / 2) * (2 / sqrt(3))]
 
 
 def _isotropic(values: FloatArray) -> FloatArray:

@@ -125,7 +125,9 @@ class TileRates:
         corners, ring = times(kind.corners, values), kind.one_ring_points(values)
         lower, upper = ring.min(axis=0), ring.max(axis=0)
         limit = self.criterion.limit(lower, upper)
-        height_range = np.zeros(len(tiles)) if heights is None else np.ptp(heights, axis=(0, 1))
+        height_range = np.zeros(len(tiles))
+        if heights is not None:
+            height_range = np.nanmax(heights, axis=(0, 1)) - np.nanmin(heights, axis=(0, 1))
         if self.criterion.measure is Measure.EDGE:
             extent = _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles)))
             return np.hypot(extent, height_range) <= limit
@@ -183,19 +185,26 @@ class TileRates:
         return sides
 
     def _heights(self, tiles: Tiles) -> FloatArray | None:
-        """``(n, n, t)`` heights of the displacement over tiles, by v and by u; None without a displacement."""
+        """``(n, n, t)`` heights of the displacement over tiles, by v and by u; None without a displacement.
+
+        Heights outside triangular tiles are not numbers.
+        """
         displacement = self.criterion.displacement
         if displacement is None:
             return None
-        v, u = np.indices((HEIGHT_SAMPLES,) * 2).reshape(2, -1) / (HEIGHT_SAMPLES - 1)
+        steps = HEIGHT_SAMPLES - 1
+        row, column = np.indices((HEIGHT_SAMPLES,) * 2).reshape(2, -1)
         if self._corner_count == 3:
-            # Samples outside the triangle are mirrored at the diagonal, as they lie in another element.
-            u, v = np.where(u + v > 1, 1 - v, u), np.where(u + v > 1, 1 - u, v)
+            is_inside = row + column <= steps
+            row, column = row[is_inside], column[is_inside]
+        u, v = column / steps, row / steps
         tile = np.tile(np.arange(len(tiles)), len(u))
         corner = tiles["corner"][tile].astype(np.int64)
         uv = in_patch(tiles, tile, np.repeat([u, v], len(tiles), axis=1))
         uv *= self.frames.scale[self.frames.topology.face[corner]]
-        return displacement.heights(corner, uv.T).reshape(HEIGHT_SAMPLES, HEIGHT_SAMPLES, -1)
+        heights = np.full((HEIGHT_SAMPLES, HEIGHT_SAMPLES, len(tiles)), np.nan)
+        heights[row, column] = displacement.heights(corner, uv.T).reshape(len(row), -1)
+        return heights
 
 
 def _extent(kind: DividedTile, values: FloatArray, axes: FloatArray) -> FloatArray:
