@@ -551,6 +551,27 @@ def test_the_trial_notices_what_differs(kind, message):
 
 
 @llvm
+def test_the_trial_leaves_nothing_that_scenes_would_call(monkeypatch):
+    """Symbolic calls are traced for all shapes that exist, also before garbage is collected."""
+    make()
+    monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
+    triangle, left = interaction_hook._triangle, []
+
+    def kept_weakly(variant):
+        shape = triangle(variant)
+        left.append(weakref.ref(shape))
+        return shape
+
+    monkeypatch.setattr(interaction_hook, "_triangle", kept_weakly)
+    gc.disable()
+    try:
+        assert not interaction_hook.InteractionHook(mi.llvm_ad_rgb)._answers
+        assert [shape() for shape in left] == [None]
+    finally:
+        gc.enable()
+
+
+@llvm
 def test_code_longer_than_its_page_is_refused():
     make()
     with pytest.raises(OSError, match=r"^machine code of \d+ bytes; expected at most a page of \d+$"):

@@ -983,6 +983,17 @@ def test_display_colours_of_every_interpolation(scene, scheme):
         np.testing.assert_allclose(picture[6:10, [4, 11]].mean(axis=0), expected, atol=0.07)
 
 
+def test_scalar_variants_make_the_same_picture(scene, request):
+    colors = 'color3f[] primvars:displayColor = [(1,0,0), (0,1,0), (0,0,1), (1,1,0)] (interpolation = "vertex")'
+    text = CAMERA + SUN + mesh("square", SQUARE, colors) + mesh("cube", CUBE.replace("-1", "-0.5"))
+    pictures = []
+    for variant in ("llvm_ad_rgb", "scalar_rgb"):
+        request.getfixturevalue(f"variant_{variant}")
+        pictures.append(rendered({**scene(text, size=(12, 12)), **DIRECT}, spp=4))
+    assert pictures[0].std() > 0.05
+    np.testing.assert_allclose(pictures[0].mean(axis=(0, 1)), pictures[1].mean(axis=(0, 1)), rtol=0.05)
+
+
 def test_normals_of_polygons(scene):
     """Facets, unless normals are authored; those of left-handed meshes stay at their corners."""
     assert not scene(mesh("square", SQUARE))["square"].has_vertex_normals()

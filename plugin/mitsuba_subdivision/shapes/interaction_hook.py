@@ -288,10 +288,13 @@ class Trial:
         self._record(_asked(hit))
         si.uv = self._variant.Point2f(*_ANSWERED_UV)
 
-    def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value:
+    def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
         """Record the arguments, and return a known result."""
+        size = _ATTRIBUTES.get(name)
+        if size is None:  # Asked by a scene that another thread renders
+            return None
         self._record([name, *_identity(si.t, active)])
-        return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
+        return self._variant.Float(_VALUE[0]) if size == 1 else self._variant.Color3f(*_VALUE)
 
     def _record(self, asked: list[Any]) -> None:
         if self.fails:
@@ -306,8 +309,9 @@ class Trial:
         except ArithmeticError as error:
             return error is self.error
         finally:
-            # Scenes may call the functions of any existing shape.
             self.fails = False
+            # Its frames refer to the triangle, whose functions scenes call for as long as it exists.
+            self.error.__traceback__ = None
         return False
 
 
