@@ -9,13 +9,14 @@ import os
 import sys
 from pathlib import Path
 
+# Users' kernels stay fast. Before the package imports Dr.Jit, which reads it then.
+os.environ.setdefault("DRJIT_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "d" / "drjit"))
+
 from mitsuba_subdivision.llvm import select_llvm
 
 # The extra `llvm` brings this version or a newer one. An unknown option would end the process.
 LLVM = 19
 
-# Users' kernels stay fast.
-os.environ.setdefault("DRJIT_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "d" / "drjit"))
 library = select_llvm()
 if library.path and (library.version or 0) >= LLVM:
     # Registers are given without a search as well: compiling takes a fifth less, and long renders a twentieth more.

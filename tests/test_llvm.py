@@ -1,10 +1,13 @@
 """Which LLVM library Dr.Jit gets. Choices that Dr.Jit makes once per process are tested in processes of their own."""
 
 import os
+import secrets
 import subprocess
 import sys
 from pathlib import Path
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 from mitsuba_subdivision import llvm
 
@@ -248,3 +251,13 @@ def test_what_runs_kernels_is_an_error_where_they_would_abort(code):
 def test_a_library_that_aborts_does_not_matter_to_scalar_variants():
     done = run_with_an_old_one("import mitsuba_subdivision, mitsuba as mi; mi.set_variant('scalar_rgb')")
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_kernels_of_tests_are_not_kept_for_users():
+    """These are without LLVM's optimisations."""
+    folder = Path(os.environ["DRJIT_CACHE_DIR"])
+    before = set(folder.iterdir()) if folder.is_dir() else set()
+    # Of a number that no kernel has had.
+    dr.eval(dr.arange(mi.Float, 3) * secrets.randbelow(10**7))
+    assert set(folder.iterdir()) - before
