@@ -137,8 +137,8 @@ def heights(kind):
 @pytest.mark.parametrize(
     ("name", "kind", "to_world"),
     [
-        *((name, kind, None) for name in QUADS for kind in ("vertex_height", "bitmap")),
         *((name, kind, matrix) for name in QUADS for kind, matrix in (("vertex_height", MATRIX), ("bitmap", MIRROR))),
+        *(("creased islands", kind, None) for kind in ("vertex_height", "bitmap")),
         *((name, "vertex_height", None) for name in ("loop", "doo_sabin")),
     ],
 )

@@ -12,7 +12,7 @@ import pytest
 from mitsuba_subdivision.llvm import llvm_problem, require_llvm
 from mitsuba_subdivision.shapes import interaction_hook, register_variant
 from mitsuba_subdivision.shapes.interaction_hook import exact_shading_problem, hook_problem
-from shapes.cages import cube, load
+from shapes.cages import cube, described, load
 from shapes.scenes import vertices
 from shapes.variants import every_variant, exact_llvm, llvm, scalar
 
@@ -96,21 +96,19 @@ def test_known_variants_are_registered_once_from_many_threads():
         register_variant("scalar_grb")
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", pytest.param("llvm_ad_rgb", marks=needs_llvm)])
-def test_equal_shapes_of_a_dict_stay_two_and_can_be_written_as_xml(variant):
-    run(f"""
-import mitsuba_subdivision, mitsuba as mi; mi.set_variant('{variant}')
-scene = mi.load_dict({{'type': 'scene', 'left': cube(), 'right': cube()}})
-assert sorted(shape.id() for shape in scene.shapes()) == ['left', 'right']
-assert {{'left.control_points', 'right.control_points'}} <= set(mi.traverse(scene).keys())
-# Whether or not objects of a scene are merged.
-one = cube()
-assert len(mi.load_dict({{'type': 'scene', 'a': one, 'b': one}}, optimize=False).shapes()) == 2
-scene = {{'type': 'scene', 'left': {{'type': 'subdivision', 'filename': 'cage.obj', 'tessellation_rate': 3}}}}
-text = mi.parser.write_string(mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene))
-assert '<shape type="subdivision" name="left">' in text, text
-assert '<integer name="tessellation_rate" value="3"' in text, text
-""")
+@every_variant
+def test_equal_shapes_of_a_dict_stay_two_and_can_be_written_as_xml():
+    one = described(cube(), tessellation_rate=3)
+    scene = mi.load_dict({"type": "scene", "left": one, "right": described(cube(), tessellation_rate=3)})
+    assert sorted(shape.id() for shape in scene.shapes()) == ["left", "right"]
+    assert {"left.control_points", "right.control_points"} <= {key for key, _ in mi.traverse(scene)}
+    # Whether or not objects of a scene are merged.
+    assert len(mi.load_dict({"type": "scene", "a": one, "b": one}, optimize=False).shapes()) == 2
+    of_file = {"type": "subdivision", "filename": "cage.obj", "tessellation_rate": 3}
+    state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), {"type": "scene", "left": of_file})
+    text = mi.parser.write_string(state)
+    assert '<shape type="subdivision" name="left">' in text
+    assert '<integer name="tessellation_rate" value="3"' in text
 
 
 def test_a_first_picture_imports_little():
