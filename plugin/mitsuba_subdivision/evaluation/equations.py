@@ -136,15 +136,16 @@ def child_rows(
     rows : (3, s, K) or (6, s, K)
     """
     level, child, local = locate(scheme.domain, uv)
-    values = scheme.regular_basis(local.astype(tables.dtype), derivatives)
-    rows = np.empty((*values.shape[:2], tables.shape[2]), dtype=tables.dtype)
+    rows = np.empty((3 * derivatives, len(uv), tables.shape[2]), dtype=tables.dtype)
     for k, table in enumerate(tables):
         in_child = np.flatnonzero(child == k)
-        rows[:, in_child] = times(values[:, in_child], table)
+        products = times(scheme.regular_basis(local[in_child].astype(tables.dtype), derivatives), table)
         # 2 s_k: the child's parameters run twice as fast, and backwards in a triangle's middle child.
         speed = scheme.domain.children[k + 1].matrix[0, 0].astype(tables.dtype)
-        rows[1:3, in_child] *= speed
-        rows[3:, in_child] *= speed**2
+        products[1:3] *= speed
+        products[3:] *= speed**2
+        for row, product in zip(rows, products, strict=True):
+            row[in_child] = product
     return level, rows
 
 

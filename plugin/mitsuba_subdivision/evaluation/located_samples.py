@@ -45,8 +45,9 @@ class _Node(NamedTuple):
     """An element at one depth of the patch trees, with samples."""
 
     tree: PatchTree
-    samples: IntArray  # In increasing order
-    # For each child that contains samples: its number, its index among the nodes of the next depth, and these samples
+    sample_count: int  # Samples are in increasing order at depth 0, and parent by parent below
+    # For each child that contains samples: its number, its index among the nodes of the next depth, and the indices of
+    # its samples among those of this node
     children: list[tuple[int, int, IntArray]]
 
 
@@ -101,40 +102,40 @@ class LocatedSamples:
         self._depths: list[list[_Node]] = []
         domain, uv, speed, leaf_turn = scheme.domain, uv.copy(), np.ones(len(uv)), corner.copy()
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray]]] = {}
-        samples, trees, node = np.arange(len(uv)), list(elements), element.copy()
+        trees, samples = list(elements), list[IntArray]([np.empty(0, dtype=np.int64)] * len(elements))
+        for number, in_element in _grouped(element):
+            samples[number] = in_element
         for depth in range(MOST_DEPTH + 1):
-            nodes = [
-                _Node(tree, in_tree, [])
-                for tree, in_tree in zip(trees, _split(samples, node[samples], len(trees)), strict=True)
-            ]
+            nodes = [_Node(tree, len(in_tree), []) for tree, in_tree in zip(trees, samples, strict=True)]
             self._depths.append(nodes)
-            is_inner = np.array([tree.piece is None for tree in trees])[node[samples]]
-            for number, (tree, in_tree, _) in enumerate(nodes):
-                if tree.piece is not None and len(in_tree):
+            inner = []
+            for number, (tree, in_tree) in enumerate(zip(trees, samples, strict=True)):
+                if tree.piece is None:
+                    inner.append(number)
+                elif len(in_tree):
                     in_leaves.setdefault(tree.piece.patch, []).append((depth, number, tree.piece, in_tree))
                     leaf_turn[in_tree] = (corner[in_tree] + tree.turn) % domain.corner_count
                     self.path[in_tree] += 1 << 2 * depth
-            samples = samples[is_inner]
-            if not len(samples):
+            counts = [nodes[number].sample_count for number in inner]
+            if not sum(counts):
                 break
-            child, child_uv = domain.first_child(uv[samples].T)
-            is_only = np.array([tree.kind == PartKind.ONLY_CHILD for tree in trees])[node[samples]]
+            in_inner, begins = np.concatenate([samples[number] for number in inner]), np.cumsum(counts) - counts
+            child, child_uv = domain.first_child(uv[in_inner].T)
+            is_only = np.repeat([trees[number].kind == PartKind.ONLY_CHILD for number in inner], counts)
             # Children at corners are numbered from the element's first corner; the middle of a triangle comes last.
             corners = domain.corner_count
-            child = np.where(child < corners, (child + corner[samples]) % corners, child)
-            child, uv[samples] = np.where(is_only, 0, child), np.where(is_only, uv[samples].T, child_uv).T
-            self.path[samples] += child << 2 * depth
-            # Pairs of a node and the number of one of its children, as `4 * node + child`.
-            pairs, pair = np.unique(4 * node[samples] + child, return_inverse=True)
-            child_index: dict[PatchTree, int] = {}
-            for key, in_child in zip(pairs.tolist(), _split(samples, pair, len(pairs)), strict=True):
-                parent, number = nodes[key // 4], key % 4
+            child = np.where(child < corners, (child + corner[in_inner]) % corners, child)
+            child, uv[in_inner] = np.where(is_only, 0, child), np.where(is_only, uv[in_inner].T, child_uv).T
+            self.path[in_inner] += child << 2 * depth
+            in_children: dict[PatchTree, tuple[int, list[IntArray]]] = {}
+            for key, at in _grouped(4 * np.repeat(np.arange(len(inner)), counts) + child):
+                parent, number, in_child = nodes[inner[key // 4]], key % 4, in_inner[at]
                 tree = parent.tree.child_element(number)
-                index = child_index.setdefault(tree, len(child_index))
-                parent.children.append((number, index, in_child))
+                index, in_parents = in_children.setdefault(tree, (len(in_children), []))
+                in_parents.append(in_child)
+                parent.children.append((number, index, at - begins[key // 4]))
                 speed[in_child] *= parent.tree.domains[number].matrix[0, 0]
-                node[in_child] = index
-            trees = list(child_index)
+            trees, samples = [*in_children], [np.concatenate(in_parents) for _, in_parents in in_children.values()]
         else:
             raise not_isolated(scheme, trees[0].signature, MOST_DEPTH + 1)
         uv = _turned(scheme, uv, leaf_turn)
@@ -146,8 +147,8 @@ class LocatedSamples:
             parts = [(*row[:3], slice(end - len(row[3]), end)) for row, end in zip(rows, ends, strict=True)]
             self.leaves.append(Leaves(patch, uv[in_patch], parts, begin))
             begin += len(in_patch)
-        rotations = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)])
-        self.jacobian: FloatArray = np.moveaxis(rotations[leaf_turn] * speed[:, None, None], 0, -1)
+        rotations = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)], axis=-1)
+        self.jacobian: FloatArray = rotations.take(leaf_turn, axis=-1) * speed
 
     def chosen(self, which: IntArray) -> LocatedSamples:
         """Return a subset of the samples; ``which`` is in increasing order."""
@@ -180,19 +181,18 @@ class LocatedSamples:
                 in_leaf[depth][number] = weights
                 times(rows[:, uv_slice], matrix, weights.swapaxes(0, 1))
         below: list[FloatArray] = []
-        position = np.empty(len(self.leaf_sample), dtype=np.int64)
         for depth in range(len(self._depths) - 1, -1, -1):
-            current = []
-            for number, (tree, samples, children) in enumerate(self._depths[depth]):
+            current, begins = [], [0] * len(below)
+            for number, (tree, count, children) in enumerate(self._depths[depth]):
                 if number in in_leaf[depth]:
                     current.append(in_leaf[depth][number])
                     continue
-                node_weights: FloatArray = np.empty((len(samples), size, tree.control_count))
-                for child_number, child, in_child in children:
-                    position[self._depths[depth + 1][child].samples] = np.arange(len(below[child]))
-                    child_rows = below[child].take(position[in_child], axis=0)
+                node_weights: FloatArray = np.empty((count, size, tree.control_count))
+                for child_number, child, at in children:
+                    begins[child] += len(at)
+                    child_rows = below[child][begins[child] - len(at) : begins[child]]
                     product = times(child_rows.reshape(1, -1, child_rows.shape[2]), tree.child(child_number)[1])
-                    node_weights[np.searchsorted(samples, in_child)] = product.reshape(*child_rows.shape[:2], -1)
+                    node_weights[at] = product.reshape(len(at), size, -1)
                 current.append(node_weights)
             below = current
         return below
@@ -212,27 +212,27 @@ class LocatedSamples:
 
     def slices(self) -> Iterator[slice]:
         """Return the samples of each element."""
-        ends = np.cumsum([len(node.samples) for node in self._depths[0]]).tolist()
+        ends = np.cumsum([node.sample_count for node in self._depths[0]]).tolist()
         return (slice(begin, end) for begin, end in pairwise([0, *ends]))
 
 
-def _split(samples: IntArray, number: IntArray, count: int) -> list[IntArray]:
-    """Split samples by their numbers, from 0 to ``count - 1``."""
-    order = np.argsort(number.astype(np.min_scalar_type(count)), kind="stable")
-    return np.split(samples[order], np.cumsum(np.bincount(number, minlength=count))[:-1])
+def _grouped(keys: IntArray) -> Iterator[tuple[int, IntArray]]:
+    """Return the distinct keys in increasing order, each with the indices at which it stands."""
+    counts = np.bincount(keys)
+    occurring, order = np.flatnonzero(counts), np.argsort(keys.astype(np.min_scalar_type(len(counts))), kind="stable")
+    return zip(occurring.tolist(), np.split(order, np.cumsum(counts[occurring])[:-1]), strict=False)
 
 
 def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:
     """Return ``(2, n)`` sums of the absolute weights of control points in the tangents of leaves, see `CANCELLED`."""
-    tangents = sample_rows.tangents
-    rows = np.abs(tangents)
-    if leaves.patch is not None:
-        rows = CANCELLED * times(rows, np.abs(leaves.patch.basis.inverse).astype(rows.dtype))
-    magnitude = np.empty(rows.shape[:2], rows.dtype)
+    tangents, share = sample_rows.tangents, 1 if leaves.patch is None else CANCELLED
+    magnitude = np.empty(tangents.shape[:2], tangents.dtype)
     for _, _, piece, uv_slice in leaves.parts:
-        magnitude[:, uv_slice] = rows[:, uv_slice] @ piece.absolute_sums.astype(rows.dtype)
+        rows = tangents[:, uv_slice]
+        magnitude[:, uv_slice] = np.abs(rows) @ (share * piece.absolute_sums).astype(rows.dtype)
         if leaves.patch is not None:
-            magnitude[:, uv_slice] += np.abs(times(tangents[:, uv_slice], piece.coordinates)).sum(axis=2)
+            weights = np.abs(times(rows, piece.coordinates))
+            magnitude[:, uv_slice] += weights @ np.ones(weights.shape[2])
     return magnitude
 
 

@@ -248,8 +248,9 @@ class Piece:
 
     @cached_property
     def absolute_sums(self) -> FloatArray:
-        """``(K_piece,)`` sum of the absolute weights of each row of `stencils`."""
-        return np.abs(self.stencils).sum(axis=1)
+        """``(K_piece,)`` sums of the absolute weights of control points, or of the terms of eigen-coordinates."""
+        sums = np.abs(self.stencils).sum(axis=1)
+        return sums if self.patch is None else np.abs(self.patch.basis.inverse) @ sums
 
     @cached_property
     def coordinates(self) -> FloatArray:

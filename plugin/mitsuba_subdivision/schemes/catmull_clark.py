@@ -113,19 +113,15 @@ class CatmullClark(Scheme):
     def regular_basis(self, uv: FloatArray, derivatives: int) -> FloatArray:
         """Evaluate uniform bicubic B-splines."""
         along = _cubic(uv.T, derivatives)
-        return tensor_basis(along[:, 0], along[:, 1], derivatives)
+        return tensor_basis(along[:, :, 0], along[:, :, 1], derivatives)
 
 
 def _cubic(t: FloatArray, derivatives: int) -> FloatArray:
-    """Evaluate a uniform cubic B-spline segment at ``(..)`` parameters: ``(derivatives + 1, .., 4)``."""
+    """Evaluate a uniform cubic B-spline segment at ``(..)`` parameters: ``(derivatives + 1, 4, ..)``."""
     s = 1 - t
     rows: list[list[FloatArray]] = [
         [s * s * s / 6, (4 - 3 * t * t * (2 - t)) / 6, (4 - 3 * s * s * (2 - s)) / 6, t * t * t / 6],
         [-s * s / 2, t * (3 * t - 4) / 2, s * (4 - 3 * s) / 2, t * t / 2],
         [s, 3 * t - 2, 3 * s - 2, t],
     ]
-    basis = np.empty((derivatives + 1, *t.shape, 4), dtype=t.dtype)
-    for order, row in enumerate(rows[: derivatives + 1]):
-        for column, values in enumerate(row):
-            basis[order, ..., column] = values
-    return basis
+    return np.array(rows[: derivatives + 1])

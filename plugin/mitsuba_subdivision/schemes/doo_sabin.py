@@ -92,8 +92,8 @@ class DooSabin(Scheme):
 
 
 def _quadratic(t: FloatArray, derivatives: int) -> FloatArray:
-    """Evaluate a uniform quadratic B-spline segment: ``(derivatives + 1, s, 3)``."""
+    """Evaluate a uniform quadratic B-spline segment: ``(derivatives + 1, 3, s)``."""
     s = 1 - t
     one = np.ones_like(t)
     rows: list[list[FloatArray]] = [[s * s / 2, (1 + 2 * s * t) / 2, t * t / 2], [-s, s - t, t], [one, -2 * one, one]]
-    return np.array([np.stack(row, axis=1) for row in rows[: derivatives + 1]])
+    return np.array(rows[: derivatives + 1])

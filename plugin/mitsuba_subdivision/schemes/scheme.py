@@ -261,18 +261,17 @@ class Scheme(ABC):
 
 
 def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
-    """Multiply the values and derivatives ``(derivatives + 1, s, r)`` of one-dimensional bases along u and v.
+    """Multiply the values and derivatives ``(derivatives + 1, r, s)`` of one-dimensional bases along u and v.
 
     Returns (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
     """
     orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
-    count = u.shape[1:]
-    # Samples are along the last axis, so that NumPy's inner loops are long.
-    u, v = (np.ascontiguousarray(basis.swapaxes(1, 2)) for basis in (u, v))
-    products = np.empty((len(orders), v.shape[1], count[1], count[0]), dtype=u.dtype)
+    size, count = u.shape[1:]
+    # Samples are along the last axis in memory, so that NumPy's inner loops are long.
+    products = np.empty((len(orders), size, size, count), dtype=u.dtype)
     for product, (a, b) in zip(products, orders, strict=True):
         np.multiply(v[b][:, None], u[a], out=product)
-    return np.ascontiguousarray(products.reshape(len(orders), -1, count[0]).swapaxes(1, 2))
+    return products.reshape(len(orders), size**2, count).swapaxes(1, 2)
 
 
 def scheme_named(name: str) -> Scheme:
