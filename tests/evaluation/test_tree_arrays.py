@@ -40,11 +40,11 @@ for name in ("cube", "torus", "mixed torus", "hexagon", "valence 2 beside triang
 EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
 
 
-def trees(scheme, cage):
+def trees(scheme, cage, piece_levels=(0, PIECE_LEVELS)):
     """The scheme, and every class of patches and its tree, with pieces at some levels of tips or none."""
     surface = LimitSurface(cage, scheme)
     for each in surface.patches.classes:
-        for levels in (0, PIECE_LEVELS):
+        for levels in piece_levels:
             yield surface.scheme, each, tree_arrays(surface.scheme, each.signature, levels), levels
 
 
@@ -118,8 +118,8 @@ def test_polynomials_are_the_limit_stencils(scheme, cage, np_rng):
 
 @EVERY_CAGE
 def test_pieces_agree_with_their_neighbours_where_they_meet(scheme, cage, np_rng):
-    """On lines between copies of the domain, at every level, taken from either side."""
-    for own, patch_class, tree, levels in trees(scheme, cage):
+    """On lines between copies of the domain, at every level, from either side: of pieces, at one level, and of blocks."""
+    for own, patch_class, tree, levels in trees(scheme, cage, [1]):
         walker, domain = Walker(own, tree, levels), own.domain
         # Both sides of a dart have their own copies of the vertices on it.
         vertices = cage.cut_mesh.vertex[patch_class.controls[0]]
