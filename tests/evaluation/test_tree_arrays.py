@@ -118,7 +118,7 @@ def test_polynomials_are_the_limit_stencils(scheme, cage, np_rng):
 
 @EVERY_CAGE
 def test_pieces_agree_with_their_neighbours_where_they_meet(scheme, cage, np_rng):
-    """On lines between copies of the domain, at every level, from either side: of pieces, at one level, and of blocks."""
+    """On lines between copies of the domain, at every level, from either side: pieces at one level, and blocks."""
     for own, patch_class, tree, levels in trees(scheme, cage, [1]):
         walker, domain = Walker(own, tree, levels), own.domain
         # Both sides of a dart have their own copies of the vertices on it.
