@@ -64,6 +64,21 @@ def test_a_box_is_found_from_a_cube(views):
     np.testing.assert_allclose(*sizes, rtol=0.03)
 
 
+@pytest.mark.parametrize(("refinements", "least", "most"), [(0, 0.9, 1.0), (2, 0.0, 0.5)])
+def test_smoothing_slows_what_neighbours_do_against_each_other_in_dense_cages_alone(views, refinements, least, most):
+    """Here, to give up random displacements, for a regularizer beside which pictures do not count."""
+    cage = cube()
+    for _ in range(refinements):
+        cage = cage.refined()
+    moves = 0.1 * np.random.default_rng(1).standard_normal(cage.positions.shape)
+    start, fallen = cage.with_positions(cage.positions + moves), {}
+    for smoothing in (0.0, 1.0):
+        fit = made(start, views[:1], smoothing=smoothing, learning_rate=0.002, regularizers={"laplacian": 1e6}).run(3)
+        fallen[smoothing] = ((start.positions - fit.control_points) * moves).sum()
+    assert fallen[0.0] > 0
+    assert least < fallen[1.0] / fallen[0.0] < most
+
+
 def test_steps_that_collapse_the_surface_or_have_no_finite_loss_are_told(views):
     """The first step of Adam moves each coordinate by the learning rate: here, to the centre."""
     diagonal = np.sqrt(12)

@@ -39,6 +39,9 @@ SHARPNESS = "sharpness"
 CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
 # A surface of this size, in that of the initial one, has collapsed: its triangles have no area in single precision.
 COLLAPSED = 1e-4
+# Large steps reach their full λ from as many control points on, those of a cube refined twice. With fewer, each moves
+# much of a surface that is smooth already, and λ would only slow what neighbours do against each other.
+MANY_POINTS = 98
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +119,8 @@ class CageFit(Fit):
     learning_rate : float or schedule
         How far a step moves the points at most, about, in diagonals of the box around ``cage``.
     smoothing : float
-        How far steps reach, as λ of `LargeSteps`; 0 to move each point for itself.
+        How far steps reach, as λ of `LargeSteps`; 0 to move each point for itself. Cages of n < 98 control points have
+        (n / 98)² of it, until they are refined.
     laplacian : "cage" or "surface"
         Whose Laplacian smooths steps: that of the cage's edges, or of the limit surface where the fit begins.
     sharp_edges : (n, 2) array of int, optional
@@ -247,7 +251,7 @@ class CageFit(Fit):
         self._steps: LargeSteps | None = None
         if self._smoothing:
             laplacian = start.cage.laplacian() if self._laplacian == "cage" else start.stiffness()
-            self._steps = LargeSteps(laplacian, self._smoothing)
+            self._steps = LargeSteps(laplacian, self._smoothing * min(1, start.cage.vertex_count / MANY_POINTS) ** 2)
         self._regularizers = {name: regularizer(name, start) for name in self._weights}
         self._optimizer = mi.ad.Adam(lr=1.0, uniform=True)
         flat = upload(mi.Float, positions)

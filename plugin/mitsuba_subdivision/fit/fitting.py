@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 # A loss has stopped falling when its mean over this many steps is within this part of that over as many before.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
-# Layout of checkpoints.
-FORMAT = 1
+# Layout of checkpoints, and what their numbers mean: those of control points depend on λ of large steps.
+FORMAT = 2
 
 # Arrays by their names.
 State = Mapping[str, NDArray]
