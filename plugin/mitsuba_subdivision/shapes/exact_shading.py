@@ -139,7 +139,7 @@ class ExactShading:
         self.kernel.values.take(coefficients)
         # Assign in place, because other objects may hold a reference to the array.
         self.to_world[:] = self.kernel.types.matrix4(to_world)
-        self._map = AffineMap.of(dr.detach(self.to_world), self.kernel.types.matrix4(placement.inverse))
+        self._map = AffineMap.of(dr.detach(self.to_world), self.kernel.types.matrix4(placement.inverse()))
 
     def channel(self, name: str) -> ChannelKernel:
         """Return the kernel of an attribute of the cage or of its texture coordinates, created at the first call."""

@@ -85,7 +85,7 @@ class Placement:
     """The map of ``to_world`` for points relative to the centre of `RecentredPoints`."""
 
     matrix: Matrix4  # Dr.Jit matrix attached to the parameter; NumPy matrix in scalar variants
-    inverse: Matrix4  # Inverse of the parameter without the centre, detached
+    parameter: Matrix4  # The parameter: NumPy matrix, or detached Dr.Jit matrix if it cannot be read
     is_identity: bool  # Whether the matrix is the identity and is not differentiated
     mirrors: bool  # Whether the map is a reflection, which reverses the orientation of triangles
 
@@ -97,23 +97,24 @@ class Placement:
         centre: NDArray[np.float64] | None,  # (3,) float64 or None
     ) -> Placement:
         """The placement of a transformation."""
-        is_jit = dr.is_jit_v(to_world.matrix)
-        matrix, inverse = cls._recentred(to_world.matrix if is_jit else value, centre), np.linalg.inv(value)
+        matrix = cls._recentred(to_world.matrix if dr.is_jit_v(to_world.matrix) else value, centre)
         is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)
-        return cls(
-            matrix,
-            type(matrix)(inverse.tolist()) if is_jit else inverse,
-            is_identity,
-            bool(np.linalg.det(value[:3, :3]) < 0),
-        )
+        return cls(matrix, value, is_identity, bool(np.linalg.det(value[:3, :3]) < 0))
 
     def recorded(self, to_world: mi.AffineTransform4f, centre: NDArray[np.float64] | None) -> Placement:
         """The placement of a transformation while a frozen function is recorded, when its value cannot be read.
 
         It is assumed to be a reflection if this placement is one.
         """
-        matrix = dr.detach(to_world.matrix)
-        return Placement(self._recentred(to_world.matrix, centre), dr.rcp(matrix), False, self.mirrors)
+        return Placement(self._recentred(to_world.matrix, centre), dr.detach(to_world.matrix), False, self.mirrors)
+
+    def inverse(self) -> Matrix4:
+        """Inverse of the parameter, without the centre, as a detached Dr.Jit matrix."""
+        is_read = isinstance(self.parameter, np.ndarray)
+        inverse = type(self.matrix)(np.linalg.inv(self.parameter).tolist()) if is_read else dr.rcp(self.parameter)
+        # Dr.Jit compiles literals into kernels.
+        dr.make_opaque(inverse)
+        return inverse
 
     def placed(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Map flat positions and unit normals from object space to world space."""

@@ -282,7 +282,7 @@ def make_subdivision(
                 self._placement = Placement.of(self.to_world, matrix, centre)
             if is_jit:
                 # Dr.Jit compiles literals into kernels.
-                dr.make_opaque(self.to_world, self._placement.matrix, self._placement.inverse)
+                dr.make_opaque(self.to_world, self._placement.matrix)
 
         def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
             """Evaluate the moving buffers, and update exact shading."""
