@@ -57,7 +57,7 @@ class Bilinear(Scheme):
 
     def regular_basis(self, uv, derivatives):
         one = np.ones_like(uv[:, 0])
-        rows = [np.array([np.stack(row, 1) for row in ((1 - t, t), (-one, one), (0 * one, 0 * one))]) for t in uv.T]
+        rows = [np.array([(1 - t, t), (-one, one), (0 * one, 0 * one)]) for t in uv.T]
         return tensor_basis(*(row[: derivatives + 1] for row in rows), derivatives)
 
 
