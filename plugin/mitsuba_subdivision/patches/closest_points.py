@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # Pieces are halved until the thickness of their boxes over the length is at most FLAT, but at most MOST_HALVINGS times.
 FLAT, MOST_HALVINGS = 0.05, 4
+# More pieces than this, as of semi-sharp cages, are halved only where a query needs it, to save memory.
+MOST_HALVED = 20_000
 # Most pieces that are kept in memory for levels around extraordinary points, at about a kilobyte per piece. Pieces of
 # deeper levels are computed whenever a query needs them.
 MOST_KEPT = 200_000
@@ -266,7 +268,7 @@ def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPi
     for halving in range(MOST_HALVINGS + 1):
         boxes = TurnedBoxes.around(pieces)
         is_flat = boxes.halves[:, 2] <= FLAT * boxes.halves[:, :2].max(axis=1) + rounded
-        if halving == MOST_HALVINGS:
+        if halving == MOST_HALVINGS or np.count_nonzero(~is_flat) > MOST_HALVED:
             is_flat[:] = True
         done.append((pieces.chosen(is_flat), boxes.chosen(is_flat)))
         pieces = pieces.chosen(~is_flat).halved()
