@@ -40,20 +40,20 @@ def value(cage, points=None):
     "pages",
     [((0, 1, 2, 3), (1, 0, 4, 5)), ((0, 1, 2), (1, 0, 4)), ((0, 1, 2, 3), (1, 0, 4)), ((3, 0, 1, 2), (5, 1, 0, 4))],
 )
-def test_it_is_of_the_angle_between_faces(pages):
+def test_folds_are_of_the_angle_between_faces(pages):
     for angle in np.radians([0, 60, 100, 120, 150, 180]):
         expected = max(0, LEAST_COSINE - np.cos(angle)) ** 2
         assert value(book(angle, pages)) == pytest.approx(expected, abs=ROUNDING)
 
 
-def test_size_and_cages_without_folds_and_edges_do_not_count():
+def test_folds_have_no_size_and_cages_without_them_or_edges_have_none():
     for size in (1e-4, 1e4):
         assert value(book(2.5), size * book(2.5).positions) == pytest.approx(value(book(2.5)), rel=ROUNDING)
     assert value(cube().refined()) == 0
     assert value(ControlCage([(0, 0, 0), (1, 0, 0), (1, 1, 0)], [[0, 1, 2]])) == 0
 
 
-def test_gradients_are_those_of_differences(np_rng):
+def test_gradients_of_folds_are_differences(np_rng):
     cage = book(2.4)
     points = cage.positions + 0.1 * np_rng.standard_normal(cage.positions.shape)
     flat = upload(mi.Float, points)

@@ -266,10 +266,10 @@ def test_boxes_of_a_grid_have_parents_that_are_cubes(np_rng):
         np.testing.assert_array_equal(high - low, side)
 
 
-def test_nearest_points_do_not_depend_on_what_is_halved_beforehand(monkeypatch):
-    cage = bumpy(cage_of("catmull_clark", "torus"))
-    points = np.random.default_rng(3).normal(size=(40, 3))
-    expected = LimitSurface(cage).closest_point(points)
+@pytest.mark.parametrize("name", ["torus", "mixed torus", "semi-sharp ring", "loop mixed torus"])
+def test_nearest_points_do_not_depend_on_what_is_halved_beforehand(name, monkeypatch):
+    surface, points = surface_named(name), np.random.default_rng(3).normal(size=(40, 3))
+    expected = surface.closest_point(points)
     monkeypatch.setattr(closest_points, "MOST_HALVED", 0)
-    halved_later = LimitSurface(cage).closest_point(points)
+    halved_later = LimitSurface(surface.cage, surface.scheme).closest_point(points)
     np.testing.assert_allclose(halved_later.distance, expected.distance, rtol=0, atol=1e-13)

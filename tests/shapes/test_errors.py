@@ -49,7 +49,7 @@ ADAPTIVE = {"tessellation": "adaptive"}
         ({"shown_faces": np.arange(0)}, 'parameter "shown_faces" shows no face; expected one at least'),
         (
             {"shown_faces": np.array([1]), "scheme": "doo_sabin"},
-            '"doo_sabin", whose surface belongs to vertices',
+            'expected none for the scheme "doo_sabin", whose surface belongs to vertices',
         ),
         # Attributes
         ({"texcoords": np.zeros((8, 3))}, 'parameter "texcoords" has shape (8, 3); expected (n, 2)'),
