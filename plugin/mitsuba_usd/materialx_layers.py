@@ -124,9 +124,7 @@ def _beside(path: str, document: str) -> str:
         # What is not there, as the pattern of a picture's tiles, may come back as it is.
         return absolute if absolute != path else beside(document)
     package, inner = Ar.SplitPackageRelativePathInner(document)
-    return str(
-        Ar.JoinPackageRelativePath([package, posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))])
-    )
+    return str(Ar.JoinPackageRelativePath([package, beside(inner)]))
 
 
 class _Material:
