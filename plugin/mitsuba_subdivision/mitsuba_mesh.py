@@ -120,8 +120,8 @@ def with_meshes(scene: SceneNode) -> SceneNode:
 
 
 def points_at(points: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points ``(n, 3)`` transformed by a matrix ``(4, 4)``."""
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
+    """Points ``(n, 3)`` transformed by a matrix ``(4, 4)``, or by each of several ``(m, 4, 4)``: ``(m, n, 3)``."""
+    return points @ matrix[..., :3, :3].swapaxes(-2, -1) + matrix[..., None, :3, 3]
 
 
 def box_corners(box: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageSource
 from mitsuba_subdivision.files import reversed_order
 from mitsuba_subdivision.mesh import IntArray
+from mitsuba_subdivision.studio import points_at
 from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
@@ -145,7 +146,7 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
     """One shape of all copies of a shape, with the transforms ``(n, 4, 4)``."""
     cage, count = shape.cage, len(matrices)
     linear = matrices[:, :3, :3]
-    positions = np.asarray(cage.positions, dtype=np.float64) @ linear.transpose(0, 2, 1) + matrices[:, None, :3, 3]
+    positions = points_at(np.asarray(cage.positions, dtype=np.float64), matrices)
     # Corners of the faces in each copy; faces of mirrored ones are turned over.
     is_mirrored = np.linalg.det(linear) < 0
     corners = np.where(is_mirrored[:, None], reversed_order(cage.face_sizes), np.arange(len(cage.face_vertices)))

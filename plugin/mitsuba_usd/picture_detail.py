@@ -18,6 +18,7 @@ from mitsuba_subdivision.studio import (
     highest_rate,
     outline_for,
     pixels_of_boxes,
+    points_at,
     segments_for,
     triangles_for,
 )
@@ -149,9 +150,9 @@ def _pixels_of_texcoords(
     there = in_texture > 0
     if not there.any():
         return np.inf
-    linear, shifts = to_world[:, :3, :3], to_world[:, None, :3, 3]
     box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
-    corners_of_copies = box_corners(box) @ linear.transpose(0, 2, 1) + shifts
+    corners_of_copies = points_at(box_corners(box), to_world)
     pixels = np.max([pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
+    stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
     ratio = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
-    return ratio * float((np.linalg.norm(linear, 2, axis=(1, 2)) * pixels).max())
+    return ratio * float((stretch * pixels).max())

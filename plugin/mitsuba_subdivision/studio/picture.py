@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..messages import print_remark
-from ..mitsuba_mesh import box_corners
+from ..mitsuba_mesh import box_corners, points_at
 from ..regression.scene import BOX, LoadedScene, SceneSource, load_scene, render_image, render_pixels
 from ..shapes.interaction_hook import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
@@ -68,10 +68,9 @@ def segments_for(
     shading: str,
 ) -> NDArray[np.int64]:
     """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`. Returns (n,) int64."""
-    linear = to_world[:, :3, :3]
     box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
-    corners = box_corners(box) @ linear.transpose(0, 2, 1) + to_world[:, None, :3, 3]
-    stretch = np.linalg.norm(linear, 2, axis=(1, 2))
+    stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
+    corners = points_at(box_corners(box), to_world)
     error = _deviation(cage, shading) * stretch * pixels_of_boxes(corners, outline, near_clip)
     # At twice the rate, triangles are four times as near.
     segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], FINEST_RATE**2)))
