@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 
 from ..cage import ControlCage
 from ..device_arrays import upload
-from ..kernels.linear_maps import SparseMatrix
+from ..kernels.linear_maps import SparseMatrix, attached
 from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
@@ -74,27 +74,11 @@ class LargeSteps:
 
     def from_differential(self, u: dr.ArrayBase) -> mi.Float:
         """Control points, flat x, y, z, of large-step coordinates; differentiable in forward and reverse mode."""
-        return dr.custom(_Solve, self._factors, u)
-
-
-class _Solve(dr.CustomOp):
-    """Solves the system. As its matrix is symmetric, gradients pass through the same solution."""
-
-    def eval(self, factors, u):
-        self.factors = factors
-        return self._solved(u)
-
-    def forward(self):
-        self.set_grad_out(self._solved(self.grad_in("u")))
-
-    def backward(self):
-        self.set_grad_in("u", self._solved(self.grad_out()))
-
-    def name(self):
-        return "LargeSteps"
+        # As the matrix is symmetric, derivatives pass through the same solution in both directions.
+        return attached(self._solved(dr.detach(u)), u, self._solved, self._solved)
 
     def _solved(self, flat: dr.ArrayBase) -> mi.Float:
-        return upload(mi.Float, self.factors.solve(rows(flat)))
+        return upload(mi.Float, self._factors.solve(rows(flat)))
 
 
 def rows(points: dr.ArrayBase | NDArray) -> FloatArray:

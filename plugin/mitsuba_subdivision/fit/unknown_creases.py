@@ -18,6 +18,7 @@ from scipy import sparse
 from ..cage import CageError, ControlCage
 from ..cage.validation import validated_edges
 from ..device_arrays import upload
+from ..kernels.linear_maps import attached
 from ..mesh.connectivity import IntArray
 from ..mesh.cuts import Sharpness
 from ..refinement.adapted_scheme import adapted_scheme
@@ -92,8 +93,24 @@ class UnknownCreases:
         return [(self.matrix(end) @ positions - before) / (STEP * side) for end, side in zip(ends, ahead, strict=True)]
 
     def points(self, sharpness: dr.ArrayBase, positions: dr.ArrayBase) -> mi.Float:
-        """Control points of `refined`, flat x, y, z, differentiable by both; of the sharpness of each crease."""
-        return dr.custom(_RefinedPoints, self, sharpness, positions)
+        """Control points of `refined`, flat x, y, z, differentiable by both; of the sharpness of each crease.
+
+        Runs on the host: the cost of a cage is small beside that of a render.
+        """
+        values = np.clip(np.array(dr.detach(sharpness), dtype=np.float64), 0, self.highest)
+        points = rows(dr.detach(positions))
+        matrix, moves = self.matrix(values), self.derivatives(values, points)
+
+        def forward(changes: tuple[dr.ArrayBase, dr.ArrayBase]) -> mi.Float:
+            along, moved = np.array(changes[0], dtype=np.float64), matrix @ rows(changes[1])
+            return upload(mi.Float, moved + np.tensordot(along, moves, axes=1))
+
+        def backward(gradient: dr.ArrayBase) -> tuple[mi.Float, mi.Float]:
+            by_points = rows(gradient)
+            by_sharpness = [np.vdot(move, by_points) for move in moves]
+            return upload(mi.Float, by_sharpness), upload(mi.Float, matrix.T @ by_points)
+
+        return attached(upload(mi.Float, matrix @ points), (sharpness, positions), forward, backward)
 
     def after(self, refinement: CageRefinement) -> UnknownCreases:
         """The same creases on a refinement of the cage: halves of edges, one less sharp, and at least 1 at most."""
@@ -103,22 +120,3 @@ class UnknownCreases:
         edges = np.stack([finer.face_vertices[halves], finer.face_vertices[finer.next[halves]]], axis=1)
         highest = max(self.highest - 1, 1)
         return UnknownCreases(refinement.cage, edges, np.tile(self.crease_of, 2), highest, self._chosen)
-
-
-class _RefinedPoints(dr.CustomOp):
-    """Runs on the host: the cost of a cage is small beside that of a render."""
-
-    def eval(self, creases, sharpness, positions):
-        values = np.clip(np.array(sharpness, dtype=np.float64), 0, creases.highest)
-        self.matrix, self.moves = creases.matrix(values), creases.derivatives(values, rows(positions))
-        return upload(mi.Float, self.matrix @ rows(positions))
-
-    def forward(self):
-        along = np.array(self.grad_in("sharpness"), dtype=np.float64)
-        moved = sum(rate * move for rate, move in zip(along, self.moves, strict=True))
-        self.set_grad_out(upload(mi.Float, self.matrix @ rows(self.grad_in("positions")) + moved))
-
-    def backward(self):
-        gradient = rows(self.grad_out())
-        self.set_grad_in("sharpness", upload(mi.Float, [np.vdot(move, gradient) for move in self.moves]))
-        self.set_grad_in("positions", upload(mi.Float, self.matrix.T @ gradient))
