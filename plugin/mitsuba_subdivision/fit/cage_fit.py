@@ -70,28 +70,24 @@ def with_sample_count(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sen
     return loaded
 
 
-def _target(picture: Any, size: tuple[int, int], where: str) -> mi.TensorXf:
-    if isinstance(picture, (str, Path)):
-        picture = mi.Bitmap(str(picture))
+def _loaded(view: View, where: str, spp: int) -> tuple[mi.Sensor, mi.TensorXf, mi.TensorXf]:
+    """The sensor of a view, and its picture and mask on the device, checked; a mask of ones if it has none."""
+    sensor = with_sample_count(view.sensor, spp)
+    width, height = map(int, sensor.film().crop_size())
+    picture = mi.Bitmap(str(view.picture)) if isinstance(view.picture, (str, Path)) else view.picture
     if isinstance(picture, mi.Bitmap):
         picture = picture.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    values = np.array(picture, dtype=np.float32)
-    if values.ndim != 3 or values.shape[:2] != size:
-        raise ValueError(f"{where}: a picture of the shape {values.shape}; expected ({size[0]}, {size[1]}, channels)")
-    if not np.isfinite(values).all():
+    target = np.array(picture, dtype=np.float32)
+    if target.ndim != 3 or target.shape[:2] != (height, width):
+        raise ValueError(f"{where}: a picture of the shape {target.shape}; expected ({height}, {width}, channels)")
+    if not np.isfinite(target).all():
         raise ValueError(f"{where}: a picture with values that are not finite")
-    return upload(mi.TensorXf, values)
-
-
-def _mask(mask: ArrayLike | None, size: tuple[int, int], where: str) -> mi.TensorXf | None:
-    if mask is None:
-        return None
-    values = np.array(mask, dtype=np.float32)
-    if values.shape != size:
-        raise ValueError(f"{where}: a mask of the shape {values.shape}; expected {size}")
-    if not np.isfinite(values).all() or (values < 0).any():
+    mask = np.ones((height, width), np.float32) if view.mask is None else np.array(view.mask, dtype=np.float32)
+    if mask.shape != (height, width):
+        raise ValueError(f"{where}: a mask of the shape {mask.shape}; expected {(height, width)}")
+    if not np.isfinite(mask).all() or (mask < 0).any():
         raise ValueError(f"{where}: a mask with weights that are negative or not finite")
-    return upload(mi.TensorXf, values[:, :, None])
+    return sensor, upload(mi.TensorXf, target), upload(mi.TensorXf, mask[:, :, None])
 
 
 class CageFit(Fit):
@@ -182,17 +178,29 @@ class CageFit(Fit):
         seed: int = 0,
         callbacks: Sequence[Callable[[CageFit], None]] = (),
     ) -> None:
-        if crease_of is not None and sharp_edges is None:
-            raise ValueError("crease_of without sharp_edges; expected both, as it is about these")
+        if not mi.variant() or not dr.is_diff_v(mi.Float):
+            raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
+        if not views:
+            raise ValueError("no views: expected one at least")
+        if SHAPE in scene:
+            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
+        if not callable(loss) and loss not in ("l1", "l2"):
+            raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
         if laplacian not in ("cage", "surface"):
             raise ValueError(f'laplacian "{laplacian}"; expected "cage" or "surface"')
-        shape = {} if shape is None else dict(shape)
-        if scheme is not None:
-            shape["scheme"] = scheme
-        self._set_pictures(views, scene, shape, loss, spp, edge_spp)
+        if crease_of is not None and sharp_edges is None:
+            raise ValueError("crease_of without sharp_edges; expected both, as it is about these")
+        self._shape = {**DEFAULT_SHAPE, **(shape or {}), **({} if scheme is None else {"scheme": scheme})}
+        self._entries = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
+        integrator = self._entries["integrator"]
+        if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
+            # Counts for derivatives, unless it has its own.
+            self._entries["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
+        loaded = [_loaded(view, f"view {index}", spp) for index, view in enumerate(views)]
+        self._sensors, self._targets, self._masks = zip(*loaded, strict=True)
+        self._loss, self._smoothing, self._laplacian, self._seed = loss, smoothing, laplacian, seed
         self._size = float(np.linalg.norm(np.ptp(cage.positions, axis=0)))
         self._learning_rate = Schedule.of(learning_rate, "learning_rate")
-        self._smoothing, self._laplacian, self._seed = smoothing, laplacian, seed
         self._weights = {
             name: Schedule.of(weight, f"regularizer {name}") for name, weight in (regularizers or {}).items()
         }
@@ -206,36 +214,6 @@ class CageFit(Fit):
             self._other_rates[SHARPNESS] = Schedule.of(sharpness_rate, "sharpness_rate")
         self._others = mi.ad.Adam(lr=1.0)
         super().__init__(cage, scheme, refine, callbacks)
-
-    def _set_pictures(
-        self,
-        views: Sequence[View],
-        scene: Mapping[str, Any],
-        shape: Mapping[str, Any],
-        loss: Loss,
-        spp: int,
-        edge_spp: int,
-    ) -> None:
-        if not mi.variant() or not dr.is_diff_v(mi.Float):
-            raise ValueError(f"variant {mi.variant()}: expected one with derivatives, such as llvm_ad_rgb")
-        if not views:
-            raise ValueError("no views: expected one at least")
-        if SHAPE in scene:
-            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
-        if not callable(loss) and loss not in ("l1", "l2"):
-            raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
-        self._shape, self._loss = {**DEFAULT_SHAPE, **shape}, loss
-        self._entries = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
-        integrator = self._entries["integrator"]
-        if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
-            # Counts for derivatives, unless it has its own.
-            self._entries["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
-        self._sensors = [with_sample_count(view.sensor, spp) for view in views]
-        self._targets, self._masks = [], []
-        for index, (view, sensor) in enumerate(zip(views, self._sensors, strict=True)):
-            width, height = map(int, sensor.film().crop_size())
-            self._targets.append(_target(view.picture, (height, width), f"view {index}"))
-            self._masks.append(_mask(view.mask, (height, width), f"view {index}"))
 
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
         creases = self._creases
@@ -326,8 +304,14 @@ class CageFit(Fit):
     def _step(self, number: int) -> float:
         points = self._points()
         moved = points if self._creases is None else self._creases.points(self._others[SHARPNESS], points)
-        values = {CONTROL_POINTS: moved, **{name: self._others[name] for name in self._other_names}}
-        loss = self._loss_of_views(values, self._seed + number)
+        self._params[CONTROL_POINTS] = moved
+        for name in self._other_names:
+            self._params[name] = self._others[name]
+        self._params.update()
+        # One graph of all views, so that one `dr.backward` reaches whatever the values were computed from.
+        compare = self._loss if callable(self._loss) else self._difference
+        seed = self._seed + number
+        loss = loss_of_views(self._scene, self._params, compare, self._sensors, seed=seed, spp=0) / len(self._sensors)
         total: Any = loss
         for name, term in self._regularizers.items():
             total += dr.opaque(mi.Float, self._weights[name](number)) * term(points)
@@ -349,22 +333,10 @@ class CageFit(Fit):
             )
         return value
 
-    def _loss_of_views(self, values: Mapping[str, Any], seed: int) -> mi.TensorXf:
-        """The loss of all views at values of the scene's parameters, by their names.
-
-        It is one graph, so that one ``dr.backward`` reaches whatever the values were computed from.
-        """
-        for name, value in values.items():
-            self._params[name] = value
-        self._params.update()
-        loss = self._loss if callable(self._loss) else self._difference
-        return loss_of_views(self._scene, self._params, loss, self._sensors, seed=seed, spp=0) / len(self._sensors)
-
     def _difference(self, image: mi.TensorXf, view: int) -> mi.TensorXf:
         difference = image - self._targets[view]
         size = dr.square(difference) if self._loss == "l2" else dr.abs(difference)
-        mask = self._masks[view]
-        return dr.mean(size if mask is None else size * mask, axis=None)
+        return dr.mean(size * self._masks[view], axis=None)
 
     def _extent(self) -> float:
         """Diagonal of the box around the optimiser's variables: 0 where that around the control points is."""
