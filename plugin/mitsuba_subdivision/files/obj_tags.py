@@ -11,12 +11,10 @@ import re
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.contents import RULES, CageContents
 from ..cage.errors import CageError, shortened, warn
-from ..mesh.connectivity import IntArray
-from .obj_text import SPACE, ObjText, parsed, run_starts
+from .obj_text import ObjText
 
 # Tags that choose a rule: the rule, and its values by the tag's integer or string.
 _RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
@@ -34,12 +32,10 @@ _LIST_TAGS = {
     "corner": (1, 1, "one integer per vertex and a float for all or for each"),
     "hole": (1, 0, "one or more integers and no floats"),
 }
+_HEAD = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
+_INTEGER, _DECIMAL = r" (\d{1,15})", r" (\d{1,15}\.?\d{0,20})"
 # Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
 _PROPAGATE = "facevaryingpropagatecorners"
-# Up to this number, float64 holds every integer.
-_LARGEST_INDEX = 2**53
-# Rows of creases, corners or holes, ``(n, k)``, and the lines that they are from, ``(n,)``.
-_Rows = tuple[NDArray[np.float64], IntArray]
 
 
 def read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
@@ -53,29 +49,35 @@ def read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
     statements = np.flatnonzero(obj.statements_of(b"t"))
     if not len(statements):
         return {}, {}
-    rows: dict[str, list[_Rows]] = {name: [] for name in _LIST_TAGS}
+    bounds = np.append(obj.statement_start, len(obj.text))
+    rows: dict[str, list[list[float]]] = {}
+    row_lines: dict[str, list[int]] = {}
+    is_plain = np.zeros(len(statements), dtype=bool)
+    # There may be very many tags of one edge, vertex or face, in the form of `tag_statements`; all other forms, among
+    # them all that are malformed, are read one by one.
+    for kind, (width, has_sharpness, _) in _LIST_TAGS.items():
+        form = rf"^t {kind} {width}/{has_sharpness}/0{_INTEGER * width}{_DECIMAL * has_sharpness}[ \r]*$"
+        plain = list(re.finditer(form.encode(), obj.text, re.MULTILINE))
+        starts = np.array([match.start() for match in plain], np.int64)
+        rows[kind], row_lines[kind] = [[*map(float, match.groups())] for match in plain], obj.lines(starts).tolist()
+        is_plain |= np.isin(bounds[statements], starts)
     rules: dict[str, str] = {}
     propagates = ""
-    is_taken = np.zeros(len(statements), dtype=bool)
-    for name, of_kind in rows.items():
-        is_plain, plain = _plain_tags(obj, statements, name)
-        is_taken |= is_plain
-        of_kind.append(plain)
-    bounds = np.append(obj.statement_start, len(obj.text))
-    for statement in statements[~is_taken]:
-        start, line = bounds[statement], int(obj.lines(bounds[statement]))
-        tag = obj.text[start + 1 : bounds[statement + 1]].decode(errors="backslashreplace")
-        where, shown = f"{obj.name}, line {line}", shortened(tag.strip())
+    for statement in statements[~is_plain]:
+        start, end = bounds[statement : statement + 2]
+        line = int(obj.lines(start))
+        where, tag = f"{obj.name}, line {line}", obj.text[start + 1 : end].decode(errors="backslashreplace")
         name, integers, floats, strings = _values(where, tag)
         if name in _LIST_TAGS:
-            table = _listed(where, name, integers, floats)
-            rows[name].append((table, np.full(len(table), line)))
+            listed = _listed(where, name, integers, floats)
+            rows[name] += listed
+            row_lines[name] += [line] * len(listed)
         elif name in _RULE_TAGS:
-            rules |= _rule(where, shown, name, [*integers, *floats, *strings])
+            rules |= _rule(where, tag, name, [*integers, *floats, *strings])
         elif name == _PROPAGATE and len(integers) == 1:
             propagates = where if integers[0] else ""
         else:
-            warn(f'{where}: tag "{shown}" is not supported and has no effect')
+            warn(f'{where}: tag "{shortened(tag.strip())}" is not supported and has no effect')
     if propagates and rules.get("face_varying", "corners_plus1") not in ("corners_plus1", "corners_plus2"):
         warn(
             f'{propagates}: tag "{_PROPAGATE}" has no effect with the face-varying rule "{rules["face_varying"]}"; '
@@ -85,58 +87,31 @@ def read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
         rules["face_varying"] = "corners_plus2"
     tags: dict[str, Any] = {"rules": rules}
     tag_lines = {}
-    for name, of_kind in rows.items():
-        tables, lines = (np.concatenate(parts) for parts in zip(*of_kind, strict=True))
+    for kind, (width, has_sharpness, _) in _LIST_TAGS.items():
+        table = np.array(rows[kind], np.float64).reshape(-1, width + has_sharpness)
+        lines = np.array(row_lines[kind], np.int64)
         # The last of several tags counts.
         order = np.argsort(lines, kind="stable")
-        tags[f"{name}s"], tag_lines[f"{name}s"] = tables[order], lines[order].tolist()
+        tags[f"{kind}s"], tag_lines[f"{kind}s"] = table[order], lines[order].tolist()
     tags["holes"] = tags["holes"].ravel().astype(np.int64)
     return tags, tag_lines
 
 
-def _plain_tags(obj: ObjText, statements: IntArray, name: str) -> tuple[NDArray[np.bool_], _Rows]:
-    """Which numbered statements have the most common form, that of one edge, vertex or face, and their tags.
-
-    Other forms, among them all that are malformed, are left to `_listed`.
-    """
-    integers, floats, _ = _LIST_TAGS[name]
-    head, width = f"t {name} {integers}/{floats}/0 ".encode(), integers + floats
-    nothing = np.zeros(len(statements), dtype=bool), (np.zeros((0, width)), np.zeros(0, np.int64))
-    positions = obj.statement_start[statements][:, None] + np.arange(len(head))
-    is_head = np.frombuffer(obj.text, np.uint8).take(positions, mode="clip") == np.frombuffer(head, np.uint8)
-    # The arguments of the statement are the name, the counts and the values.
-    is_plain = is_head.all(axis=1) & (obj.argument_count[statements] == 2 + width)
-    if not is_plain.any():
-        return nothing
-    chosen = np.zeros(len(obj.statement_start), dtype=bool)
-    chosen[statements[is_plain]] = True
-    text, _ = obj.arguments(chosen, len(head))
-    values = parsed(text, np.float64, width * is_plain.sum())
-    if values is None:
-        return nothing
-    rows, is_number = values.reshape(-1, width), text != SPACE
-    token = np.searchsorted(run_starts(is_number), np.flatnonzero(is_number), side="right") - 1
-    digits = text[is_number][token % width < integers]
-    if ((digits < ord("0")) | (digits > ord("9"))).any() or rows[:, :integers].max() > _LARGEST_INDEX:
-        return nothing
-    return is_plain, (rows, obj.lines(obj.statement_start[chosen]))
-
-
 def _values(where: str, tag: str) -> tuple[str, list[int], list[float], list[str]]:
     """Name, integers, floats and strings of a tag."""
-    expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
-    head, shown = re.match(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)", tag), shortened(tag.strip())
-    if not head:
-        raise CageError(f'{where}: malformed tag "{shown}"; {expected}')
-    values = tag[head.end() :].split()
+    problem = ""
     try:
-        integers, floats, strings = map(_integer, head.groups()[1:])
-        if len(values) != integers + floats + strings:
-            raise ValueError(f"{len(values)} values")
-        numbers = [float(value) for value in values[integers : integers + floats]]
-        return head[1], [*map(_integer, values[:integers])], numbers, values[integers + floats :]
+        if head := _HEAD.match(tag):
+            values = tag[head.end() :].split()
+            integers, floats, strings = map(_integer, head.groups()[1:])
+            if len(values) == integers + floats + strings:
+                numbers = [float(value) for value in values[integers : integers + floats]]
+                return head[1], [*map(_integer, values[:integers])], numbers, values[integers + floats :]
+            problem = f" ({len(values)} values)"
     except ValueError as error:
-        raise CageError(f'{where}: malformed tag "{shown}" ({shortened(str(error))}); {expected}') from None
+        problem = f" ({shortened(str(error))})"
+    expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
+    raise CageError(f'{where}: malformed tag "{shortened(tag.strip())}"{problem}; {expected}')
 
 
 def _integer(text: str) -> int:
@@ -147,21 +122,22 @@ def _integer(text: str) -> int:
     return value
 
 
-def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> NDArray[np.float64]:
+def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> list[list[float]]:
     """Rows of the vertices or the face, and of the sharpness, of which there may be one for all rows."""
     width, has_sharpness, expected = _LIST_TAGS[name]
     count = len(integers) // width
     if not count or len(integers) % width or len(floats) not in ((1, count) if has_sharpness else (0,)):
         problem = f"tag {name} has {len(integers)} integers and {len(floats)} floats"
         raise CageError(f"{where}: {problem}; expected {expected}")
-    sharpness = np.broadcast_to(floats, (count,))[:, None] if has_sharpness else np.zeros((count, 0))
-    return np.concatenate([np.array(integers, np.float64).reshape(count, width), sharpness], axis=1)
+    if len(floats) == 1:
+        floats = floats * count
+    return [integers[width * k : width * (k + 1)] + floats[k : k + 1] for k in range(count)]
 
 
-def _rule(where: str, shown: str, name: str, given: list[Any]) -> dict[str, str]:
+def _rule(where: str, tag: str, name: str, given: list[Any]) -> dict[str, str]:
     """The rule that a tag sets; nothing, with a warning, for an unknown value."""
     rule, values = _RULE_TAGS[name]
-    kind = type(next(iter(values)))
+    kind, shown = type(next(iter(values))), shortened(tag.strip())
     if len(given) != 1 or not isinstance(given[0], kind):
         noun = "string" if kind is str else "integer"
         raise CageError(f'{where}: tag "{shown}" has the wrong values; expected one {noun}')
