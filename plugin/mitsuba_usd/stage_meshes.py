@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
-from mitsuba_subdivision.files import MeshReader, PrimvarChoice, Skinning, require_types, reversed_order, value_at
+from mitsuba_subdivision.files import MeshReader, Skinning, require_types, reversed_order, value_at
 from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
@@ -61,16 +61,16 @@ class ShapeReader:
         materials, owner = self._materials_of_faces(mesh, reader)
         shapes = []
         # Parts whose materials need the same primvars share their arrays.
-        cages: dict[PrimvarChoice, CageContents] = {}
+        cages: dict[tuple[tuple[str, ...], str | None], CageContents] = {}
         for number, material in enumerate(materials):
             if not (owner == number).any():
                 continue
-            choice = self._choice(material)
-            if choice not in cages:
-                cages[choice] = reader.contents(is_local=True, choice=choice)
-            cage = cages[choice]
-            if cage.texcoords is not None and not all(map(UsdGeom.PrimvarsAPI(prim).HasPrimvar, choice.texcoords)):
-                what = f'texture coordinates "{choice.texcoords[0]}" are missing; the first others of the mesh are used'
+            names = self._primvars(material)
+            if names not in cages:
+                cages[names] = reader.contents(*names)
+            cage, uv_name = cages[names], names[1]
+            if uv_name is not None and cage.texcoords is not None and not UsdGeom.PrimvarsAPI(prim).HasPrimvar(uv_name):
+                what = f'texture coordinates "{uv_name}" are missing; the first others of the mesh are used'
                 self._notes.add(what, prim.GetPath())
             normals = read_normals(reader, cage) if cage.scheme is None else None
             shown = None
@@ -110,16 +110,16 @@ class ShapeReader:
             owner[faces] = materials.index(material)
         return materials, owner
 
-    def _choice(self, material: int | None) -> PrimvarChoice:
-        """Primvars that a material needs."""
+    def _primvars(self, material: int | None) -> tuple[tuple[str, ...], str | None]:
+        """Names of the attributes that a material needs, and of its texture coordinates."""
         if material is None:
-            return PrimvarChoice(attributes=COLORS)
+            return COLORS, None
         contents = self._materials.materials[material]
         names = contents.texcoords()
         if len(names) > 1:
             what = "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set"
             self._notes.add(what, contents.name)
-        return PrimvarChoice(tuple(names[:1]), tuple(sorted(contents.primvars())))
+        return tuple(sorted(contents.primvars())), next(iter(names), None)
 
     def _shape(
         self,

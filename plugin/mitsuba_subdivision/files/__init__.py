@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .usd_reader import MeshReader, PrimvarChoice, reversed_order
+    from .usd_reader import MeshReader, reversed_order
     from .usd_skinning import Skinning
     from .usd_stage import (
         HIDDEN_PURPOSES,
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 __all__ = [
     "HIDDEN_PURPOSES",
     "MeshReader",
-    "PrimvarChoice",
     "Skinning",
     "local_to_world",
     "open_stage",
@@ -37,6 +36,6 @@ __all__ = [
     "value_at",
 ]
 
-_OF_READER = {"usd_reader": ("MeshReader", "PrimvarChoice", "reversed_order"), "usd_skinning": ("Skinning",)}
+_OF_READER = {"usd_reader": ("MeshReader", "reversed_order"), "usd_skinning": ("Skinning",)}
 # Cages of other formats do not wait for these.
 __getattr__ = deferred(__name__, {"usd_stage": __all__, **_OF_READER})

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -75,15 +74,6 @@ def read_usd(
     return joined(contents, name)
 
 
-@dataclass(frozen=True)
-class PrimvarChoice:
-    """Which primvars of a mesh are read, where not all are."""
-
-    texcoords: Sequence[str] = ()  # Names that texture coordinates are looked up by first
-    # Names of the attributes that are read; values of whole faces become values of their corners
-    attributes: Collection[str] = ()
-
-
 class MeshReader:
     """Reads the attributes of one mesh."""
 
@@ -100,12 +90,14 @@ class MeshReader:
         self.mesh, self.location, self.skinning = mesh, location, skinning
         self._rules, self._report = rules or {}, report
 
-    def contents(self, *, is_local: bool = False, choice: PrimvarChoice | None = None) -> CageContents:
-        """The mesh as contents of a cage in the world's space, or its own; by default, all primvars are read.
+    def contents(self, attributes: Collection[str] | None = None, texcoords: str | None = None) -> CageContents:
+        """The mesh as contents of a cage in the world's space, with all primvars.
 
-        In its own space, a mesh that is not to be smoothed has no scheme.
+        With names of attributes, the mesh is in its own space, where one that is not to be smoothed has no scheme, and
+        only these primvars and texture coordinates are read, values of whole faces as those of their corners. Texture
+        coordinates are looked up by the name ``texcoords`` first.
         """
-        mesh = self.mesh
+        mesh, is_local = self.mesh, attributes is not None
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
         sizes = self.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)
         vertices = self.array(mesh.GetFaceVertexIndicesAttr(), np.int64, required=True)
@@ -138,7 +130,7 @@ class MeshReader:
         )
         holes = self.fitting(mesh.GetHoleIndicesAttr(), left_out("holes"), partial(self._holes, topology), no_holes)
         rules = {rule: self._rule(rule) for rule in RULE_ATTRIBUTES if rule not in self._rules}
-        texcoords, attributes = self._primvars(order, topology, choice)
+        uv, data = self._primvars(order, topology, attributes, texcoords)
         is_flat = str(self.value(mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
         return CageContents(
             points,
@@ -147,8 +139,8 @@ class MeshReader:
             creases=creases,
             corners=corners,
             holes=holes,
-            texcoords=texcoords,
-            attributes=attributes,
+            texcoords=uv,
+            attributes=data,
             rules=rules,
             scheme=None if is_local and is_flat else self._scheme(),
             source=CageSource(self.location),
@@ -318,7 +310,8 @@ class MeshReader:
         # (n_h,) int64, if the orientation of faces is reversed: which face corner of the file becomes each face corner
         order: IntArray | None,
         topology: Topology | None,  # What values are checked against. By default, the cage does so later.
-        choice: PrimvarChoice | None,  # By default, all primvars are read
+        chosen: Collection[str] | None,  # As for `contents`
+        first_name: str | None,
     ) -> tuple[Attribute | None, dict[str, Attribute]]:
         """Texture coordinates and attributes.
 
@@ -329,8 +322,8 @@ class MeshReader:
         """
         from pxr import UsdGeom
 
-        preferred = (*(choice.texcoords if choice else ()), *TEXCOORDS)
-        known = (*INTERPOLATIONS, "uniform") if choice else INTERPOLATIONS
+        preferred = TEXCOORDS if first_name is None else (first_name, *TEXCOORDS)
+        known = INTERPOLATIONS if chosen is None else (*INTERPOLATIONS, "uniform")
         attributes: dict[str, Attribute] = {}
         pairs: list[str] = []
         left_out: dict[str, str] = {}
@@ -339,15 +332,14 @@ class MeshReader:
             if interpolation == UsdGeom.Tokens.constant or name == "normals" or name.startswith("skel:"):
                 continue
             is_pair = kind.startswith("texCoord2")
-            if choice and not (is_pair or name in preferred or name in choice.attributes):
+            if chosen is not None and not (is_pair or name in preferred or name in chosen):
                 continue
             attribute = primvar.GetAttr()
             table = _table(self.value(attribute), primvar.GetElementSize())
             if table is None or interpolation not in known:
                 left_out[str(attribute.GetPath())] = f'"{name}" ({kind}, {interpolation})'
                 continue
-            width = 2 if choice and name in choice.texcoords else None
-            read = partial(self._primvar, primvar, table, order, topology, width)
+            read = partial(self._primvar, primvar, table, order, topology, 2 if name == first_name else None)
             values = self.fitting(attribute, "the primvar is left out", read, None)
             if values is not None:
                 attributes[name] = values
@@ -361,7 +353,7 @@ class MeshReader:
         )
         first = next(pair_names, None)
         texcoords = None if first is None else attributes[first]
-        kept = choice.attributes if choice else attributes.keys() - {first}
+        kept = attributes.keys() - {first} if chosen is None else chosen
         return texcoords, {name: values for name, values in attributes.items() if name in kept}
 
     def _primvar(
