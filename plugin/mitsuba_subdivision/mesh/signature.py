@@ -9,14 +9,13 @@ around it. The limit surface over an element depends on its one-ring only.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from .connectivity import HalfEdges, IndexArray, IntArray, Topology, VertexRule
+from .connectivity import IndexArray, IntArray, Topology, VertexRule
 
 ElementKind = Literal["face", "vertex"]
 Number = TypeVar("Number", int, IntArray)
@@ -168,16 +167,14 @@ def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
 
 
 def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
-    def half_edges(current: int, step: Callable[[int], HalfEdges]) -> list[int]:
-        walked: list[int] = []
-        while current >= 0 and not (walked and current == half_edge):
-            walked.append(current)
-            current = int(step(current))
-        return walked
-
-    ahead = half_edges(half_edge, topology.turn)
-    is_closed = int(topology.turn(ahead[-1])) >= 0
-    return [] if is_closed else half_edges(int(topology.turn_back(half_edge)), topology.turn_back), ahead
+    ahead, behind = [half_edge], list[int]()
+    while (current := int(topology.turn(ahead[-1]))) not in (half_edge, -1):
+        ahead.append(current)
+    if current < 0:
+        current = half_edge
+        while (current := int(topology.turn_back(current))) >= 0:
+            behind.append(current)
+    return behind, ahead
 
 
 def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
