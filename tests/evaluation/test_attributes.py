@@ -8,8 +8,8 @@ from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, torus
 from reference.exact_samples import faces_of
-from reference.face_varying import Channel, refined
 from reference.refined_cages import half_disc, sheet, tagged
+from reference.refinement import Channel, refined
 
 SCENES = Path(__file__).parents[2] / "scenes"
 INFINITE = 10.0

@@ -13,7 +13,7 @@ from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.schemes import CatmullClark
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, upper_half, with_bumps
-from reference.sharp_refinement import SharpMesh
+from reference.refinement import SharpMesh
 
 # Of cages of size about 2, in float64.
 POSITION = 1e-14
@@ -251,7 +251,7 @@ def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng)
     for corners in [[0, 0, 0], *descents]:
         face, mesh, uv = int(element), slow, np.zeros((1, 2))
         for corner in corners:
-            face, mesh = face * int(sizes[0]) + corner, mesh.refined()
+            face, mesh = 4 * face + corner, mesh.refined()
         for corner in corners[::-1]:
             uv = surface.scheme.domain.rotation(corner)(uv / 2)
         vertex = mesh.faces[face][0]

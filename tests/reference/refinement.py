@@ -1,16 +1,34 @@
-"""Refinement of face-varying values, vertex by vertex and edge by edge, from OpenSubdiv's description of its rules.
+"""Refinement with creases and corners of any sharpness, and of face-varying values, vertex by vertex and edge by edge.
 
-Nothing of `mitsuba_subdivision` is used. A mesh is a list of faces (tuples of vertices), a channel a list of index
-tuples of the same lengths and a dict of values by (vertex, index): the same index at two vertices is two values.
+Nothing of `mitsuba_subdivision` is used. The rules are those that OpenSubdiv documents: a vertex with two sharp edges
+moves along them, with more it stays; sharpness falls by one with each refinement; where that makes something smooth,
+the rules before and after are mixed by what was left of it (for Chaikin's method, more than one at times).
+
+A mesh is a list of faces (tuples of vertices), a channel a list of index tuples of the same lengths and a dict of
+values by (vertex, index): the same index at two vertices is two values. Points are a channel without seams.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, pi
 
 import numpy as np
 
-from reference.sharp_refinement import INFINITE, left_of, less
+INFINITE = 10.0
+
+
+def less(sharpness: float) -> float:
+    return sharpness if sharpness >= INFINITE else max(sharpness - 1, 0)
+
+
+def left_of(sharpness: float, others: list[float], method: str) -> float:
+    """What a refinement leaves of an edge's sharpness, in its half at a vertex that has other edges."""
+    semi = [other for other in others if 0 < other < INFINITE]
+    if method == "chaikin" and 0 < sharpness < INFINITE and semi:
+        return max(0.75 * sharpness + 0.25 * sum(semi) / len(semi) - 1, 0)
+    return less(sharpness)
 
 
 @dataclass
@@ -30,7 +48,42 @@ class Channel:
     sharp_boundary_corners: bool
     mode: str
     method: str = "uniform"
+    smooth_triangles: bool = False
     followed: dict | None = None
+
+
+@dataclass
+class SharpMesh:
+    """Polygon mesh with a sharpness for each edge, a frozenset of two vertices, and vertex; border edges are infinite.
+
+    ``scheme`` is "catmull_clark" or "loop", ``method`` "uniform" or "chaikin".
+    """
+
+    scheme: str
+    points: np.ndarray
+    faces: list[tuple[int, ...]]
+    edges: dict[frozenset, float]
+    vertices: dict[int, float]
+    method: str = "uniform"
+    smooth_triangles: bool = False
+
+    def refined(self) -> SharpMesh:
+        """One refinement, with the faces of `refined`. Vertices keep their numbers; new ones come after them."""
+        values = {(vertex, 0): point for vertex, point in enumerate(self.points)}
+        indices, options = [(0,) * len(face) for face in self.faces], (self.method, self.smooth_triangles)
+        channel = Channel(self.faces, indices, values, self.edges, self.vertices, False, "none", *options)
+        finer, _ = refined(channel, self.scheme)
+        number = {("vertex", vertex): vertex for vertex in range(len(self.points))}
+        for vertex, _ in finer.values:
+            number.setdefault(vertex, len(number))
+        points = {number[vertex]: point for (vertex, _), point in finer.values.items()}
+        return replace(
+            self,
+            points=np.array([points[k] for k in range(len(points))]),
+            faces=[tuple(number[vertex] for vertex in face) for face in finer.faces],
+            edges={frozenset(number[vertex] for vertex in edge): s for edge, s in finer.creases.items()},
+            vertices={number[vertex]: s for vertex, s in finer.corners.items()},
+        )
 
 
 class _Around:
@@ -70,7 +123,6 @@ class _Around:
         return INFINITE if self.is_boundary(edge) else self.c.creases.get(edge, 0)
 
     def left(self, edge, vertex):
-
         others = [self.sharpness(other) for other in self.edges_at[vertex] if other != edge]
         return left_of(self.sharpness(edge), others, self.c.method)
 
@@ -164,7 +216,8 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
         if scheme == "loop":
             smooth = 0.75 * own + sum(around.value(g, j + 2) for g, j in sides) / 8
         else:
-            smooth = own / 2 + sum(around.face_means[g] for g, _ in sides) / 4
+            share = np.mean([0.47 if c.smooth_triangles and len(c.faces[g]) == 3 else 0.25 for g, _ in sides])
+            smooth = (1 - 2 * share) * own + share * sum(around.face_means[g] for g, _ in sides)
         return add(key, side, sharpness * own + (1 - sharpness) * smooth)
 
     def vertex_value(f, i):
@@ -188,8 +241,8 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
     creases = {frozenset((("vertex", v), ("edge", edge))): around.left(edge, v) for edge in c.creases for v in edge}
     corners = {("vertex", vertex): less(sharpness) for vertex, sharpness in c.corners.items()}
     followed = {(("vertex", v), i): (("vertex", w), j) for (v, i), (w, j) in c.followed.items()}
-    finer = Channel(faces, indices, values, creases, corners, c.sharp_boundary_corners, c.mode, c.method, followed)
-    return finer, child
+    of_mesh = {"faces": faces, "indices": indices, "values": values, "creases": creases, "corners": corners}
+    return replace(c, **of_mesh, smooth_triangles=False, followed=followed), child
 
 
 def _moved(around, vertex, index, scheme):
