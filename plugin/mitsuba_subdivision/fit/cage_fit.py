@@ -10,7 +10,7 @@ from typing import Any, Literal
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..cage import ControlCage
 from ..device_arrays import upload
@@ -342,37 +342,40 @@ class CageFit(Fit):
         """Diagonal of the box around the optimiser's variables: 0 where that around the control points is."""
         return float(np.linalg.norm(np.ptp(rows(self._optimizer[U]), axis=0)))
 
-    def _states(self) -> dict[str, State]:
-        others = {f"other {name}": _adam_state(self._others, name) for name in self._other_rates}
+    def _state(self) -> State:
+        state = _adam_state(self._optimizer, U, "points")
+        for name in self._other_rates:
+            state |= _adam_state(self._others, name, f"other {name}")
         if self._creases is not None:
             # The refined cage depends on the sharpness at that time.
-            others["start"] = {"positions": self._start.positions, "sharpness": self._creases.initial}
-        return {"points": _adam_state(self._optimizer, U), **others}
+            state |= {"start: positions": self._start.positions, "start: sharpness": self._creases.initial}
+        return state
 
-    def _restore(self, states: Mapping[str, State]) -> None:
+    def _restore(self, state: State) -> None:
         creases = self._creases
         if creases is not None:
-            start = states["start"]
-            self._start = creases.with_sharpness(start["sharpness"], start["positions"])
+            self._start = creases.with_sharpness(state["start: sharpness"], state["start: positions"])
             self._creases = UnknownCreases(self._start, creases.edges, creases.crease_of, creases.highest, self._scheme)
             self._load(LimitSurface(self._start, self._scheme), self._start.positions)
-        _restore_adam(self._optimizer, U, states["points"])
+        _restore_adam(self._optimizer, U, "points", state)
         for name in self._other_rates:
-            _restore_adam(self._others, name, states[f"other {name}"])
+            _restore_adam(self._others, name, f"other {name}", state)
 
 
-def _adam_state(optimizer: mi.ad.Optimizer, name: str) -> State:
+def _adam_state(optimizer: mi.ad.Optimizer, name: str, prefix: str) -> dict[str, NDArray]:
     """A variable of ``mi.ad.Adam``, with the moving averages of its gradient and of that squared."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
-    return {"value": np.array(value), "steps": np.array(steps), "first": np.array(first), "second": np.array(second)}
+    fields = {"value": value, "steps": steps, "first": first, "second": second}
+    return {f"{prefix}: {field}": np.array(values) for field, values in fields.items()}
 
 
-def _restore_adam(optimizer: mi.ad.Optimizer, name: str, state: State) -> None:
+def _restore_adam(optimizer: mi.ad.Optimizer, name: str, prefix: str, state: State) -> None:
     """Give a state to a variable of ``mi.ad.Adam``."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
-    optimizer[name] = upload(type(value), state["value"])
+    optimizer[name] = upload(type(value), state[f"{prefix}: value"])
     value, promoted, rate, (*_, more) = optimizer.state[name]
-    moments = [upload(type(now), state[key]) for key, now in (("steps", steps), ("first", first), ("second", second))]
+    fields = {"steps": steps, "first": first, "second": second}
+    moments = [upload(type(now), state[f"{prefix}: {field}"]) for field, now in fields.items()]
     optimizer.state[name] = value, promoted, rate, (*moments, more)
 
 

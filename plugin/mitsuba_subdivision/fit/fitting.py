@@ -29,7 +29,7 @@ STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 # Layout of checkpoints, and what their numbers mean: those of control points depend on λ of large steps.
 FORMAT = 2
 
-# Arrays by their names.
+# What steps have changed: arrays by their names, "variable: field".
 State = Mapping[str, NDArray]
 # A number, or what users may give instead.
 Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
@@ -85,12 +85,12 @@ class Fit(ABC):
         """Update the state that a refinement changes besides control points; `_load` comes next."""
 
     @abstractmethod
-    def _states(self) -> dict[str, State]:
+    def _state(self) -> State:
         """State that steps have changed."""
 
     @abstractmethod
-    def _restore(self, states: Mapping[str, State]) -> None:
-        """Restore `_states`, with arrays of the same shapes."""
+    def _restore(self, state: State) -> None:
+        """Restore `_state`, with arrays of the same shapes."""
 
     @property
     @abstractmethod
@@ -167,9 +167,7 @@ class Fit(ABC):
             If the file cannot be written; an existing one is then unchanged.
         """
         arrays: dict[str, Any] = {"format": FORMAT, "losses": self.losses}
-        arrays.update(refinements=self.refinements, since=self._since)
-        for name, state in self._states().items():
-            arrays.update({f"{name}: {field}": values for field, values in state.items()})
+        arrays.update(refinements=self.refinements, since=self._since, **self._state())
         with whole_file(Path(path)) as unfinished, unfinished.open("wb") as file:
             np.savez(file, **arrays)
 
@@ -198,21 +196,13 @@ class Fit(ABC):
             )
         while self.refinements < refinements:
             self.refine()
-        states: dict[str, dict[str, NDArray]] = {}
-        for key, values in arrays.items():
-            name, _, field = key.rpartition(": ")
-            if name:
-                states.setdefault(name, {})[field] = values
-        for name, state in self._states().items():
-            saved, expected = (
-                {field: np.shape(values) for field, values in fields.items()}
-                for fields in (states.get(name, {}), state)
-            )
-            if saved != expected:
+        for name, values in self._state().items():
+            if name not in arrays or arrays[name].shape != np.shape(values):
+                variable = name.partition(":")[0]
                 raise ValueError(
-                    f'the checkpoint has no "{name}" of this fit; expected that of a fit with the same arguments'
+                    f'the checkpoint has no "{variable}" of this fit; expected that of a fit with the same arguments'
                 )
-        self._restore(states)
+        self._restore(arrays)
         self.losses, self._since = arrays["losses"].tolist(), int(arrays["since"])
         return self
 

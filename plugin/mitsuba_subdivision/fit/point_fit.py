@@ -19,7 +19,8 @@ from ..surface import LimitSurface
 from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import quadratic_form
 
-POINTS = "points"
+# Name of the control points in checkpoints.
+POINTS = "points: value"
 # Parts of the surface have no points nearby if these are further than this many median distances of a point from
 # the next one. Gaps between random points are smaller.
 NEAR = 5.0
@@ -152,11 +153,11 @@ class PointFit(Fit):
         weights = surface.matrix(at.element[is_pair], at.uv[is_pair], at.corner[is_pair]).p
         return weights, self._points[goal[is_pair]], np.nan_to_num(at.n[is_pair])
 
-    def _states(self) -> dict[str, State]:
-        return {POINTS: {"value": self._control_points}}
+    def _state(self) -> State:
+        return {POINTS: self._control_points}
 
-    def _restore(self, states: Mapping[str, State]) -> None:
-        self._control_points = states[POINTS]["value"]
+    def _restore(self, state: State) -> None:
+        self._control_points = state[POINTS]
 
 
 def _least_squares(
