@@ -11,7 +11,7 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.cage.named_cages import cube, tetrahedron
-from mitsuba_subdivision.files.formats import FORMATS, Format, triangle_writers
+from mitsuba_subdivision.files.formats import FORMATS, Format
 
 
 def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
@@ -28,9 +28,8 @@ def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
     monkeypatch.setitem(FORMATS, ".npz", Format("npz:read", "npz:write"))
     cube().save(tmp_path / "cube.npz")
     np.testing.assert_array_equal(ControlCage.from_file(tmp_path / "cube.npz").positions, cube().positions)
-    with pytest.raises(ValueError, match=r'unknown format ".npz" of triangles'):
+    with pytest.raises(ValueError, match=r'unknown format ".npz" of triangles; expected one of .obj, .ply, .usd, '):
         LimitSurface(cube()).tessellate(2).save(tmp_path / "triangles.npz")
-    assert list(triangle_writers()) == [".obj", ".ply", ".usd", ".usda", ".usdc"]
 
 
 def test_neither_cages_nor_files_are_imported_with_the_package_and_readers_only_where_they_are_used(tmp_path):

@@ -30,8 +30,8 @@ class Format(NamedTuple):
     # From a path to `CageContents`. If the format has prims, it also takes `prim`, `time` and the rules that replace
     # the file's own, as `ControlCage.from_file` does.
     read: str
-    write: str | None = None  # Takes `CageContents` and a path
-    write_triangles: str | None = None  # Has the parameters of `write_triangles`, none with a default
+    write: str = ""  # Takes `CageContents` and a path; empty if there is none
+    write_triangles: str = ""  # Has the parameters of `write_triangles`, none with a default
     has_prims: bool = False  # Whether a file may hold several meshes, and values at several times
     refers_to_files: bool = False  # Whether what a file says may depend on other files
     # Axis, "y" or "z", that points up in the files that modelling programs write by default; None if files store it
@@ -74,18 +74,14 @@ def read_file(path: str | Path, prim: str | None, time: float | None, rules: Map
 
 def write_file(contents: CageContents, path: str | Path) -> None:
     """Write a file of any known format; see `ControlCage.save`."""
-    writers = {suffix: known.write for suffix, known in FORMATS.items() if known.write is not None}
-    function_named(writers[_known_suffix(path, writers)])(contents, path)
-
-
-def triangle_writers() -> dict[str, str]:
-    """Names of the functions that write triangles, by the suffixes of their formats."""
-    return {suffix: known.write_triangles for suffix, known in FORMATS.items() if known.write_triangles is not None}
+    suffix = _known_suffix(path, [suffix for suffix, known in FORMATS.items() if known.write])
+    function_named(FORMATS[suffix].write)(contents, path)
 
 
 def require_triangle_format(path: str | Path) -> str:
     """The suffix of a file of triangles. Raises ValueError if the format is unknown."""
-    return _known_suffix(path, triangle_writers(), 'format "{}" of triangles', ValueError)
+    writable = [suffix for suffix, known in FORMATS.items() if known.write_triangles]
+    return _known_suffix(path, writable, 'format "{}" of triangles', ValueError)
 
 
 def write_triangles(
@@ -103,7 +99,7 @@ def write_triangles(
     Raises ValueError if the format is unknown. Raises CageError if the package usd-core, which writes USD files, is
     missing. Raises OSError if the file cannot be written. Warns if the format cannot hold an attribute, or its name.
     """
-    write = function_named(triangle_writers()[require_triangle_format(path)])
+    write = function_named(FORMATS[require_triangle_format(path)].write_triangles)
     write(path, positions, normals, triangles, texcoords, attributes or {})
 
 

@@ -15,8 +15,7 @@ from ..mesh.connectivity import IntArray
 SPACE, _NEWLINE = b" \n"
 _COMMENT = re.compile(rb"#[^\n]*")
 # The name of a material may have a "#" in it, but for one between spaces.
-_MATERIAL = re.compile(rb"usemtl[ \t][^\n]*#[^\n]*")
-_COMMENT_OF_NAME = re.compile(rb"[ \t]#(?=\s|$)")
+_MATERIAL, _COMMENT_OF_NAME = re.compile(rb"[ \t]*usemtl[ \t]"), re.compile(rb"[ \t]#(?=\s|$)")
 # Files that are often named ".obj" but are something else, by their first bytes.
 _NO_TEXT = {
     b"\xff\xfe": "text in UTF-16; expected ASCII or UTF-8",
@@ -58,12 +57,12 @@ class ObjText:
         line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
         text, statement_end = content, line_end
         if b"#" in text:
-            text = _with_names(_COMMENT.sub(_blank, text), text)
+            text = _COMMENT.sub(_without_comment, text)
         if b"\\" in text:
             if text.rstrip().endswith(b"\\"):
                 line = np.searchsorted(line_end, len(text.rstrip())) + 1
                 raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
-            text = re.sub(rb"\\\r?\n", _blank, text)
+            text = re.sub(rb"\\\r?\n", lambda match: b" " * len(match[0]), text)
             statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
         # Two bytes more, so that a keyword of two letters can be looked for at every statement.
         text += b"\n\n"
@@ -143,16 +142,9 @@ def run_starts(inside: NDArray[np.bool_]) -> IntArray:
     return np.flatnonzero(begins)
 
 
-def _blank(match: re.Match[bytes]) -> bytes:
-    return b" " * len(match[0])
-
-
-def _with_names(text: bytes, content: bytes) -> bytes:
-    """Text without comments, with the names of materials as they were."""
-    restored = bytearray(text)
-    for statement in _MATERIAL.finditer(content):
-        start = statement.start()
-        if not content[content.rfind(b"\n", 0, start) + 1 : start].strip():
-            name = _COMMENT_OF_NAME.split(statement[0])[0]
-            restored[start : start + len(name)] = name
-    return bytes(restored)
+def _without_comment(match: re.Match[bytes]) -> bytes:
+    """What comes in place of a comment, or of the name of a material from its first "#" on: most of all, spaces."""
+    text, (start, end) = match.string, match.span()
+    line = text[text.rfind(b"\n", 0, start) + 1 : end]
+    kept = _COMMENT_OF_NAME.split(line)[0] if _MATERIAL.match(line) else b""
+    return kept[len(line) - (end - start) :].ljust(end - start)
