@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..schemes.domain import FloatArray
-
-if TYPE_CHECKING:
-    from scipy import sparse
 
 # Computed eigenvalues closer than this are treated as one eigenvalue: rounding splits a defective pair by about the
 # square root of the machine precision, 1.5e-8, while distinct eigenvalues of the schemes differ by 1e-3 and more.
@@ -26,7 +23,7 @@ RESIDUAL = 1e-10
 INVERSE_ITERATIONS = 25
 # The modulus of the second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
-# Power of the matrix with which `require_basis` checks a basis.
+# Power of the matrix with which `_require_basis` checks a basis.
 POWER = 20
 # Powers of a nilpotent matrix with entries below this are treated as zero.
 NILPOTENT = 1e-13
@@ -67,13 +64,6 @@ class Eigenbasis:
             matrix[block_slice, block_slice] = np.linalg.matrix_power(block, power)
         return matrix
 
-    def times_blocks(self, coordinates: FloatArray) -> FloatArray:
-        """Multiply eigen-coordinates ``(K, ..)`` by T."""
-        product = self.eigenvalues[:, None] * coordinates
-        for block_slice, block in self.blocks:
-            product[block_slice] = block @ coordinates[block_slice]
-        return product
-
     def turned_over(self) -> Eigenbasis:
         """Return the basis with its third eigenvector negated, which reverses the characteristic map's orientation."""
         sign = np.ones(len(self.eigenvalues))
@@ -85,9 +75,7 @@ class Eigenbasis:
 
 
 def eigenbasis(
-    matrix: FloatArray,  # (K, K) float64: 1 is a simple eigenvalue, and all others are smaller
-    # (K,) float64: the eigenvector of the eigenvalue 1. By default all ones, for rows that sum to one.
-    constant: FloatArray | None = None,
+    matrix: FloatArray,  # (K, K) float64: rows sum to one, 1 is a simple eigenvalue, and all others are smaller
 ) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
@@ -111,7 +99,7 @@ def eigenbasis(
             for members, (left, singular) in zip(clusters, _spans(eigenvectors, clusters), strict=True)
         ]
         vectors = np.hstack(bases)
-        vectors[:, 0] = 1 if constant is None else constant
+        vectors[:, 0] = 1
         inverse = np.linalg.inv(vectors)
     except np.linalg.LinAlgError as error:
         raise EigenbasisError(
@@ -132,33 +120,24 @@ def eigenbasis(
         begin = block_slice.stop
     means[0] = 1
     basis = Eigenbasis(vectors, inverse, means, np.concatenate(moduli), tuple(blocks))
-    require_basis(matrix, basis, np.eye(size))
+    _require_basis(matrix, basis)
     return basis
 
 
-def require_basis(
-    matrix: FloatArray | sparse.csr_array,  # (K, K) float64, or sparse array
-    basis: Eigenbasis,
-    # (K, p) float64: vectors by which the equations are multiplied: all unit vectors, or a few vectors of random
-    # signs, which detect wrong products with high probability [Freivalds 1977]
-    probes: FloatArray,
-) -> None:
+def _require_basis(matrix: FloatArray, basis: Eigenbasis) -> None:
     """Raise EigenbasisError unless ``basis`` is the eigenbasis of a matrix."""
-    coordinates = basis.inverse @ probes
-    image: NDArray = probes
-    powers: NDArray = coordinates
-    for _ in range(POWER):
-        image, powers = matrix @ image, basis.times_blocks(powers)
+    size, vectors, inverse = len(matrix), basis.vectors, basis.inverse
     residuals = {
-        "V L - 1": basis.vectors @ coordinates - probes,
-        "A V - V T": matrix @ (basis.vectors @ coordinates) - basis.vectors @ basis.times_blocks(coordinates),
-        f"A^{POWER} - V T^{POWER} L": image - basis.vectors @ powers,
+        "V L - 1": vectors @ inverse - np.eye(size),
+        "A V - V T": matrix @ vectors - vectors @ basis.block_matrix(),
+        f"A^{POWER} - V T^{POWER} L": np.linalg.matrix_power(matrix, POWER)
+        - vectors @ basis.block_matrix(POWER) @ inverse,
     }
     for equation, residual in residuals.items():
         error = np.abs(residual).max()
         if not error < RESIDUAL:
             raise EigenbasisError(
-                f"eigenbasis of a {len(probes)} x {len(probes)} subdivision matrix: |{equation}| is {error:.1e}, "
+                f"eigenbasis of a {size} x {size} subdivision matrix: |{equation}| is {error:.1e}, "
                 f"expected below {RESIDUAL:.0e}"
             )
 
@@ -196,15 +175,13 @@ def times_block_powers(
     return product
 
 
-def sorting_key(moduli: FloatArray, real_parts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return keys for `numpy.lexsort`: by decreasing modulus; of opposite eigenvalues the positive one comes first."""
-    return -real_parts, -np.round(moduli / CLUSTER_WIDTH)
-
-
 def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
-    """Return indices of equal or conjugate eigenvalues for each cluster, in the order of `sorting_key`."""
+    """Return indices of equal or conjugate eigenvalues for each cluster, by decreasing modulus.
+
+    Of opposite eigenvalues the positive one comes first.
+    """
     points = eigenvalues.real + 1j * np.abs(eigenvalues.imag)
-    left = np.lexsort(sorting_key(np.abs(points), points.real))
+    left = np.lexsort((-points.real, -np.round(np.abs(points) / CLUSTER_WIDTH)))
     clusters = []
     while len(left):
         near = np.abs(points[left] - points[left[0]]) < CLUSTER_WIDTH
