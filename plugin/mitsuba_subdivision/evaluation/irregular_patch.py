@@ -158,12 +158,23 @@ class IrregularPatch:
         return SampleRows(rows, np.ones((2, count), dtype=dtype), np.full(count, AT_EXTRAORDINARY_POINT), frame)
 
 
+def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: IntArray) -> FloatArray:
+    """Return ``(l, 3, m, K)`` coefficients of the regular pieces of levels over eigen-coordinates.
+
+    ``form``, ``(m, R)``, maps the control points of a regular patch to coefficients.
+    """
+    rows: FloatArray = form @ patch.eigen_children
+    flat = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
+    powers = times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), -1)
+    # The first eigenvector is one, whose coefficients are whole numbers.
+    powers[..., 0] = np.rint(form.sum(axis=1))[:, None]
+    return np.moveaxis(powers, 2, 0)
+
+
 @lru_cache(maxsize=4096)
 def level_rows(patch: IrregularPatch, level: int) -> FloatArray:
     """Return ``(3, b, K)`` Bernstein coefficients of a level's regular pieces over eigen-coordinates, read-only."""
-    rows = _rows(patch)
-    flat = rows.reshape(1, -1, rows.shape[2])
-    coefficients = times_powers(flat, np.full(flat.shape[1], level), patch.basis, 1.0).reshape(rows.shape)
+    coefficients = level_polynomials(patch, polynomial_basis(patch.scheme).of_controls, np.array([level]))[0]
     coefficients.flags.writeable = False
     return coefficients
 
@@ -206,7 +217,7 @@ def rest_rows(patch: IrregularPatch) -> FloatArray:
     largest entry of ``Φ Tʲ`` for any j. It is the entry for j = 0, except in Jordan blocks, whose powers grow before
     they shrink.
     """
-    rows, step = _rows(patch).reshape(-1, len(patch.basis.eigenvalues)), transition(patch, 1)
+    rows, step = level_rows(patch, 0).reshape(-1, len(patch.basis.eigenvalues)), transition(patch, 1)
     bound = np.abs(rows)
     for _ in range(GROWING_LEVELS):
         rows = rows @ step
@@ -215,7 +226,3 @@ def rest_rows(patch: IrregularPatch) -> FloatArray:
     bound = np.unique(bound, axis=0)
     bound.flags.writeable = False
     return bound
-
-
-def _rows(patch: IrregularPatch) -> FloatArray:
-    return polynomial_basis(patch.scheme).of_controls @ patch.eigen_children

@@ -25,11 +25,11 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .equations import Evaluator, SampleRows, locate, times
-from .irregular_patch import IrregularPatch
+from .irregular_patch import IrregularPatch, level_polynomials
 from .normals import TANGENT_ROUNDING
 from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, not_isolated
 from .polynomials import polynomial_basis
-from .tree_arrays import LEVEL_PIECES, PIECE_LEVELS, level_polynomials
+from .tree_arrays import LEVEL_PIECES, PIECE_LEVELS
 
 # Share of the absolute terms that `frame_magnitude` counts as weight. Weights of control points are sums over
 # eigen-coordinates, whose large terms may cancel and leave rounding errors. Times `TANGENT_ROUNDING`, this share is at
@@ -323,11 +323,12 @@ def _planes(samples: LocatedSamples) -> list[FloatArray]:
 def _pieces(samples: LocatedSamples) -> list[FloatArray]:
     """Return ``(p, m, K)`` coefficients of the piece that contains each sample, for each element."""
     scheme, rows = samples.scheme, []
+    matrix = polynomial_basis(scheme).matrix
     for leaves in samples.leaves:
         if leaves.patch is None:
-            matrix = polynomial_basis(scheme).matrix[:, None]
-            rows.append(np.broadcast_to(matrix, (len(matrix), len(leaves.uv), matrix.shape[2])))
+            rows.append(np.broadcast_to(matrix[:, None], (len(matrix), len(leaves.uv), matrix.shape[1])))
         else:
-            polynomials = level_polynomials(scheme, leaves.patch, PIECE_LEVELS)
-            rows.append(polynomials[_in_pieces(scheme, leaves)[0]].swapaxes(0, 1))
+            polynomials = level_polynomials(leaves.patch, matrix, np.arange(PIECE_LEVELS))
+            pieces = polynomials.reshape(-1, len(matrix), polynomials.shape[3])
+            rows.append(pieces[_in_pieces(scheme, leaves)[0]].swapaxes(0, 1))
     return samples.weights(rows)

@@ -25,8 +25,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .equations import times_powers
-from .irregular_patch import IrregularPatch, float32_levels
+from .irregular_patch import IrregularPatch, float32_levels, level_polynomials
 from .patch_tree import PartKind, PatchTree, patch_trees
 from .polynomials import polynomial_basis
 
@@ -133,47 +132,25 @@ def _tip(
     Returns those of the pieces ``(n, m, K)``; the blocks ``(b, m, K)``; row 0 of the first l blocks ``(l, m)``, see
     `TreeArrays.blocks`; the kind of frame; and the number of levels, as in `TreeArrays.levels`.
     """
-    basis, polynomials = patch.basis, polynomial_basis(scheme)
-    # The regular children's polynomials over the eigen-coordinates.
-    rows: FloatArray = polynomials.matrix @ patch.eigen_children
-    level_count = float32_levels(patch)
-    by_level = level_polynomials(scheme, patch, level_count)
-    piece_count = piece_levels * len(rows)
-    rest: FloatArray = np.zeros((2, len(polynomials.powers), len(basis.eigenvalues)))
+    basis, polynomials, level_count = patch.basis, polynomial_basis(scheme), float32_levels(patch)
+    by_level = level_polynomials(patch, polynomials.matrix, np.arange(level_count))
+    shape = -1, *by_level.shape[2:]
+    deeper = by_level[piece_levels:]
+    rest: FloatArray = np.zeros((2, *shape[1:]))
     u, v = (int(np.flatnonzero((polynomials.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
     rest[0, [u, v]], rest[1, [u, v]] = basis.subdominant**level_count * patch.edge_tangents, patch.limit_frame
     # Polynomials are about the middle of the domain, and the extraordinary point is at its corner.
     rest[0, 0] = polynomials.centre @ rest[0, [u, v]]
     rest[0, 0, 0] = 1
-    levels = np.arange(piece_levels, level_count)
-    blocks, second_eigenvector = [by_level[piece_count:], rest], 0 * rows[:, :, 0]
+    blocks, second_eigenvector = [deeper.reshape(shape), rest], 0 * by_level[0, :, :, 0]
     frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
     if patch.contracts_unevenly:
-        blocks.append(_by_level(rows, patch, float(basis.moduli[2]), levels))
-        frame, second_eigenvector = FrameKind.UNEVEN, rows[:, :, 1]
-    second_eigenvector = np.tile(second_eigenvector, (len(levels), 1))
-    return by_level[:piece_count], np.concatenate(blocks), second_eigenvector, frame, level_count
-
-
-def level_polynomials(scheme: Scheme, patch: IrregularPatch, level_count: int) -> FloatArray:
-    """Return ``(c, m, K)`` polynomials of the regular children at the first levels, over the eigen-coordinates.
-
-    The `LEVEL_PIECES` of each level are consecutive.
-    """
-    rows: FloatArray = polynomial_basis(scheme).matrix @ patch.eigen_children
-    base = patch.basis.subdominant
-    polynomials = _by_level(rows, patch, base, np.arange(level_count))
-    polynomials *= base ** np.repeat(np.arange(level_count), len(rows))[:, None, None]
-    # The first eigenvector is constant.
-    polynomials[:, 0, 0] = 1
-    return polynomials
-
-
-def _by_level(rows: FloatArray, patch: IrregularPatch, base: float, levels: IntArray) -> FloatArray:
-    """Multiply rows ``(c, m, K)`` by powers of the eigenvalues divided by ``base``; return ``(levels c, m, K)``."""
-    repeated = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
-    scaled = times_powers(repeated, levels.astype(np.int64), patch.basis, base)
-    return np.moveaxis(scaled.reshape(*rows.shape[:2], len(levels), -1), 2, 0).reshape(-1, *rows.shape[1:])
+        across = deeper / basis.moduli[2] ** np.arange(piece_levels, level_count)[:, None, None, None]
+        across[..., :2] = 0
+        blocks.append(across.reshape(shape))
+        frame, second_eigenvector = FrameKind.UNEVEN, by_level[0, :, :, 1]
+    second_eigenvector = np.tile(second_eigenvector, (len(deeper), 1))
+    return by_level[:piece_levels].reshape(shape), np.concatenate(blocks), second_eigenvector, frame, level_count
 
 
 def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None]]:
