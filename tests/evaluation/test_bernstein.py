@@ -51,7 +51,7 @@ def test_products_do_not_depend_on_the_blocks_they_are_made_in(dtype, count, np_
     rows, points = np_rng.normal(size=(5, 9)).astype(dtype), np_rng.normal(size=(9, 3, count)).astype(dtype)
     expected = np.einsum("rb,bxn->rxn", rows, points)
     for most in (1, rows.size * 10, 1 << 18):
-        monkeypatch.setattr("mitsuba_subdivision.evaluation.polynomials.MOST_MULTIPLICATIONS", most)
+        monkeypatch.setattr("mitsuba_subdivision.evaluation.equations.MOST_MULTIPLICATIONS", most)
         found = times(rows, points)
         assert found.dtype == dtype
         # Sums of nine products.

@@ -139,7 +139,7 @@ def child_rows(
     rows = np.empty((3 * derivatives, len(uv), tables.shape[2]), dtype=tables.dtype)
     for k, table in enumerate(tables):
         in_child = np.flatnonzero(child == k)
-        products = times(scheme.regular_basis(local[in_child].astype(tables.dtype), derivatives), table)
+        products = times_matrix(scheme.regular_basis(local[in_child].astype(tables.dtype), derivatives), table)
         # 2 s_k: the child's parameters run twice as fast, and backwards in a triangle's middle child.
         speed = scheme.domain.children[k + 1].matrix[0, 0].astype(tables.dtype)
         products[1:3] *= speed
@@ -149,7 +149,7 @@ def child_rows(
     return level, rows
 
 
-def times(rows: FloatArray, matrix: FloatArray, out: FloatArray | None = None) -> FloatArray:
+def times_matrix(rows: FloatArray, matrix: FloatArray, out: FloatArray | None = None) -> FloatArray:
     """Multiply rows ``(d, n, K)`` by a matrix, in products without OpenBLAS threads, see `MOST_MULTIPLICATIONS`."""
     if out is None:
         out = np.empty((*rows.shape[:2], matrix.shape[1]), dtype=np.result_type(rows, matrix))

@@ -24,7 +24,7 @@ from numpy.typing import DTypeLike, NDArray
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .equations import Evaluator, SampleRows, locate, times
+from .equations import Evaluator, SampleRows, locate, times_matrix
 from .irregular_patch import IrregularPatch, level_polynomials
 from .normals import TANGENT_ROUNDING
 from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, not_isolated
@@ -179,7 +179,7 @@ class LocatedSamples:
                 matrix = piece.stencils if power or piece.patch is None else piece.coordinates
                 weights = np.empty((uv_slice.stop - uv_slice.start, size, matrix.shape[1]))
                 in_leaf[depth][number] = weights
-                times(rows[:, uv_slice], matrix, weights.swapaxes(0, 1))
+                times_matrix(rows[:, uv_slice], matrix, weights.swapaxes(0, 1))
         below: list[FloatArray] = []
         for depth in range(len(self._depths) - 1, -1, -1):
             current, begins = [], [0] * len(below)
@@ -191,7 +191,7 @@ class LocatedSamples:
                 for child_number, child, at in children:
                     begins[child] += len(at)
                     child_rows = below[child][begins[child] - len(at) : begins[child]]
-                    product = times(child_rows.reshape(1, -1, child_rows.shape[2]), tree.child(child_number)[1])
+                    product = times_matrix(child_rows.reshape(1, -1, child_rows.shape[2]), tree.child(child_number)[1])
                     node_weights[at] = product.reshape(len(at), size, -1)
                 current.append(node_weights)
             below = current
@@ -231,7 +231,7 @@ def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:
         rows = tangents[:, uv_slice]
         magnitude[:, uv_slice] = np.abs(rows) @ (share * piece.absolute_sums).astype(rows.dtype)
         if leaves.patch is not None:
-            weights = np.abs(times(rows, piece.coordinates))
+            weights = np.abs(times_matrix(rows, piece.coordinates))
             magnitude[:, uv_slice] += weights @ np.ones(weights.shape[2])
     return magnitude
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme, SchemeError
-from .equations import MOST_MULTIPLICATIONS
+from .equations import times_matrix
 
 # Largest rounding error in the matrices of `BernsteinBasis`, whose entries are fractions with small denominators.
 NO_ENTRY = 1e-12
@@ -120,13 +120,10 @@ class BernsteinBasis:
 
 
 def times(rows: FloatArray, points: FloatArray) -> FloatArray:
-    """Multiply rows ``(r, b)`` by points ``(b, 3, n)`` without OpenBLAS threads; return ``(r, 3, n)``."""
+    """Multiply rows ``(r, b)`` by points ``(b, 3, n)``, by `times_matrix`; return ``(r, 3, n)``."""
     columns = points.reshape(len(points), -1)
     product = np.empty((len(rows), columns.shape[1]), dtype=np.result_type(rows, columns))
-    length = max(1, MOST_MULTIPLICATIONS // max(1, rows.size))
-    for begin in range(0, columns.shape[1], length):
-        run = slice(begin, begin + length)
-        np.matmul(rows, columns[:, run], out=product[:, run])
+    times_matrix(columns.T[None], rows.T, product.T[None])
     return product.reshape(len(rows), *points.shape[1:])
 
 
