@@ -64,8 +64,8 @@ def normals_on_every_path(cage, scheme="catmull_clark", rate=RATE):
     _, kernel = VertexKernel(table, Float)(Float(cage.positions.ravel().astype(np.float32)))
     return {
         "table": table.apply(cage.positions)[1],
-        "samples": surface._evaluate_from(start, uv, "stabilized", np.float64).n,
-        "single samples": surface._evaluate_from(start, uv, "stabilized", np.float32).n,
+        "samples": surface._sampler.evaluate(start, uv).n,
+        "single samples": surface._sampler.evaluate(start, uv, dtype=np.float32).n,
         "kernel": kernel.numpy().reshape(-1, 3),
     }, table
 

@@ -301,7 +301,7 @@ def evaluate_at(surface, half_edge, uv):
     table = surface.patches
     corner = np.empty(table.topology.half_edge_count, dtype=np.int64)
     corner[table.half_edge_of_corner] = np.arange(len(table.half_edge_of_corner))
-    return surface._evaluate_from(corner[half_edge], uv, "stabilized", np.float64)
+    return surface._sampler.evaluate(corner[half_edge], uv)
 
 
 def is_convention(surface, half_edge, found):
@@ -349,7 +349,7 @@ def tessellation_problem(surface):
     """What is wrong with the normals of a tessellation, in either precision, if anything."""
     table = surface.sampling(2)
     start, uv = table.locations()
-    normals = [table.apply(surface.cage.positions)[1], surface._evaluate_from(start, uv, "stabilized", np.float64).n]
+    normals = [table.apply(surface.cage.positions)[1], surface._sampler.evaluate(start, uv).n]
     lengths = np.linalg.norm(normals, axis=2)
     if not ((lengths == 0) | (np.abs(lengths - 1) < SINGLE_LENGTH)).all():
         return "normals of a tessellation neither unit nor zero"

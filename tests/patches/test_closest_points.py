@@ -49,7 +49,7 @@ def distances_by_evaluation(surface, points, samples, start, uv, spacing):
         locations = np.clip(uv[:, None] + spacing * STEPS, 0, 1)
         if surface.scheme.domain.corner_count == 3:
             locations = np.clip(locations - np.maximum(locations.sum(axis=2, keepdims=True) - 1, 0) / 2, 0, 1)
-        found = surface._evaluate_from(np.repeat(start, len(STEPS)), locations.reshape(-1, 2), "stabilized", np.float64)
+        found = surface._sampler.evaluate(np.repeat(start, len(STEPS)), locations.reshape(-1, 2))
         away = np.linalg.norm(found.p.reshape(*locations.shape[:2], 3) - points[:, None], axis=2)
         best = away.argmin(axis=1)
         uv = locations[np.arange(len(points)), best]
@@ -69,7 +69,7 @@ def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np
     surface = surface_named(name)
     segments = max(3, round((SAMPLES / len(grid_locations(surface, 1)[0]) * 4) ** 0.5))
     start, uv = grid_locations(surface, segments)
-    samples = surface._evaluate_from(start, uv, "stabilized", np.float64)
+    samples = surface._sampler.evaluate(start, uv)
     size, points = points_around(samples, np_rng)
     found = surface.closest_point(points)
     others = distances_by_evaluation(surface, points, samples, start, uv, 1 / segments)

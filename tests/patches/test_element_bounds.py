@@ -71,7 +71,7 @@ def test_boxes_are_tight(make, name):
     surface = make(name)
     bounds = surface.bounds()
     start, uv = grid_locations(surface, GRID)
-    points = surface._evaluate_from(start, uv, "stabilized", np.float64).p
+    points = surface._sampler.evaluate(start, uv).p
     lower, upper = np.full((2, len(surface.patches.elements.face_sizes), 3), np.inf)
     element = surface.patches.elements.face[start]
     np.minimum.at(lower, element, points)

@@ -6,7 +6,7 @@ from evaluation.common import evaluate_from
 from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
-from mitsuba_subdivision.patches import channel
+from mitsuba_subdivision.patches import patch_samples
 from patches.closed_cages import bumpy
 
 pytestmark = pytest.mark.core
@@ -61,7 +61,7 @@ def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
     for chosen in (slice(None, None, -1), slice(0, 1), slice(5, 6), slice(40, 43)):
         check(chosen)
     # In short runs.
-    monkeypatch.setattr(channel, "WEIGHTS", 70)
+    monkeypatch.setattr(patch_samples, "WEIGHTS", 70)
     check(slice(None))
 
 

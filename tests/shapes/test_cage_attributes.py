@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.patches.channel import LinearChannel, SubdividedChannel
+from mitsuba_subdivision.patches.channel import Channel
 from reference.refined_cages import refine_first, tagged
 from shapes.cages import MIXED_FACES, cube, load
 from shapes.scenes import SINGLE, buffer, down, perspective, rays, scene_with
@@ -172,8 +172,7 @@ def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated_for_which
     own = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
     update(parameters, vertex_colour=own, cage_weight=parameters["cage_weight"] * 2)
     with monkeypatch.context() as patched:
-        for kind in (SubdividedChannel, LinearChannel):
-            patched.setattr(kind, "weights", None)
+        patched.setattr(Channel, "weights", None)
         update(parameters, control_points=parameters["control_points"] * 2)
         update(make(creased()), control_points=parameters["control_points"])
     np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(own))

@@ -109,7 +109,7 @@ class Truth:
         return np.sin(3 * s) * np.cos(2 * t) if self.kind == "waves" else bilinear(np.stack([s, t], axis=1))
 
     def points(self, corner, uv):
-        found = self.surface._evaluate_from(corner, uv, "stabilized", np.float64)
+        found = self.surface._sampler.evaluate(corner, uv)
         moved = found.p + SCALE * self.height(corner, uv)[:, None] * found.n
         return moved @ self.matrix[:3, :3].T + self.matrix[:3, 3]
 
@@ -440,7 +440,7 @@ def test_hits_follow_what_heights_depend_on(kind):
 def extraordinary(truth, corner, uv):
     """Which locations lie at extraordinary vertices."""
     at = np.flatnonzero((uv == 0).all(axis=1))
-    return at[truth.surface._evaluate_from(corner[at], uv[at], "stabilized", np.float64).level == -1]
+    return at[truth.surface._sampler.evaluate(corner[at], uv[at]).level == -1]
 
 
 @every_variant

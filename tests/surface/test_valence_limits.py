@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
-from mitsuba_subdivision.patches import channel
+from mitsuba_subdivision.patches import patch_samples
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 from mitsuba_subdivision.surface import arguments
 
@@ -68,7 +68,7 @@ def test_samples_on_a_fan_are_those_of_its_faces_one_after_the_other(monkeypatch
     cage = pyramid(60, creases=[[60, 0, 2.5], [60, 7, 1.5]])
     element, uv = np.repeat(np.arange(60), 5), np_rng.random((300, 2))
     together = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
-    monkeypatch.setattr(channel, "WEIGHTS", 1)
+    monkeypatch.setattr(patch_samples, "WEIGHTS", 1)
     apart = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
     np.testing.assert_allclose(apart.p, together.p, rtol=0, atol=ROUNDED_POINT)
     np.testing.assert_allclose(apart.n, together.n, rtol=0, atol=ROUNDED_NORMAL)

@@ -94,7 +94,7 @@ def assert_vertices_lie_where_triangles_say(surface, table):
     corner, uv = table.grid.triangle_locations
     vertex_corner, vertex_uv = table.locations()
     corner, uv = np.concatenate([vertex_corner, corner.repeat(3)]), np.concatenate([vertex_uv, uv.reshape(-1, 2)])
-    exact = surface._evaluate_from(corner, uv, "stabilized", np.float64)
+    exact = surface._sampler.evaluate(corner, uv)
     vertices = np.concatenate([np.arange(table.vertex_count), table.triangles.ravel()])
     np.testing.assert_allclose(positions[vertices], exact.p, rtol=0, atol=rounding)
     np.testing.assert_allclose(normals, exact.n[: len(normals)], rtol=0, atol=ROUNDING / 1e-3)

@@ -265,7 +265,7 @@ def test_rates_follow_a_displacement(name):
 
     def displaced(start, uv):
         """Points, normals and heights."""
-        samples = surface._evaluate_from(start.astype(np.int64), uv, "stabilized", np.float64)
+        samples = surface._sampler.evaluate(start.astype(np.int64), uv)
         x, _, z = samples.p.T / size
         height = 0.01 * size * np.sin(20 * x) * np.cos(15 * z)
         return samples.p + height[:, None] * samples.n, samples.n, height
@@ -288,7 +288,7 @@ def corners_on_sheet(scheme, heights, **criterion):
     surface = LimitSurface(cage if scheme == "catmull_clark" else ControlCage(cage.positions, cage.triangles), scheme)
 
     def places(start, uv):
-        return surface._evaluate_from(start.astype(np.int64), uv, "stabilized", np.float64).p[:, :2]
+        return surface._sampler.evaluate(start.astype(np.int64), uv).p[:, :2]
 
     bound = DisplacementBound(lambda start, uv: heights(places(start, uv)), 16.0)
     start, uv = surface.adaptive_sampling(Criterion(**criterion, displacement=bound), 64).grid.triangle_locations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from ..schemes.scheme import Scheme
 from .eigenbasis import eigenbasis
 from .equations import Evaluator, child_rows, times_powers
 from .irregular_patch import IrregularPatch
-from .located_samples import LocatedSamples, frame_magnitude, without_collapsed
+from .located_samples import LocatedSamples, by_uv, frame_magnitude, limit_stencils
 from .normals import unit_normals
 from .patch_tree import isolated_signature, patch_tree
 from .refined_rings import refined_children
@@ -27,31 +26,52 @@ from .refined_rings import refined_children
 CONSTANT = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class ElementSamples:
-    """Values and derivatives at samples."""
+class SurfaceSamples(NamedTuple):
+    """Points of a limit surface.
 
-    values: FloatArray  # (3 or 6, s, x): value; derivatives by u and v; by uu, uv and vv if requested
-    # (s, 3) unit normals. Zero where the surface has none, except in the published forms "power" and "stam". NaN where
-    # values are not points in space.
-    normal: FloatArray
-    level: NDArray[np.int64]  # (s,) as in `SampleRows`
-    curvature: FloatArray  # (2, s) Gaussian and mean; NaN unless requested
+    Attributes
+    ----------
+    p : (s, 3)
+        Points, in the cage's space.
+    dp_du, dp_dv : (s, 3)
+        Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
+        tangents along the u and the v edge, of arbitrary length.
+    n : (s, 3)
+        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. At a vertex without a
+        tangent plane, a convention defines the normal: beside many faces on a border, the limit along the border; at
+        the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero where the
+        tangents are parallel or zero up to rounding: on the fold between two faces glued back to back, at sharp
+        vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
+        "power" and "stam" follow the published formulas without these conventions.
+    level : (s,) int64
+        The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
+        in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
+    d2p_duu, d2p_duv, d2p_dvv : (s, 3) or None
+        Second derivatives, if requested. Not a number at an extraordinary point itself.
+    gaussian_curvature, mean_curvature : (s,) or None
+        If requested. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
+        extraordinary point itself, 0 where the curvature vanishes (Catmull-Clark, valence 3), else not a number,
+        because the curvature is unbounded or depends on the direction. Not a number where the normal is zero.
+    """
+
+    p: FloatArray
+    dp_du: FloatArray
+    dp_dv: FloatArray
+    n: FloatArray
+    level: NDArray[np.int64]
+    d2p_duu: FloatArray | None = None
+    d2p_duv: FloatArray | None = None
+    d2p_dvv: FloatArray | None = None
+    gaussian_curvature: FloatArray | None = None
+    mean_curvature: FloatArray | None = None
 
     @classmethod
-    def empty(cls, count: int, width: int, dtype: DTypeLike, derivatives: int) -> ElementSamples:
-        """Return samples with uninitialized values."""
-        return cls(
-            np.empty((3 if derivatives == 1 else 6, count, width), dtype=dtype),
-            np.empty((count, 3), dtype=dtype),
-            np.empty(count, dtype=np.int64),
-            np.empty((2, count), dtype=dtype),
-        )
-
-    def put(self, at: IntArray, some: ElementSamples) -> None:
-        """Copy the samples ``some`` to the indices ``at``."""
-        self.values[:, at], self.normal[at] = some.values, some.normal
-        self.level[at], self.curvature[:, at] = some.level, some.curvature
+    def empty(cls, count: int, width: int, dtype: DTypeLike, derivatives: int) -> SurfaceSamples:
+        """Return samples of values of ``width`` components, uninitialized."""
+        p, dp_du, dp_dv, *second = np.empty((3 * derivatives, count, width), dtype=dtype)
+        normal, level = np.empty((count, 3), dtype=dtype), np.empty(count, dtype=np.int64)
+        curvature = np.empty((2 * (derivatives - 1), count), dtype=dtype)
+        return cls(p, dp_du, dp_dv, normal, level, *second, *curvature)
 
 
 def evaluate_samples(
@@ -65,8 +85,8 @@ def evaluate_samples(
     evaluator: Evaluator,
     dtype: DTypeLike,  # Type of all arithmetic
     derivatives: int,
-) -> ElementSamples:
-    """Evaluate samples."""
+) -> SurfaceSamples:
+    """Evaluate samples. Normals of values that are not points in space are not numbers."""
     count, has_origin = len(located.leaf_sample), evaluator not in ("power", "stam")
     # Samples are along the last axis, as operations along an axis of length three are slow.
     origin: FloatArray = np.zeros((len(extent), count), dtype=dtype)
@@ -83,7 +103,7 @@ def evaluate_samples(
         curvature = _curvature(located, values, points, evaluator)
     values[0] += origin
     jacobian, scale = located.jacobian.astype(dtype, copy=False), located.per_sample([r.derivative_scale for r in rows])
-    tangents = _by_uv(values[1:3], jacobian)
+    tangents = by_uv(values[1:3], jacobian)
     # At levels that float32 parameters cannot reach, the scale overflows.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         values[1:3] = tangents * scale[0]
@@ -96,10 +116,10 @@ def evaluate_samples(
         if len(framed):
             framed_samples, framed_points = located.chosen(framed), _chosen(points, located, framed)
             frames = framed_samples.weights([r.tangents for r in framed_samples.rows(evaluator, dtype, 1)])
-            tangents[..., framed] = _by_uv(_times_points(frames, framed_points), jacobian[..., framed])
+            tangents[..., framed] = by_uv(_times_points(frames, framed_points), jacobian[..., framed])
         if has_origin:
             magnitude = located.per_sample([frame_magnitude(*pair) for pair in zip(located.leaves, rows, strict=True)])
-            magnitude = _by_uv(magnitude, np.abs(jacobian))
+            magnitude = by_uv(magnitude, np.abs(jacobian))
             normal = unit_normals(tangents, magnitude, extent.astype(dtype)[:, None])
             # Repeat with the extent of each sample's control points, which is a tighter bound of the rounding error.
             suspect = np.flatnonzero(~normal.any(axis=0))
@@ -110,53 +130,35 @@ def evaluate_samples(
         else:
             normal = unit_normals(tangents)
     level = located.per_sample([leaf_rows.level for leaf_rows in rows])
-    return ElementSamples(values.swapaxes(1, 2), normal.T, level, curvature)
+    p, dp_du, dp_dv, *second = values.swapaxes(1, 2)
+    return SurfaceSamples(p, dp_du, dp_dv, normal.T, level, *second, *(curvature if derivatives == 2 else ()))
 
 
 def element_stencils(
     scheme: Scheme,
     signature: Signature,
-    uv: FloatArray,  # (s, 2) float64: parameters with (0, 0) at the sample's corner
-    corner: IntArray | None = None,  # (s,) int64; by default the first corner
+    uv: FloatArray,  # (s, 2) float64: parameters with (0, 0) at the first corner
 ) -> FloatArray:
-    """Compute limit stencils of samples over an element's one-ring.
+    """Compute `limit_stencils` of samples of one element: ``(3, s, K)`` float64."""
+    element = np.zeros(len(uv), dtype=np.int64)
+    located = LocatedSamples(scheme, [patch_tree(scheme, signature)], element, np.asarray(uv, np.float64), element)
+    return limit_stencils(located)[0].swapaxes(0, 1)
 
-    Returns
-    -------
-    (3, s, K) float64, read-only
-        Weights of the point, which sum to one, and of two tangents, which sum to zero. The cross product of the
-        tangents is along the normal, also at extraordinary points. Away from extraordinary points, borders and sharp
-        features, the tangents are the derivatives times a positive factor, which may differ between samples. They are
-        zero where the surface is folded for all control points.
+
+def derivative_stencils(located: LocatedSamples, derivatives: int) -> list[FloatArray]:
+    """Compute the weights over one-rings that `evaluate_samples` applies to control points.
+
+    Returns list of (s_element, 3 or 6, K) float64: for each element, weights of the point; of the derivatives by u and
+    v; of those by uu, uv and vv.
     """
-    uv = np.asarray(uv, dtype=np.float64)
-    corner = np.zeros(len(uv), dtype=np.int64) if corner is None else corner
-    located = LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
-    rows = located.rows("stabilized", np.float64, 1)
-    magnitude = located.per_sample([frame_magnitude(*pair) for pair in zip(located.leaves, rows, strict=True)])
-    (weights,) = located.weights([np.concatenate([leaf_rows.rows[:1], leaf_rows.tangents]) for leaf_rows in rows])
-    stencils = np.ascontiguousarray(weights.swapaxes(0, 1))
-    stencils[1:] = _by_uv(stencils[1:].swapaxes(1, 2), located.jacobian).swapaxes(1, 2)
-    without_collapsed(stencils[1:], _by_uv(magnitude, np.abs(located.jacobian)))
-    stencils.flags.writeable = False
-    return stencils
-
-
-def derivative_stencils(
-    scheme: Scheme, signature: Signature, uv: FloatArray, corner: IntArray, derivatives: int
-) -> FloatArray:
-    """Compute the weights over an element's one-ring that `evaluate_samples` applies to control points.
-
-    Returns (3 or 6, s, K) float64: of the point; of the derivatives by u and v; of those by uu, uv and vv.
-    """
-    located = LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(len(uv), dtype=np.int64), uv, corner)
     rows = located.rows("stabilized", np.float64, derivatives)
-    (weights,) = located.weights([leaf_rows.rows for leaf_rows in rows])
-    stencils, scale = weights.transpose(1, 2, 0), located.per_sample([r.derivative_scale for r in rows])
-    stencils[1:3] = _by_uv(stencils[1:3], located.jacobian) * scale[0]
-    if derivatives == 2:
-        stencils[3:] = _second_by_uv(stencils[3:], located.jacobian) * scale[1]
-    return stencils.swapaxes(1, 2)
+    weights, scale = located.weights([r.rows for r in rows]), located.per_sample([r.derivative_scale for r in rows])
+    for stencils, samples in zip(weights, located.slices(), strict=True):
+        by_sample, jacobian = stencils.transpose(1, 2, 0), located.jacobian[..., samples]
+        by_sample[1:3] = by_uv(by_sample[1:3], jacobian) * scale[0, samples]
+        if derivatives == 2:
+            by_sample[3:] = _second_by_uv(by_sample[3:], jacobian) * scale[1, samples]
+    return weights
 
 
 def _times_points(weights: list[FloatArray], points: list[FloatArray]) -> FloatArray:
@@ -191,13 +193,6 @@ def _curvature(
         coordinates = np.concatenate([w.astype(p.dtype, copy=False) @ p for w, p in zip(weights, near, strict=True)])
         curvatures[:, which] = irregular_curvature(leaves.patch, samples.leaf_uv, coordinates, np.arange(len(which)))
     return curvatures
-
-
-def _by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Transform derivatives ``(2, .., s)`` by the leaf's parameters to derivatives by the sample's (u, v)."""
-    (a, b), (c, d) = jacobian
-    u, v = tangents
-    return np.stack([a * u + c * v, b * u + d * v])
 
 
 def _second_by_uv(second: FloatArray, jacobian: FloatArray) -> FloatArray:

@@ -158,7 +158,7 @@ class IrregularPatch:
         return SampleRows(rows, np.ones((2, count), dtype=dtype), np.full(count, AT_EXTRAORDINARY_POINT), frame)
 
 
-def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: IntArray) -> FloatArray:
+def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[np.int64]) -> FloatArray:
     """Return ``(l, 3, m, K)`` coefficients of the regular pieces of levels over eigen-coordinates.
 
     ``form``, ``(m, R)``, maps the control points of a regular patch to coefficients.

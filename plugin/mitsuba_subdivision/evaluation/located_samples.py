@@ -236,9 +236,35 @@ def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:
     return magnitude
 
 
-def without_collapsed(tangents: FloatArray, magnitude: FloatArray) -> None:
-    """Set weights ``(2, s, K)`` of tangents to zero where they cancel, as on the fold between faces back to back."""
-    tangents[np.abs(tangents).sum(axis=2) <= TANGENT_ROUNDING[64] * magnitude] = 0
+def by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """Transform derivatives ``(2, .., s)`` by the leaf's parameters to derivatives by the sample's (u, v)."""
+    (a, b), (c, d) = jacobian
+    u, v = tangents
+    return np.stack([a * u + c * v, b * u + d * v])
+
+
+def limit_stencils(located: LocatedSamples) -> list[FloatArray]:
+    """Compute limit stencils of samples over the one-rings of their elements.
+
+    Returns
+    -------
+    list of (s_element, 3, K) float64
+        For each element, weights of the point, which sum to one, and of two tangents, which sum to zero. The cross
+        product of the tangents is along the normal, also at extraordinary points. Away from extraordinary points,
+        borders and sharp features, the tangents are the derivatives times a positive factor, which may differ between
+        samples. They are zero where the surface is folded for all control points.
+    """
+    rows = located.rows("stabilized", np.float64, 1)
+    stencils = located.weights([np.concatenate([leaf_rows.rows[:1], leaf_rows.tangents]) for leaf_rows in rows])
+    if rows:
+        magnitude = located.per_sample([frame_magnitude(*pair) for pair in zip(located.leaves, rows, strict=True)])
+        rounded = TANGENT_ROUNDING[64] * by_uv(magnitude, np.abs(located.jacobian))
+        for weights, samples in zip(stencils, located.slices(), strict=True):
+            tangents = by_uv(weights[:, 1:].transpose(1, 2, 0), located.jacobian[..., samples])
+            # Weights cancel, as on the fold between faces back to back.
+            tangents.swapaxes(1, 2)[np.abs(tangents).sum(axis=1) <= rounded[:, samples]] = 0
+            weights[:, 1:] = tangents.transpose(2, 0, 1)
+    return stencils
 
 
 def _turned(scheme: Scheme, uv: FloatArray, turn: IntArray) -> FloatArray:
@@ -291,7 +317,7 @@ def sampled_polynomials(
     plane[in_planes] = np.arange(len(in_planes))
     piece[in_pieces] = np.repeat(np.arange(len(first)), counts[~has_plane])
     return (
-        Polynomials(_planes(located.chosen(in_planes)), plane, 0 * st),
+        Polynomials(limit_stencils(located.chosen(in_planes)), plane, 0 * st),
         Polynomials(_pieces(located.chosen(first)), piece, st),
     )
 
@@ -307,17 +333,6 @@ def _in_pieces(scheme: Scheme, leaves: Leaves) -> tuple[IntArray, FloatArray]:
         has_piece = (level < PIECE_LEVELS) & (scheme.domain.extent(leaves.uv) > 0)
         number = np.where(has_piece, LEVEL_PIECES * level + child, -1)
     return number, (local - scheme.domain.centre).T
-
-
-def _planes(samples: LocatedSamples) -> list[FloatArray]:
-    """Return ``(p, 3, K)`` coefficients of a plane through each sample, for each element."""
-    rows = samples.rows("stabilized", np.float64, 1)
-    planes = samples.weights([np.concatenate([leaf_rows.rows[:1], leaf_rows.tangents]) for leaf_rows in rows])
-    if rows:
-        magnitude = samples.per_sample([frame_magnitude(*pair) for pair in zip(samples.leaves, rows, strict=True)])
-        for element_planes, element_samples in zip(planes, samples.slices(), strict=True):
-            without_collapsed(element_planes[:, 1:].swapaxes(0, 1), magnitude[:, element_samples])
-    return planes
 
 
 def _pieces(samples: LocatedSamples) -> list[FloatArray]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..patches import LinearChannel, PieceTable
+from ..patches import PieceTable
 from ..patches.piece_table import CODE, FOLLOWING, PRECEDING, WHOLE
 from .algebra import Monomials
 from .array_types import ArrayTypes, Float, Index, Mask, Value
@@ -26,7 +26,7 @@ _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 def channel_kernel(channel: Channel, walk: ElementWalk, float_type: type) -> ChannelKernel:
     """The kernel of a channel with values of 1, 2 or 3 components, over the elements of a surface."""
-    if isinstance(channel, LinearChannel):
+    if channel.is_linear:
         return LinearChannelKernel(channel, walk, float_type)
     return ChannelKernel(channel, float_type)
 
@@ -58,7 +58,7 @@ class ChannelKernel:
 class LinearChannelKernel(ChannelKernel):
     """Evaluates linearly interpolated values."""
 
-    def __init__(self, channel: LinearChannel, walk: ElementWalk, float_type: type) -> None:
+    def __init__(self, channel: Channel, walk: ElementWalk, float_type: type) -> None:
         self._types, self._walk = ArrayTypes(float_type), walk
         patches = channel.patches
         half_edges = patches.half_edge_of_corner

@@ -8,13 +8,13 @@ from ..deferred import deferred
 
 if TYPE_CHECKING:
     from .area_samples import AreaSamples, SamplingCells, SurfaceAreas, uniform_locations
-    from .channel import Channel, ChannelLayout, LinearChannel, PatchSampler, SubdividedChannel, contracts_alike
+    from .channel import Channel, ChannelLayout, contracts_alike
     from .closest_points import ClosestPoints, ClosestPointSearch
     from .energies import energy_matrix, gradients, hessians
+    from .patch_samples import PatchSampler, StencilMatrices, stencil_matrices
     from .patch_table import PatchClass, PatchTable
     from .piece_table import PieceTable
     from .polynomial_pieces import ElementBounds, SurfacePieces
-    from .stencil_matrices import StencilMatrices, sample_matrices
 
 __all__ = [
     "AreaSamples",
@@ -23,21 +23,19 @@ __all__ = [
     "ClosestPointSearch",
     "ClosestPoints",
     "ElementBounds",
-    "LinearChannel",
     "PatchClass",
     "PatchSampler",
     "PatchTable",
     "PieceTable",
     "SamplingCells",
     "StencilMatrices",
-    "SubdividedChannel",
     "SurfaceAreas",
     "SurfacePieces",
     "contracts_alike",
     "energy_matrix",
     "gradients",
     "hessians",
-    "sample_matrices",
+    "stencil_matrices",
     "uniform_locations",
 ]
 
@@ -45,19 +43,12 @@ __getattr__ = deferred(
     __name__,
     {
         "area_samples": ("AreaSamples", "SamplingCells", "SurfaceAreas", "uniform_locations"),
-        "channel": (
-            "Channel",
-            "ChannelLayout",
-            "LinearChannel",
-            "PatchSampler",
-            "SubdividedChannel",
-            "contracts_alike",
-        ),
+        "channel": ("Channel", "ChannelLayout", "contracts_alike"),
         "closest_points": ("ClosestPointSearch", "ClosestPoints"),
         "energies": ("energy_matrix", "gradients", "hessians"),
+        "patch_samples": ("PatchSampler", "StencilMatrices", "stencil_matrices"),
         "patch_table": ("PatchClass", "PatchTable"),
         "piece_table": ("PieceTable",),
         "polynomial_pieces": ("ElementBounds", "SurfacePieces"),
-        "stencil_matrices": ("StencilMatrices", "sample_matrices"),
     },
 )

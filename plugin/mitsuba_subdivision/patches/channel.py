@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.contents import Attribute
-from ..evaluation.element import ElementSamples, evaluate_samples
-from ..evaluation.equations import Evaluator
-from ..evaluation.located_samples import LocatedSamples
-from ..evaluation.patch_tree import patch_tree
+from ..evaluation.located_samples import limit_stencils
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.cuts import seams, value_mesh
 from ..mesh.shared import Content, Shared
-from ..messages import counted
 from ..schemes import Scheme, SchemeError
 from ..schemes.domain import FloatArray
+from .patch_samples import PatchSampler, stencil_matrices
 from .patch_table import PatchTable
-from .stencil_matrices import vertex_matrices
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -31,22 +26,24 @@ if TYPE_CHECKING:
 # Tolerance when testing that an interpolation is linear: rounding of sums of some tens of weights of order one.
 LINEAR = 1e-13
 
-# Weights per run of samples, for values and for each derivative, which bounds temporary memory to tens of megabytes.
-WEIGHTS = 1 << 19
-
 
 @dataclass(frozen=True, eq=False)
 class ChannelLayout:
     """The part of an attribute's interpolation that does not depend on its values.
 
+    Values at mesh vertices are subdivided as points are. Values at face corners are interpolated linearly over each
+    element; over a polygon that has a patch at each corner, bilinearly over each patch: the quadrilateral of the
+    corner, the midpoints of its two edges and the polygon's centre, as by linear refinement.
+
     Attributes with equal indices, on cages of the same topology, tags and rules, share a layout while it is referenced.
     """
 
-    # `SubdividedChannel` or `LinearChannel`; its docstring defines `patches`
-    kind: type[SubdividedChannel] | type[LinearChannel]
+    # Of the mesh on which values are subdivided, which is cut along seams as well and has the same half-edges as the
+    # cage; for linear interpolation, of the surface
     patches: PatchTable
-    value_index: IntArray  # (n,) int64: 0-based row of the values at each vertex or face corner
-    seam: NDArray[np.bool_] | None = None  # (n_h,) bool: half-edges on a seam, or None
+    value_index: IntArray  # (n,) int64: 0-based row of the values at each vertex (subdivided) or face corner (linear)
+    seam: NDArray[np.bool_] | None = None  # (n_h,) bool: half-edges of the cage on a seam; None where none is
+    is_linear: bool = False
 
     @classmethod
     def of(
@@ -61,120 +58,71 @@ class ChannelLayout:
         key = cage.structure, scheme, attribute.interpolation, Content(attribute.indices)
         return _LAYOUTS.get(key, lambda: _layout_of(name, attribute, cage, scheme, patches))
 
-    def channel(self, values: FloatArray) -> Channel:
-        """The channel with values ``(n, k)``."""
-        return self.kind(self, values)
-
 
 _LAYOUTS: Shared[ChannelLayout] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
-class Channel(ABC):
+class Channel:
     """An attribute as a scheme interpolates it over the elements. Samples are given as for `PatchSampler.evaluate`."""
 
     layout: ChannelLayout
     values: FloatArray  # (n, k) float64
 
-    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(s, k)`` values at samples."""
-        return self.with_derivatives(half_edge, uv)[0]
-
-    @abstractmethod
-    def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        """``(3, s, k)`` values and derivatives by u and v."""
-
-    @abstractmethod
-    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
-        """``(s, n)`` weights of the values at samples; rows sum to one."""
-
     @property
     def patches(self) -> PatchTable:
-        """See `SubdividedChannel` and `LinearChannel`."""
+        """See `ChannelLayout`."""
         return self.layout.patches
 
     @property
     def value_index(self) -> IntArray:
-        """``(n,)`` int64, 0-based row of ``values`` at each vertex (subdivided) or face corner (linear)."""
+        """See `ChannelLayout`."""
         return self.layout.value_index
 
     @property
     def seam(self) -> NDArray[np.bool_] | None:
-        """``(n_h,)`` whether each half-edge of the cage lies on a seam; None where none does."""
+        """See `ChannelLayout`."""
         return self.layout.seam
 
+    @property
+    def is_linear(self) -> bool:
+        """See `ChannelLayout`."""
+        return self.layout.is_linear
 
-class SubdividedChannel(Channel):
-    """Values at mesh vertices that are subdivided as points are.
-
-    `patches` belong to the mesh on which the values are subdivided, which is cut along seams as well. Its half-edges
-    have the same indices as the cage's.
-    """
+    def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
+        """``(s, k)`` values at samples."""
+        return self.with_derivatives(half_edge, uv)[0]
 
     def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values and derivatives by u and v; at extraordinary points tangents, see `SurfaceSamples`."""
-        return self._sampler.evaluate(half_edge, uv).values
+        if self.is_linear:
+            rows, weights = self._linear_terms(half_edge, uv)
+            return np.stack([(w[:, :, None] * self._values_and_centres[rows]).sum(axis=1) for w in weights])
+        return np.stack(self._sampler.evaluate(half_edge, uv)[:3])
+
+    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
+        """``(s, n)`` weights of the values at samples; rows sum to one."""
+        if not self.is_linear:
+            indices = self.value_index, len(self.values)
+            return stencil_matrices(self.patches, *indices, half_edge, uv, limit_stencils, 1)[0]
+        from scipy import sparse
+
+        rows, (weights, *_) = self._linear_terms(half_edge, uv)
+        samples, centres = np.repeat(np.arange(len(uv)), rows.shape[1]), self.with_centres
+        at_corners = sparse.csr_array((weights.ravel(), (samples, rows.ravel())), shape=(len(uv), centres.shape[0]))
+        return (at_corners @ centres).tocsr()
 
     @cached_property
     def _sampler(self) -> PatchSampler:
         return PatchSampler(self.patches, self.values, self.value_index)
 
-    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
-        return vertex_matrices(self.patches, self.value_index, len(self.values), half_edge, uv, 1)[0]
-
-
-class LinearChannel(Channel):
-    """Values at face corners that are interpolated linearly over each element.
-
-    Over a polygon that has a patch at each corner, values are interpolated bilinearly over each patch: the
-    quadrilateral of the corner, the midpoints of its two edges and the polygon's centre, as by linear refinement.
-    `patches` are those of the surface.
-    """
-
-    def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
-        domain, (u, v) = self.patches.scheme.domain, uv.T[:, :, None]
-        corners, face, is_partial = self._corners(half_edge)
-        values = [self.values[self.value_index[corner]] for corner in corners]
-        if is_partial.any():
-            # Corner, midpoint of the edge after it, centre, midpoint of the edge before it.
-            for midpoint in (values[1], values[-1]):
-                midpoint[is_partial] = (midpoint[is_partial] + values[0][is_partial]) / 2
-            values[2][is_partial] = self.centres[face[is_partial]]
-        rows = domain.corner_weights(u, v), *domain.corner_derivatives(u, v)
-        return np.stack([sum(weight * value for weight, value in zip(row, values, strict=True)) for row in rows])
-
-    def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
-        from scipy import sparse
-
-        t, entries = self.patches.topology, [*self.patches.scheme.domain.corner_weights(*uv.T)]
-        corners, face, is_partial = self._corners(half_edge)
-        columns = [self.value_index[corner] for corner in corners]
-        if is_partial.any():
-            # The midpoint of an edge passes half of its weight on to the corner.
-            kept = np.where(is_partial, 0.5, 1.0)
-            entries[0] = entries[0] + (1 - kept) * (entries[1] + entries[-1])
-            entries[1], entries[-1] = entries[1] * kept, entries[-1] * kept
-            columns[2] = np.where(is_partial, len(self.values) + face, columns[2])
-        samples = np.repeat(np.arange(len(half_edge)), len(entries))
-        coordinates = np.stack(entries, axis=1).ravel(), (samples, np.stack(columns, axis=1).ravel())
-        shape = len(half_edge), len(self.values) + t.face_count
-        return (sparse.csr_array(coordinates, shape=shape) @ self.with_centres).tocsr()
-
-    def _corners(self, half_edge: IntArray) -> tuple[list[IntArray], IntArray, NDArray[np.bool_]]:
-        """Corners of the samples' faces, in the order of the domain's corners, starting at the samples' half-edges.
-
-        Returns the corners, each (s,) int; the faces; and whether these have a patch at each corner.
-        """
-        t, corner_count = self.patches.topology, self.patches.scheme.domain.corner_count
-        corners = [self.patches.half_edge_of_corner[half_edge]]
-        for _ in range(corner_count - 2):
-            corners.append(t.next[corners[-1]])
-        face = t.face[corners[0]]
-        return [*corners, t.prev[corners[0]]], face, t.face_sizes[face] != corner_count
+    @cached_property
+    def _values_and_centres(self) -> FloatArray:
+        return self.with_centres @ self.values
 
     @property
     def with_centres(self) -> sparse.csr_array:
-        """``(n + n_f, n)`` matrix from the values to the values followed by `centres`."""
+        """``(n + n_f, n)`` matrix from linear values to the values followed by their means over each face."""
         from scipy import sparse
 
         t, count = self.patches.topology, len(self.values)
@@ -183,12 +131,24 @@ class LinearChannel(Channel):
         columns = np.concatenate([np.arange(count), self.value_index])
         return sparse.csr_array((entries, (rows, columns)), shape=(count + t.face_count, count))
 
-    @cached_property
-    def centres(self) -> FloatArray:
-        """``(n_f, k)`` means of the values at the corners of each face."""
-        t = self.patches.topology
-        sums = [np.bincount(t.face, column, minlength=t.face_count) for column in self.values[self.value_index].T]
-        return np.stack(sums, axis=1) / t.face_sizes[:, None]
+    def _linear_terms(self, half_edge: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Rows ``(s, m)`` of `with_centres`, and their weights ``(3, s, m)`` in values and derivatives by u and v."""
+        t, domain = self.patches.topology, self.patches.scheme.domain
+        corners = [self.patches.half_edge_of_corner[half_edge]]
+        for _ in range(domain.corner_count - 2):
+            corners.append(t.next[corners[-1]])
+        rows = self.value_index[np.stack([*corners, t.prev[corners[0]]], axis=1)]
+        weights = np.array([domain.corner_weights(*uv.T), *domain.corner_derivatives(*uv.T)]).swapaxes(1, 2)
+        face = t.face[corners[0]]
+        is_partial = t.face_sizes[face] != domain.corner_count
+        if is_partial.any():
+            # Corner, midpoint of the edge after it, centre, midpoint of the edge before it. Midpoints pass half of
+            # their weights on to the corner.
+            rows[is_partial, 2] = len(self.values) + face[is_partial]
+            halves = np.where(is_partial[:, None], weights[:, :, [1, -1]] / 2, 0)
+            weights[:, :, [1, -1]] -= halves
+            weights[:, :, 0] += halves.sum(axis=2)
+        return rows, weights
 
 
 def contracts_alike(
@@ -200,7 +160,7 @@ def contracts_alike(
 
     If so, tangents of the values and of the points are the same multiples of derivatives nearby.
     """
-    if isinstance(channel, LinearChannel):
+    if channel.is_linear:
         return np.zeros(len(half_edge), dtype=bool)
     if channel.patches is patches:
         return np.ones(len(half_edge), dtype=bool)
@@ -220,7 +180,7 @@ def _layout_of(
     name: str, attribute: Attribute, cage: ControlCage, scheme: Scheme, patches: PatchTable
 ) -> ChannelLayout:
     if attribute.interpolation == "vertex":
-        return ChannelLayout(SubdividedChannel, patches, cage.cut_mesh.vertex)
+        return ChannelLayout(patches, cage.cut_mesh.vertex)
     # Varying attributes have one value per vertex instead of indices.
     indices = cage.topology.face_vertices if attribute.indices is None else attribute.indices
     lies_on_seam = seams(cage.topology, indices)
@@ -235,11 +195,11 @@ def _layout_of(
             )
         value_index: IntArray = np.zeros(patches.topology.vertex_count, dtype=np.int64)
         value_index[patches.topology.face_vertices] = indices
-        return ChannelLayout(SubdividedChannel, patches, value_index)
+        return ChannelLayout(patches, value_index)
     if is_linear or (
         scheme.has_phantom_points and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
     ):
-        return ChannelLayout(LinearChannel, patches, indices, seam)
+        return ChannelLayout(patches, indices, seam, is_linear=True)
     topology, value_index = value_mesh(cage.structure, cage.face_varying, indices)
     if not scheme.has_phantom_points and ((topology.twin < 0).any() or topology.vertex_rules.any()):
         raise SchemeError(
@@ -247,7 +207,7 @@ def _layout_of(
             'states no phantom_points; expected an attribute without seams, or face_varying "all"'
         )
     value_patches = patches if topology is patches.topology else PatchTable(topology, scheme, patches.is_hole)
-    return ChannelLayout(SubdividedChannel, value_patches, value_index, seam)
+    return ChannelLayout(value_patches, value_index, seam)
 
 
 def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[np.bool_]) -> bool:
@@ -269,61 +229,7 @@ def _is_linear_alone(scheme: Scheme) -> bool:
     rules = np.full(count, VertexRule.CORNER, dtype=np.int8)
     patches = PatchTable(Topology(count, np.array([count]), corners, rules=rules), scheme)
     uv = np.array([(0.1, 0.2), (0.5, 0.25), (0.3, 0.6)])
-    subdivided, linear = (
-        ChannelLayout(kind, patches, corners.astype(np.int64))
-        .channel(np.eye(count))
-        .evaluate(np.zeros(3, np.int64), uv)
-        for kind in (SubdividedChannel, LinearChannel)
-    )
+    layouts = (ChannelLayout(patches, corners.astype(np.int64), is_linear=is_linear) for is_linear in (False, True))
+    channels = (Channel(layout, np.eye(count)) for layout in layouts)
+    subdivided, linear = (channel.evaluate(np.zeros(3, np.int64), uv) for channel in channels)
     return np.allclose(subdivided, linear, rtol=0, atol=LINEAR)
-
-
-@dataclass(frozen=True, eq=False)
-class PatchSampler:
-    """Evaluates points, or other values that are subdivided like points, anywhere on patches."""
-
-    patches: PatchTable
-    control_values: FloatArray  # (n, k) float64
-    control_of_vertex: IntArray  # (n_v,) int64: 0-based row of ``control_values`` at each mesh vertex
-
-    def evaluate(
-        self,
-        # (s,) int64: the corner of an element where a sample's parameters are (0, 0), a half-edge of
-        # `PatchTable.elements`
-        half_edge: IntArray,
-        uv: FloatArray,  # (s, 2) float64: parameters, starting at that corner
-        # As for `LimitSurface.evaluate`
-        evaluator: Evaluator = "stabilized",
-        dtype: DTypeLike = np.float64,
-        derivatives: int = 1,
-    ) -> ElementSamples:
-        """Evaluate points, derivatives and normals at samples."""
-        scheme, classes = self.patches.scheme, self.patches.classes
-        class_index, patch, corner = self.patches.patch_at(half_edge)
-        samples = ElementSamples.empty(len(uv), self.control_values.shape[1], dtype, derivatives)
-        # Samples are sorted by class, so that a run has few classes and few control points.
-        order = np.argsort(class_index.astype(np.min_scalar_type(len(classes))), kind="stable")
-        ends = np.cumsum(self.patches.control_counts[class_index[order]]) // WEIGHTS
-        runs = np.split(order, np.flatnonzero(np.diff(ends)) + 1) if len(order) else []
-        for run in counted(runs, "Evaluated patches"):
-            used, element = np.unique(class_index[run], return_inverse=True)
-            run_classes = [classes[index] for index in used.tolist()]
-            elements = [patch_tree(scheme, patch_class.signature) for patch_class in run_classes]
-            located = LocatedSamples(scheme, elements, element, uv[run], corner[run])
-            controls = [
-                patch_class.controls.take(patch[run[class_samples]], axis=0)
-                for patch_class, class_samples in zip(run_classes, located.slices(), strict=True)
-            ]
-            points = [self._values.take(indices, axis=0) for indices in controls]
-            samples.put(run, evaluate_samples(located, points, self._extent, evaluator, dtype, derivatives))
-        return samples
-
-    @cached_property
-    def _extent(self) -> FloatArray:
-        """``(k,)`` range of the control values, maximum minus minimum."""
-        return np.array([np.ptp(column) if len(column) else 0 for column in self.control_values.T])
-
-    @cached_property
-    def _values(self) -> FloatArray:
-        """``(n_v, k)`` control values at the mesh's vertices."""
-        return self.control_values[self.control_of_vertex]

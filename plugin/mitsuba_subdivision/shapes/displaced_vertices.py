@@ -204,8 +204,8 @@ class HostDisplacement:
         sampler = _sampler(self._surface, np.array(points, dtype=np.float64).reshape(-1, 3))
         samples = sampler.evaluate(self._locations.corner, self._locations.uv, derivatives=2)
         # Second derivatives do not exist at extraordinary points.
-        value, du, dv, *second = (_columns(rows) for rows in np.nan_to_num(samples.values))
-        return PatchValues(value, du, dv, _columns(samples.normal), tuple(second))
+        value, du, dv, *second = (_columns(rows) for rows in np.nan_to_num([*samples[:3], *samples[5:8]]))
+        return PatchValues(value, du, dv, _columns(samples.n), tuple(second))
 
     def _mean(self, vectors: FloatArray) -> FloatArray:
         """Replace the vector of each vertex by the mean over its copies."""

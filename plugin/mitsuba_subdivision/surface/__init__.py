@@ -1,5 +1,6 @@
 """The limit surface of a control cage."""
 
-from .limit_surface import TEXCOORDS, LimitSurface, SurfaceSamples
+from ..evaluation.element import SurfaceSamples
+from .limit_surface import TEXCOORDS, LimitSurface
 
 __all__ = ["TEXCOORDS", "LimitSurface", "SurfaceSamples"]

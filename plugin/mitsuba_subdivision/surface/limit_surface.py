@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numbers
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -14,7 +14,10 @@ from .. import patches, tessellation
 from ..cage import ControlCage
 from ..cage.contents import Attribute
 from ..cage.errors import CageError
+from ..evaluation.element import SurfaceSamples, derivative_stencils
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
+from ..evaluation.located_samples import LocatedSamples, limit_stencils
+from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
@@ -23,6 +26,7 @@ from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import ModuleType
 
     from scipy import sparse
@@ -157,16 +161,7 @@ class LimitSurface:
         dtype = checked_form(evaluator, dtype)
         require_derivatives(derivatives)
         half_edge, uv = checked_samples(self.patches, element, uv, corner)
-        return self._evaluate_from(half_edge, uv, evaluator, dtype, derivatives)
-
-    def _evaluate_from(
-        self, half_edge: NDArray[np.int64], uv: FloatArray, evaluator: Evaluator, dtype: DTypeLike, derivatives: int = 1
-    ) -> SurfaceSamples:
-        """Evaluate samples whose parameters start at half-edges of `PatchTable.elements`."""
-        samples = self._sampler.evaluate(half_edge, uv, evaluator, dtype, derivatives)
-        p, dp_du, dp_dv, *second = samples.values
-        second_order = [*second, *samples.curvature] if derivatives == 2 else []
-        return SurfaceSamples(p, dp_du, dp_dv, samples.normal, samples.level, *second_order)
+        return self._sampler.evaluate(half_edge, uv, evaluator, dtype, derivatives)
 
     @cached_property
     def _sampler(self) -> PatchSampler:
@@ -189,8 +184,18 @@ class LimitSurface:
         """
         require_derivatives(derivatives)
         half_edge, uv = checked_samples(self.patches, element, uv, corner)
-        control_of_vertex, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        return patches.sample_matrices(self.patches, control_of_vertex, count, half_edge, uv, derivatives)
+        stencils = partial(derivative_stencils, derivatives=derivatives)
+        return patches.StencilMatrices(*self._matrices(half_edge, uv, stencils, 3 * derivatives))
+
+    def _matrices(
+        self,
+        half_edge: IntArray,
+        uv: FloatArray,
+        stencils: Callable[[LocatedSamples], list[FloatArray]],
+        count: int,
+    ) -> list[sparse.csr_array]:
+        indices = self.cage.cut_mesh.vertex, self.cage.vertex_count
+        return patches.stencil_matrices(self.patches, *indices, half_edge, uv, stencils, count)
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -243,7 +248,7 @@ class LimitSurface:
                 expected = f"one of {', '.join(attributes)}" if attributes else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
             layout = patches.ChannelLayout.of(name, attributes[name], self.cage, self.scheme, self.patches)
-            self._channels[name] = layout.channel(attributes[name].values)
+            self._channels[name] = patches.Channel(layout, attributes[name].values)
         return self._channels[name]
 
     @cached_property
@@ -370,7 +375,7 @@ class LimitSurface:
         half_edge, uv = patches.uniform_locations(
             self._surface_pieces, self._areas, int(count), np.random.default_rng(seed)
         )
-        samples = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
+        samples = self._sampler.evaluate(half_edge, uv)
         return patches.AreaSamples(
             *self._element_and_corner(half_edge), uv, samples.p, samples.n, samples.dp_du, samples.dp_dv
         )
@@ -403,7 +408,7 @@ class LimitSurface:
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise ValueError(f"points of shape {points.shape}; expected (s, 3), all of them finite")
         half_edge, uv = self._closest_point_search.nearest(points)
-        samples = self._evaluate_from(half_edge, uv, "stabilized", np.float64)
+        samples = self._sampler.evaluate(half_edge, uv)
         distance = np.linalg.norm(points - samples.p, axis=1)
         return patches.ClosestPoints(*self._element_and_corner(half_edge), uv, samples.p, samples.n, distance)
 
@@ -594,10 +599,7 @@ class LimitSurface:
         """
         if not isinstance(table, tessellation.VertexTable):
             table = self.sampling(table)
-        from ..patches.stencil_matrices import vertex_matrices
-
-        cut, count = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        points, *tangents = vertex_matrices(self.patches, cut, count, *table.locations())
+        points, *tangents = self._matrices(*table.locations(), limit_stencils, 3)
         return tessellation.VertexMatrices(points[table.weld_target], *tangents)
 
     def attribute_table(self, table: VertexTable) -> AttributeTable:
@@ -626,49 +628,9 @@ class LimitSurface:
             return table.apply(self.cage.positions)
         half_edge, uv = table.locations()
         corners = np.flatnonzero(((uv == 0) | (uv == 1)).all(axis=1))
-        level = self._evaluate_from(half_edge[corners], uv[corners], "stabilized", dtype).level
+        level = self._sampler.evaluate(half_edge[corners], uv[corners], "stabilized", dtype).level
         moved = corners[level == AT_EXTRAORDINARY_POINT]
         # A parameter of 0 becomes the offset; one of 1, at the centre of a polygon, becomes 1 minus the offset.
         uv[moved] = np.abs(uv[moved] - sample_offset)
-        samples = self._evaluate_from(half_edge, uv, evaluator, dtype)
+        samples = self._sampler.evaluate(half_edge, uv, evaluator, dtype)
         return samples.p[table.weld_target], samples.n
-
-
-class SurfaceSamples(NamedTuple):
-    """Points of a limit surface.
-
-    Attributes
-    ----------
-    p : (s, 3)
-        Points, in the cage's space.
-    dp_du, dp_dv : (s, 3)
-        Derivatives by the sample's own (u, v). At an extraordinary point, where they vanish or are infinite, the
-        tangents along the u and the v edge, of arbitrary length.
-    n : (s, 3)
-        Unit normals, along ``dp_du x dp_dv``: outward for a cage with counter-clockwise faces. At a vertex without a
-        tangent plane, a convention defines the normal: beside many faces on a border, the limit along the border; at
-        the tip of a sharp vertex, one normal for all its faces, made of the edges around it. Exactly zero where the
-        tangents are parallel or zero up to rounding: on the fold between two faces glued back to back, at sharp
-        vertices of two faces and ends of creases in them, and where the surface collapses to a curve or a point.
-        "power" and "stam" follow the published formulas without these conventions.
-    level : (s,) int64
-        The n of equations (9) to (12): refinements of the irregular patch that holds the sample until the sample lies
-        in a regular one. 0 on regular patches, -1 at an extraordinary point itself.
-    d2p_duu, d2p_duv, d2p_dvv : (s, 3) or None
-        Second derivatives, if requested. Not a number at an extraordinary point itself.
-    gaussian_curvature, mean_curvature : (s,) or None
-        If requested. Mean curvature is positive where the surface bends towards its normal: negative on a ball. At an
-        extraordinary point itself, 0 where the curvature vanishes (Catmull-Clark, valence 3), else not a number,
-        because the curvature is unbounded or depends on the direction. Not a number where the normal is zero.
-    """
-
-    p: FloatArray
-    dp_du: FloatArray
-    dp_dv: FloatArray
-    n: FloatArray
-    level: NDArray[np.int64]
-    d2p_duu: FloatArray | None = None
-    d2p_duv: FloatArray | None = None
-    d2p_dvv: FloatArray | None = None
-    gaussian_curvature: FloatArray | None = None
-    mean_curvature: FloatArray | None = None

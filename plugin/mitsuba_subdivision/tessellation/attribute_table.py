@@ -102,8 +102,6 @@ def _layout(
     """The layout of attributes with the given channel layouts at the vertices of a tessellation."""
     if not layouts:
         return AttributeLayout(None, lambda: table.triangles)
-    from ..patches import LinearChannel
-
     # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
     grid, surface_vertex = table.grid, None
     seams = [layout.seam for layout in layouts if layout.seam is not None]
@@ -124,9 +122,9 @@ def _layout(
         return vertex_values if surface_vertex is None else vertex_values[surface_vertex]
 
     def evaluate(layout: ChannelLayout) -> Callable[[Channel], FloatArray]:
-        if layout.patches is patches and layout.kind is not LinearChannel:
+        if layout.patches is patches and not layout.is_linear:
             return on_surface
-        if layout.kind is LinearChannel or not isinstance(table.grid, UniformGrid):
+        if layout.is_linear or not isinstance(table.grid, UniformGrid):
             return lambda channel: channel.evaluate(*locate())
         channel_table = uniform_table(layout.patches, table.grid.rate)
         vertices = grid.vertices_of(channel_table.grid)
