@@ -29,22 +29,22 @@ CHANNELS = {
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
-class Sampling:
-    """Where expressions are evaluated: at points of texture coordinates ``(..., 2)``, all at once."""
-
-    def __init__(self, texcoords: Values) -> None:
-        self.texcoords = texcoords
-
-    def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
-        """Values ``(..., k)`` of a picture at texture coordinates, or where the points themselves are."""
-        raise NotImplementedError
-
-    def gradient(self, values: Values) -> Values:
-        """Derivatives ``(..., 2)`` of values ``(..., 1)`` along texture coordinates."""
-        return np.zeros((len(values), 2))
+# Values (..., k) of a picture at texture coordinates (..., 2), or for None at the points of an evaluation.
+Texels = Callable[[TextureContents, Values | None], Values]
 
 
-def evaluate(given: Input, sampling: Sampling) -> Values:
+def fallback_of(texture: TextureContents, _texcoords: Values | None = None) -> Values:
+    """Values of a texture whose file cannot be read."""
+    return np.asarray(texture.fallback, dtype=np.float32)[texture.channels]
+
+
+def evaluate(
+    given: Input,
+    points: Values,  # (..., 2): texture coordinates, all at once
+    texels: Texels = fallback_of,
+    # Derivatives (..., 2) of values (..., 1) along texture coordinates
+    gradient: Callable[[Values], Values] = lambda values: np.zeros((len(values), 2)),
+) -> Values:
     """Values of an expression, ``(..., k)``; attributes of meshes are their fallbacks."""
     known: dict[int, Values] = {}
 
@@ -59,18 +59,18 @@ def evaluate(given: Input, sampling: Sampling) -> Values:
 
     def computed(part: TextureContents | PrimvarContents | NodeContents) -> Values:
         if isinstance(part, TextureContents):
-            return sampling.texels(part, None)
+            return texels(part, None)
         if isinstance(part, PrimvarContents):
             return np.asarray(part.fallback, dtype=np.float32)
         if part.category == "texcoord":
-            return sampling.texcoords
+            return points
         if part.category == "image":
             file = part.inputs["file"]
             assert isinstance(file, TextureContents)
-            return sampling.texels(file, value_of(part.inputs["texcoord"]))
+            return texels(file, value_of(part.inputs["texcoord"]))
         inputs = {name: value_of(value) for name, value in part.inputs.items()}
         if part.category == "heighttonormal":
-            slope = sampling.gradient(inputs["in"]) * inputs["scale"] / 16
+            slope = gradient(inputs["in"]) * inputs["scale"] / 16
             return _unit(np.concatenate([-slope, np.ones_like(slope[..., :1])], axis=-1)) / 2 + 0.5
         return operation(part.category, part.type, inputs)
 

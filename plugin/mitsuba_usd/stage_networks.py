@@ -18,7 +18,6 @@ from .materialx_nodes import (
     CHANNELS,
     OPERATIONS,
     SAMPLED,
-    Sampling,
     affine,
     constant,
     evaluate,
@@ -309,7 +308,7 @@ _SPECIAL: dict[str, Callable[..., Input | None]] = {
 
 def _affine_map(where: Input) -> NDArray[np.float64] | None:
     """Matrix ``(3, 3)`` of an affine function of texture coordinates; None if it is no such function."""
-    points = np.broadcast_to(evaluate(where, Sampling(_TRIED)), _TRIED.shape).astype(np.float64)
+    points = np.broadcast_to(evaluate(where, _TRIED), _TRIED.shape).astype(np.float64)
     matrix = np.eye(3)
     matrix[:2, 2] = points[0]
     matrix[:2, 0], matrix[:2, 1] = points[1] - points[0], points[2] - points[0]

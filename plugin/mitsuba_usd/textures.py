@@ -14,7 +14,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .contents import NodeContents, TextureContents, leaves, parts
-from .materialx_nodes import Sampling, Values, affine, evaluate
+from .materialx_nodes import Values, affine, evaluate, fallback_of
 from .stage_warnings import StageWarnings
 from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
@@ -220,26 +220,55 @@ def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Pict
     wraps = {texture.wrap for texture in textures}
     is_direct = len(textures) == len(sources) and not samples_elsewhere(expression)
     if is_direct and maps and len(wraps) == 1 and all(np.allclose(matrix, maps[0]) for matrix in maps):
-        height, width = np.max(sizes, axis=0)
-        grid = _Grid((int(height), int(width)), maps[0], pictures, is_shared=True)
-        return _filled(expression, grid), maps[0], wraps.pop()
+        height, width = np.max(sizes, axis=0).tolist()
+        return _filled(expression, pictures, (height, width), maps[0]), maps[0], wraps.pop()
     wanted = [LEAST_PROCEDURAL] if not is_direct or not sizes else []
     for size, to_uv in zip(sizes, maps, strict=True):
         wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
     edge = min(max(wanted, default=1), MOST)
     wrap = "repeat" if textures else _procedural_wrap(expression)
-    return _filled(expression, _Grid((edge, edge), np.eye(3), pictures, is_shared=False)), np.eye(3), wrap
+    return _filled(expression, pictures, (edge, edge)), np.eye(3), wrap
 
 
-def _filled(expression: NodeContents, grid: _Grid) -> NDArray[np.float32]:
-    """Values at all pixels, some rows at a time, as an expression has many arrays at once."""
-    count = grid.height if "heighttonormal" in _categories(expression) else max(1, _PIXELS_AT_ONCE // grid.width)
-    parts = []
-    for first in range(0, grid.height, count):
-        grid.choose_rows(np.arange(first, min(first + count, grid.height)))
-        values = evaluate(expression, grid)
-        parts.append(np.broadcast_to(values, (len(grid.rows), grid.width, values.shape[-1])).astype(np.float32))
-    return np.concatenate(parts)
+def _filled(
+    expression: NodeContents,
+    pictures: Mapping[int, Picture | None],  # By the identity of the texture
+    size: tuple[int, int],
+    shared: NDArray[np.float64] | None = None,  # To the part of the plane where all pictures lie; the unit square
+) -> NDArray[np.float32]:
+    """Values at the centres of all pixels, some rows at a time, as an expression has many arrays at once."""
+    height, width = size
+    u = (np.arange(width) + 0.5) / width
+    to_uv = np.eye(2) if shared is None else shared[:2, :2]
+
+    def gradient(values: Values) -> Values:
+        if values.ndim < 3:
+            return np.zeros(2)
+        heights = values[..., 0]
+        dv, du = np.gradient(heights) if min(heights.shape) > 1 else (np.zeros_like(heights), np.zeros_like(heights))
+        return np.stack([du * width, -dv * height], axis=-1) @ to_uv
+
+    def values_of(rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        here = np.stack(np.meshgrid(u, 1 - (rows + 0.5) / height), axis=-1)
+
+        def texels(texture: TextureContents, texcoords: Values | None) -> Values:
+            picture = pictures[id(texture)]
+            if picture is None:
+                return fallback_of(texture)
+            values, of_picture = picture
+            if texcoords is None and shared is not None:
+                return values[rows] if values.shape[:2] == size else _looked_up(values, here, "clamp")
+            matrix = of_picture @ texture.to_uv
+            points = here if texcoords is None else texcoords
+            return _looked_up(values, points @ matrix[:2, :2].T + matrix[:2, 2], texture.wrap)
+
+        values = evaluate(expression, here, texels, gradient)
+        return np.broadcast_to(values, (len(rows), width, values.shape[-1])).astype(np.float32)
+
+    # Slopes need the rows beside them.
+    count = height if "heighttonormal" in _categories(expression) else max(1, _PIXELS_AT_ONCE // width)
+    starts = range(0, height, count)
+    return np.concatenate([values_of(np.arange(first, min(first + count, height))) for first in starts])
 
 
 def _categories(expression: NodeContents) -> set[str]:
@@ -256,40 +285,6 @@ def _procedural_wrap(expression: NodeContents) -> str:
     names = _categories(expression)
     is_noise = any("noise" in name or "fractal" in name for name in names)
     return "clamp" if names & {"ramplr", "ramptb", "splitlr", "splittb"} and not is_noise else "repeat"
-
-
-class _Grid(Sampling):
-    """Centres of pixels of some rows, in the part of the plane that all pictures share or over the unit square."""
-
-    def __init__(
-        self, size: tuple[int, int], to_uv: NDArray[np.float64], pictures: dict[int, Picture | None], is_shared: bool
-    ) -> None:
-        self.height, self.width = size
-        self._to_uv, self._pictures, self._is_shared = to_uv, pictures, is_shared
-
-    def choose_rows(self, rows: NDArray[np.int64]) -> None:
-        u = (np.arange(self.width) + 0.5) / self.width
-        self.rows, self.texcoords = rows, np.stack(np.meshgrid(u, 1 - (rows + 0.5) / self.height), axis=-1)
-
-    def texels(self, texture: TextureContents, texcoords: Values | None) -> Values:
-        picture = self._pictures[id(texture)]
-        if picture is None:
-            return np.asarray(texture.fallback, dtype=np.float32)[texture.channels]
-        values, to_uv = picture
-        if texcoords is None and self._is_shared:
-            if values.shape[:2] == (self.height, self.width):
-                return values[self.rows]
-            return _looked_up(values, self.texcoords, "clamp")
-        matrix = to_uv @ texture.to_uv
-        points = self.texcoords if texcoords is None else texcoords
-        return _looked_up(values, points @ matrix[:2, :2].T + matrix[:2, 2], texture.wrap)
-
-    def gradient(self, values: Values) -> Values:
-        if values.ndim < 3:
-            return np.zeros(2)
-        height = values[..., 0]
-        dv, du = np.gradient(height) if min(height.shape) > 1 else (np.zeros_like(height), np.zeros_like(height))
-        return np.stack([du * self.width, -dv * self.height], axis=-1) @ self._to_uv[:2, :2]
 
 
 def _looked_up(values: Values, uv: Values, wrap: str) -> Values:

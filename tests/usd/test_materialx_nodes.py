@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_usd import textures
 from mitsuba_usd.contents import NodeContents, TextureContents, leaves
-from mitsuba_usd.materialx_nodes import Sampling, evaluate, node, operation
+from mitsuba_usd.materialx_nodes import evaluate, node, operation
 from mitsuba_usd.textures import _procedural_wrap, baked
 
 UV = NodeContents("texcoord", "vector2", {"name": "st"})
@@ -15,11 +15,6 @@ UV = NodeContents("texcoord", "vector2", {"name": "st"})
 def picture(channel="rgb", name="a.png", to_uv=None, wrap="repeat"):
     matrix = np.eye(3) if to_uv is None else np.asarray(to_uv, dtype=float)
     return TextureContents(name, channel, "raw", wrap, [1.0] * 4, [0.0] * 4, matrix, "st", [0.0] * 4)
-
-
-def at(points):
-    """What an expression is evaluated at: texture coordinates."""
-    return Sampling(np.asarray(points, dtype=float))
 
 
 GREY = [0.2, 0.5, 0.7]
@@ -83,7 +78,7 @@ def test_operations_take_arrays_of_points():
 
 @pytest.mark.core
 def test_ramps_and_splits_lie_as_the_specification_says():
-    points = at([[0.25, 0.75], [1.5, -1]])
+    points = np.array([[0.25, 0.75], [1.5, -1]])
     for pattern, expected in (
         (node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV), [1.5, 3]),
         (node("ramptb", "float", valuet=1.0, valueb=3.0, texcoord=UV), [1.5, 3]),
@@ -120,15 +115,15 @@ def _perlin(x, y):
 
 def test_noises_are_those_of_open_shading_language():
     points = np.random.default_rng(2).uniform(-20, 20, (50, 2))
-    found = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), at(points))
+    found = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), points)
     np.testing.assert_allclose(found[..., 0], [2 * _perlin(*p) + 0.5 for p in points], atol=1e-12)
     fractal = node("fractal2d", "float", amplitude=1.0, octaves=3.0, lacunarity=2.0, diminish=0.5, texcoord=UV)
     expected = [sum(0.5**k * _perlin(*(p * 2**k)) for k in range(3)) for p in points]
-    np.testing.assert_allclose(evaluate(fractal, at(points))[..., 0], expected, atol=1e-12)
-    cells = evaluate(node("cellnoise2d", "float", texcoord=UV), at(points))[..., 0]
+    np.testing.assert_allclose(evaluate(fractal, points)[..., 0], expected, atol=1e-12)
+    cells = evaluate(node("cellnoise2d", "float", texcoord=UV), points)[..., 0]
     expected = [_hash(*(math.floor(x) & 0xFFFFFFFF for x in p)) / 0xFFFFFFFF for p in points]
     np.testing.assert_allclose(cells, expected, atol=1e-12)
-    wide = evaluate(node("noise2d", "vector3", amplitude=[1.0] * 3, pivot=0.0, texcoord=UV), at(points))
+    wide = evaluate(node("noise2d", "vector3", amplitude=[1.0] * 3, pivot=0.0, texcoord=UV), points)
     assert wide.shape == (50, 3)
     assert np.abs(np.corrcoef(wide.T) - np.eye(3)).max() < 0.5
 
@@ -137,7 +132,7 @@ def test_distances_of_worley_noise_are_to_the_nearest_of_random_points():
     """Without jitter, the points are the centres of the unit squares."""
     points = np.random.default_rng(3).uniform(-5, 5, (40, 2))
     given = {"texcoord": UV, "jitter": 0.0, "style": 0.0}
-    found = evaluate(node("worleynoise2d", "float", **given), at(points))[..., 0]
+    found = evaluate(node("worleynoise2d", "float", **given), points)[..., 0]
     np.testing.assert_allclose(found, np.linalg.norm(points - np.floor(points) - 0.5, axis=1), atol=1e-12)
 
 
