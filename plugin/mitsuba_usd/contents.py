@@ -188,16 +188,16 @@ class CameraContents:
 
 @dataclass(frozen=True, eq=False)
 class SceneContents:
-    """Contents of a stage."""
+    """Contents of a stage, or of a part of it; a part has names relative to it, and groups of the whole stage."""
 
-    up: str
-    shapes: list[ShapeContents]
-    groups: list[list[ShapeContents]]
-    instances: list[InstanceContents]
-    materials: list[MaterialContents]
-    lights: list[LightContents]
-    camera: CameraContents | None
-    resolution: list[int] | None
+    up: str = "y"
+    shapes: list[ShapeContents] = field(default_factory=list)
+    groups: list[list[ShapeContents]] = field(default_factory=list)
+    instances: list[InstanceContents] = field(default_factory=list)
+    materials: list[MaterialContents] = field(default_factory=list)
+    lights: list[LightContents] = field(default_factory=list)
+    camera: CameraContents | None = None
+    resolution: list[int] | None = None
 
     @property
     def all_shapes(self) -> list[ShapeContents]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.files import value_at
@@ -135,25 +135,17 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
     return str(asset.resolvedPath or asset.path)
 
 
-class FrameSettings(NamedTuple):
-    """What the render settings of a stage say about the picture's frame."""
-
-    resolution: list[int] | None = None
-    camera: str | None = None  # Its path
-    conform_policy: str = _CONFORM_POLICIES[0]
-    has_motion_blur: bool = True
-    has_depth_of_field: bool = True
-
-
-def read_settings(stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings) -> FrameSettings:
-    """Read the render settings that a stage names."""
+def read_settings(
+    stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings
+) -> tuple[list[int] | None, str | None, dict[str, Any]]:
+    """Resolution and path of the camera that the render settings of a stage name, and what they change of a camera."""
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
     if not settings:
         others = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
         if others or stage.HasAuthoredMetadata("renderSettingsPrimPath"):
             what = "render settings are those that renderSettingsPrimPath of the stage names; all others are ignored"
             notes.add(what, ", ".join(others) or str(stage.GetMetadata("renderSettingsPrimPath")))
-        return FrameSettings()
+        return None, None, {}
     prim = settings.GetPrim()
     path = prim.GetPath()
 
@@ -175,13 +167,12 @@ def read_settings(stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings) ->
         notes.add(f'aspectRatioConformPolicy "{policy}" is ignored; {_CONFORM_POLICIES[0]} is used', path)
         policy = _CONFORM_POLICIES[0]
     targets = settings.GetCameraRel().GetForwardedTargets()
-    return FrameSettings(
-        size.tolist() if is_size else None,
-        str(targets[0]) if targets else None,
-        policy,
-        not (value("disableMotionBlur") or value("instantaneousShutter")),
-        not value("disableDepthOfField"),
-    )
+    changes: dict[str, Any] = {"conform_policy": policy}
+    if value("disableMotionBlur") or value("instantaneousShutter"):
+        changes["shutter"] = [0.0, 0.0]
+    if value("disableDepthOfField"):
+        changes |= {"lens_radius": 0.0, "focus_distance": 0.0}
+    return size.tolist() if is_size else None, str(targets[0]) if targets else None, changes
 
 
 def read_camera(
@@ -189,7 +180,6 @@ def read_camera(
     # (4, 4) float64: for column vectors. Scales are left out, as USD's own frustum of a camera has none.
     to_world: NDArray[np.float64],
     time: Usd.TimeCode,
-    settings: FrameSettings,
     notes: StageWarnings,
 ) -> CameraContents:
     """Read a camera."""
@@ -219,7 +209,7 @@ def read_camera(
         near, far = _CLIPPING_RANGE
     focal_length, f_stop = number(camera.GetFocalLengthAttr()), number(camera.GetFStopAttr())
     focus = number(camera.GetFocusDistanceAttr())
-    has_lens = is_perspective and f_stop > 0 and focus > 0 and settings.has_depth_of_field
+    has_lens = is_perspective and f_stop > 0 and focus > 0
     if is_perspective and f_stop > 0 >= focus:
         notes.add("fStop of cameras without a focusDistance above 0 is ignored", camera.GetPath())
     for name, neutral in _NEUTRAL_EXPOSURE.items():
@@ -228,7 +218,6 @@ def read_camera(
             notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", camera.GetPath())
     if value_at(camera.GetClippingPlanesAttr(), time):
         notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
-    shutter = (camera.GetShutterOpenAttr(), camera.GetShutterCloseAttr())
     return CameraContents(
         str(camera.GetPath()),
         rigid,
@@ -240,6 +229,5 @@ def read_camera(
         float(far),
         _TENTHS * focal_length / (2 * f_stop) if has_lens else 0.0,
         focus if has_lens else 0.0,
-        [number(attribute) for attribute in shutter] if settings.has_motion_blur else [0.0, 0.0],
-        settings.conform_policy,
+        [number(camera.GetShutterOpenAttr()), number(camera.GetShutterCloseAttr())],
     )

@@ -11,9 +11,9 @@ import warnings
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from mitsuba_subdivision.cage import CageError, CageWarning, shortened, warn
@@ -39,6 +39,7 @@ from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
 from .stage_warnings import StageWarnings
 
+Part = TypeVar("Part", ShapeContents, LightContents)
 # Draw modes by which a viewer shows a model as it is.
 _FULL_MODES = (None, "default", "inherited")
 # Prims that hold others, or that are read with others.
@@ -145,33 +146,6 @@ def is_still(stage: Usd.Stage) -> bool:
     return not any(may_move(prim) for root in roots for prim in Usd.PrimRange.AllPrims(root))
 
 
-@dataclass
-class _Subtree:
-    """Shapes, lights and instances of prototypes below a prim, in its space, with names relative to it."""
-
-    shapes: list[ShapeContents] = field(default_factory=list)
-    lights: list[LightContents] = field(default_factory=list)
-    instances: list[InstanceContents] = field(default_factory=list)
-
-    def add_copy(self, other: _Subtree, matrix: NDArray[np.float64], name: str) -> None:
-        """Add the shapes and lights of another, with another transform."""
-        self.shapes += [replace(s, name=f"{name}{s.name}", to_world=matrix @ s.to_world) for s in other.shapes]
-        self.lights += [replace(x, name=f"{name}{x.name}", to_world=matrix @ x.to_world) for x in other.lights]
-
-    def can_be_instanced(self, materials: list[MaterialContents]) -> bool:
-        """Whether Mitsuba has instances of it.
-
-        Instances cannot be emitters, and where they are hit, attributes of meshes are looked up in the wrong place.
-        """
-        is_hindered = (
-            shape.radiance is not None
-            or bool(shape.cage.attributes)
-            or (shape.material is not None and materials[shape.material].is_emissive)
-            for shape in self.shapes
-        )
-        return bool(self.shapes) and not self.lights and not any(is_hindered)
-
-
 class _StageWalk:
     def __init__(
         self, stage: Usd.Stage, name: str, time: float | None, notes: StageWarnings, at: Callable[[str], None]
@@ -184,7 +158,7 @@ class _StageWalk:
         self._shapes = ShapeReader(name, self._code, self._materials, notes)
         # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
         self._numbers: dict[object, int] = {}
-        self._prototypes: list[_Subtree] = []
+        self._prototypes: list[SceneContents] = []
         # Names of primvars that the shapes of instances read, and whether some of these have places of their own, by
         # prototype and bindings.
         self._inherited: dict[tuple[object, ...], tuple[list[str], bool]] = {}
@@ -203,22 +177,22 @@ class _StageWalk:
         instances: list[InstanceContents] = []
         for instance in whole.instances:
             prototype = self._prototypes[instance.group]
-            if counts[instance.group] < 2 or not prototype.can_be_instanced(materials):
-                whole.add_copy(prototype, instance.to_world, instance.name)
-            else:
+            if counts[instance.group] > 1 and _can_be_instanced(prototype, materials):
                 instances.append(replace(instance, group=numbers.setdefault(instance.group, len(numbers))))
+            else:
+                _add_copy(whole, prototype, instance)
         groups = [self._prototypes[number].shapes for number in numbers]
         chosen, resolution = self.camera(camera)
         return SceneContents(up, whole.shapes, groups, instances, materials, whole.lights, chosen, resolution)
 
     def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:
         """The camera, and the resolution of the stage's render settings; each None if there is none."""
-        settings = read_settings(self._stage, self._code, self._notes)
-        path = path or settings.camera
+        resolution, named, changes = read_settings(self._stage, self._code, self._notes)
+        path = path or named
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
         cameras = {str(prim.GetPath()): UsdGeom.Camera(prim) for prim in prims if prim.IsA(UsdGeom.Camera)}
         if path is None and not cameras:
-            return None, settings.resolution
+            return None, resolution
         if path is None:
             if len(cameras) > 1:
                 self._notes.add("there are several cameras, and the first is used", ", ".join(cameras))
@@ -228,7 +202,7 @@ class _StageWalk:
             raise CageError(f'{self._name}: there is no camera "{path}"; expected one of those there are: {there}')
         to_world = self._to_world(cameras[path].GetPrim())
         try:
-            contents = read_camera(cameras[path], to_world, self._code, settings, self._notes)
+            contents = replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes)
         except (TypeError, ValueError):
             contents = None
         if contents is None or not contents.is_usable:
@@ -236,23 +210,27 @@ class _StageWalk:
                 f"{self._location(cameras[path])}: the camera is not usable; expected finite numbers, and apertures "
                 "and a focal length above 0"
             )
-        return contents, settings.resolution
+        return contents, resolution
 
     def _location(self, prim: Usd.Prim | UsdGeom.Camera) -> str:
         return f"{self._name}, prim {shortened(str(prim.GetPath()))}"
 
-    def _below(self, root: Usd.Prim) -> _Subtree:
-        """Visible contents of a prim and its descendants."""
-        below, to_world = _Subtree(), self._to_world(root)
+    def _below(self, root: Usd.Prim) -> SceneContents:
+        """Visible contents of a prim and its descendants, in its space, without the prims that cannot be used."""
+        below, to_world = SceneContents(), self._to_world(root)
         # Of a singular transform, none of it is visible.
         to_root = np.asarray(np.linalg.inv(to_world) if are_invertible(to_world) else np.eye(4))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
-            name = str(prim.GetPath()).removeprefix(above)
+            location = self._location(prim)
             self._count += 1
             self._at(f"prim {self._count}")
-            with self._left_out_if_unusable(prim):
-                self._add(prim, name, root, to_root, below)
+            try:
+                with usd_errors_at(location):
+                    self._add(prim, str(prim.GetPath()).removeprefix(above), root, to_root, below)
+            except (CageError, AttributeError, TypeError, ValueError) as error:
+                message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
+                self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
         return below
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
@@ -271,7 +249,9 @@ class _StageWalk:
                 prims.PruneChildren()
             yield prim
 
-    def _add(self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], below: _Subtree) -> None:
+    def _add(
+        self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], below: SceneContents
+    ) -> None:
         """Add what a prim shows."""
         if value_at(prim.GetAttribute("model:drawMode"), self._code) not in _FULL_MODES:
             self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
@@ -282,31 +262,21 @@ class _StageWalk:
         if prim != root and prim.IsInstance():
             # Instances that differ in appearance belong to different prototypes.
             if are_invertible(placed := matrix()):
-                below.instances.append(InstanceContents(name, self._prototype(self._appearance(prim), prim), placed))
+                group = self._prototype(self._appearance(prim), prim)
+                below.instances.append(InstanceContents(name, group, placed))
             else:
                 self._notes.add(_SINGULAR, prim.GetPath())
         elif not prim.IsA(UsdGeom.Imageable) or UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES:
             return
         elif prim.IsA(UsdGeom.PointInstancer):
-            below.instances += self._point_instances(UsdGeom.PointInstancer(prim), name, matrix())
+            below.instances.extend(self._point_instances(UsdGeom.PointInstancer(prim), name, matrix()))
         elif prim.IsA(UsdGeom.Mesh) or str(prim.GetTypeName()) in GPRIMS:
-            below.shapes += [replace(shape, name=name) for shape in self._shapes.read(prim, matrix())]
+            below.shapes.extend(replace(shape, name=name) for shape in self._shapes.read(prim, matrix()))
         elif prim.HasAPI(UsdLux.LightAPI):
             light = self._light(prim, matrix())
-            below.lights += [] if light is None else [replace(light, name=name)]
+            below.lights.extend([] if light is None else [replace(light, name=name)])
         elif str(prim.GetTypeName()) not in _SILENT:
             self._notes.add(f"prims of type {prim.GetTypeName()} are ignored", prim.GetPath())
-
-    @contextmanager
-    def _left_out_if_unusable(self, prim: Usd.Prim) -> Iterator[None]:
-        """Leave out a prim that raises an error in a ``with`` block, with a note, in place of the whole stage."""
-        location = self._location(prim)
-        try:
-            with usd_errors_at(location):
-                yield
-        except (CageError, AttributeError, TypeError, ValueError) as error:
-            message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
-            self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
 
     def _light(self, prim: Usd.Prim, matrix: NDArray[np.float64]) -> LightContents | None:
         """A light; None, with a note, if it cannot be used."""
@@ -420,15 +390,39 @@ class _StageWalk:
         if key not in self._numbers:
             below = self._below(root)
             # Copies, as Mitsuba has no instances within instances.
-            flat = _Subtree(list(below.shapes), list(below.lights))
+            flat = SceneContents(shapes=[*below.shapes], lights=[*below.lights])
             for instance in below.instances:
-                flat.add_copy(self._prototypes[instance.group], instance.to_world, instance.name)
+                _add_copy(flat, self._prototypes[instance.group], instance)
             self._numbers[key] = len(self._prototypes)
             self._prototypes.append(flat)
         return self._numbers[key]
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
         return np.array(local_to_world(prim, lambda attribute: time_of(attribute, self._code), self._transforms)).T
+
+
+def _add_copy(contents: SceneContents, prototype: SceneContents, instance: InstanceContents) -> None:
+    """Add the shapes and lights of a prototype where an instance is."""
+
+    def placed(part: Part) -> Part:
+        return replace(part, name=f"{instance.name}{part.name}", to_world=instance.to_world @ part.to_world)
+
+    contents.shapes.extend(map(placed, prototype.shapes))
+    contents.lights.extend(map(placed, prototype.lights))
+
+
+def _can_be_instanced(prototype: SceneContents, materials: list[MaterialContents]) -> bool:
+    """Whether Mitsuba has instances of a prototype.
+
+    Instances cannot be emitters, and where they are hit, attributes of meshes are looked up in the wrong place.
+    """
+    is_hindered = (
+        shape.radiance is not None
+        or bool(shape.cage.attributes)
+        or (shape.material is not None and materials[shape.material].is_emissive)
+        for shape in prototype.shapes
+    )
+    return bool(prototype.shapes) and not prototype.lights and not any(is_hindered)
 
 
 def _parts(root: Usd.Prim) -> Usd.PrimRange:
