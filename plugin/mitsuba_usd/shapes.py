@@ -33,7 +33,6 @@ from mitsuba_subdivision.tessellation import VertexTable
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from .bsdfs import interior
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 
@@ -143,8 +142,8 @@ class Surfaces:
 def subdivision(
     shape: ShapeContents,
     surfaces: Surfaces,
-    bsdf: SceneNode | None,
-    emitter: SceneNode | mi.Object | None,
+    bsdf: SceneNode,
+    emitter: SceneNode | None,
     parameters: dict[str, Any],  # Of the shape `subdivision`
     notes: StageWarnings,
 ) -> SceneNode:
@@ -213,23 +212,21 @@ def _triangles(cage: CageContents) -> IntArray:
 
 
 class LoadedShapes:
-    """Builds Mitsuba shapes for successive frames.
+    """Objects of shapes in successive frames.
 
     A limit surface that only moves reuses the object of the frame before, with new control points: its patches and
     weights stay. A polygon mesh that moves is rebuilt.
     """
 
-    def __init__(self, parameters: dict[str, Any]) -> None:
-        self._parameters = parameters  # Of every shape `subdivision`
+    def __init__(self) -> None:
         self._before: dict[tuple[str, int], Loaded] = {}
         self._now: dict[tuple[str, int], Loaded] = {}
         self._counts: Counter[str] = Counter()
         self._bsdfs: list[tuple[MaterialContents, mi.BSDF]] = []
-        self.surfaces = Surfaces()
 
     def begin_frame(self) -> None:
         """Begin the next frame, and free objects that the last one did not use."""
-        self._before, self._now, self._counts, self.surfaces = self._now, {}, Counter(), Surfaces()
+        self._before, self._now, self._counts = self._now, {}, Counter()
         materials = [material for _, material, _ in self._before.values()]
         self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is material for material in materials)]
 
@@ -237,9 +234,8 @@ class LoadedShapes:
         self,
         shape: ShapeContents,
         material: MaterialContents | None,
+        entry: Callable[[SceneNode], SceneNode],  # Makes the entry of the shape with a BSDF
         bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
-        area: SceneNode | None,  # Entry of its emitter
-        notes: StageWarnings,
     ) -> mi.Object:
         """The object of a shape.
 
@@ -249,16 +245,20 @@ class LoadedShapes:
         # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
-        known, is_alike, has_moved = self._before.get(key), False, False
-        if known is not None:
-            before = known[0]
-            is_alike = same(before, shape, _MOVABLE) and same(known[1], material)
-            is_alike &= same_topology(before.cage, shape.cage)
-            is_there = np.array_equal(before.to_world, shape.to_world)
-            has_moved = not (is_there and np.array_equal(before.cage.positions, shape.cage.positions))
-        if known is None or not is_alike or (shape.cage.scheme is None and has_moved):
-            known = shape, material, self._loaded(shape, material, bsdf, area, notes)
-        elif has_moved:
+        known = self._before.get(key)
+        is_there = (
+            known is not None
+            and np.array_equal(known[0].to_world, shape.to_world)
+            and np.array_equal(known[0].cage.positions, shape.cage.positions)
+        )
+        if (
+            known is None
+            or not (same(known[0], shape, _MOVABLE) and same(known[1], material))
+            or not same_topology(known[0].cage, shape.cage)
+            or (shape.cage.scheme is None and not is_there)
+        ):
+            known = shape, material, self._loaded(material, entry, bsdf)
+        elif not is_there:
             positions = np.asarray(shape.cage.positions, dtype=np.float64)
             if not np.isfinite(positions).all():
                 raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
@@ -270,29 +270,21 @@ class LoadedShapes:
 
     def _loaded(
         self,
-        shape: ShapeContents,
         material: MaterialContents | None,
+        entry: Callable[[SceneNode], SceneNode],
         bsdf: Callable[[], SceneNode],
-        area: SceneNode | None,
-        notes: StageWarnings,
     ) -> mi.Object:
-        emitter = None if area is None else mi.load_dict(area)
-        if shape.cage.scheme is None:
-            media = [mi.load_dict(medium) for medium in interior(material).values()]
-            return polygon_mesh(shape).loaded(self._bsdf(material, bsdf), emitter, *media)
-        # Validated before its BSDF is made, so that warnings about the cage name the prim.
-        parameters = {**self._parameters, **interior(material)}
-        entry = subdivision(shape, self.surfaces, None, emitter, parameters, notes)
+        # The cage is validated before the BSDF is made, so that warnings name the prim.
+        made = entry({})
+        # Shared by all shapes of a material, unless it reads their attributes.
+        alike = (loaded for known, loaded in self._bsdfs if same(known, material))
+        loaded = None if material is None or material.primvars() else next(alike, None)
+        if loaded is None:
+            loaded = mi.load_dict(bsdf())
+            self._bsdfs += [] if material is None or material.primvars() else [(material, loaded)]
+        if "mesh" in made:
+            parts = (mi.load_dict(made[name]) if name in made else None for name in ("emitter", "interior"))
+            return made["mesh"].loaded(loaded, *parts)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
-            return mi.load_dict({**entry, "bsdf": self._bsdf(material, bsdf)})
-
-    def _bsdf(self, material: MaterialContents | None, entry: Callable[[], SceneNode]) -> mi.BSDF:
-        """The BSDF of a material, shared by all its shapes unless it reads their attributes."""
-        if material is None or material.primvars():
-            return mi.load_dict(entry())
-        for known, loaded in self._bsdfs:
-            if same(known, material):
-                return loaded
-        self._bsdfs.append((material, mi.load_dict(entry())))
-        return self._bsdfs[-1][1]
+            return mi.load_dict({**made, "bsdf": loaded})

@@ -37,10 +37,11 @@ from numpy.typing import NDArray
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
-from .scene_entries import SceneEntries
+from .scene_entries import scene_entries
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
 from .shapes import LoadedShapes, Surfaces
 from .stage_warnings import StageWarnings
+from .textures import Textures
 
 if TYPE_CHECKING:
     from .stage_walk import StageReader
@@ -156,45 +157,51 @@ class StageScenes:
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError if no mesh can be used."""
-        notes, rest, parameters = StageWarnings(), None, self._parameters
-        triangles: dict[ShapeContents, dict[str, Any]] = {}
+        notes, parameters = StageWarnings(), self._parameters
+        rest: SceneNode = {}
+        chosen: dict[ShapeContents, dict[str, Any]] = {}
         needed: dict[str, float] = {}
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes, self.name)
-        if rest is not None and (turns or follows_sensor):
+        if rest and (turns or follows_sensor):
             sensors = [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
             needed = texels_for_pictures(contents, sensors)
-        if rest is None or not is_one_picture:
-            contents, parameters = self._with_copies(contents, notes)
+        if rest and is_one_picture:
+            contents, chosen = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
         else:
-            contents, triangles = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
-        size = self._look.texture_size
-        is_clear = rest is not None and _has_clear_lamps(contents, rest)
-        made = SceneEntries(
-            contents, notes, parameters, self._surfaces, triangles, needed, size, has_clear_lamps=is_clear
+            contents, parameters = self._with_copies(contents, notes)
+        made = scene_entries(
+            contents,
+            notes,
+            parameters,
+            self._surfaces,
+            Textures(notes, needed, self._look.texture_size),
+            chosen,
+            has_clear_lamps=bool(rest) and _has_clear_lamps(contents, rest),
         )
         notes.warn(self.name, self._warned)
-        if rest is None:
+        if not rest:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
-        return {**made.scene, **rest}
+        return {**made, **rest}
 
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, notes: StageWarnings, follows_sensor: bool
     ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]]]:
-        """Contents with copies, and the triangles that a picture needs."""
+        """Contents with copies, and parameters of limit surfaces with the triangles that a picture needs."""
         if not self._has_free_rates or not contents.has_surfaces:
             return self._with_copies(contents, notes)[0], {}
-        seen = outline_for(sensor), sensor["near_clip"]
-        shading = self._parameters["shading"]
-        segments = segments_of(contents, self._surfaces, *seen, shading)
+        outline, shading = outline_for(sensor), self._parameters["shading"]
+        segments = segments_of(contents, self._surfaces, outline, sensor["near_clip"], shading)
         rates: dict[ShapeContents, int] = {}
         if mi.Float is not float:
             most = {shape: np.minimum(needed, MOST_SEGMENTS) for shape, needed in segments.items()}
             contents, rates = with_copies(contents, most, shading, notes)
-        triangles = triangles_for_picture(contents, segments, seen[0], self._parameters, follows_sensor=follows_sensor)
-        return contents, triangles | {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}
+        triangles = triangles_for_picture(contents, segments, outline, self._parameters, follows_sensor=follows_sensor)
+        triangles |= {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}
+        others = {name: value for name, value in self._parameters.items() if name != "tessellation_rate"}
+        return contents, {shape: {**others, **more} for shape, more in triangles.items()}
 
     def _with_copies(self, contents: SceneContents, notes: StageWarnings) -> tuple[SceneContents, dict[str, Any]]:
         """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
@@ -218,7 +225,7 @@ class StageScenes:
         """
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
-        shapes = LoadedShapes(self._with_copies(first, StageWarnings())[1])
+        shapes, parameters = LoadedShapes(), self._with_copies(first, StageWarnings())[1]
         # Its camera has notes in `_sensor`.
         rest = with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings(), self.name)
         if self._needed is None:
@@ -235,18 +242,13 @@ class StageScenes:
                 continue
             contents, _ = self._with_copies(given, notes)
             shapes.begin_frame()
-            made = SceneEntries(
-                contents,
-                notes,
-                self._parameters,
-                shapes.surfaces,
-                needed=self._needed,
-                texture_size=self._look.texture_size,
-                loaded=shapes,
-                has_clear_lamps=_has_clear_lamps(contents, rest),
+            textures = Textures(notes, self._needed, self._look.texture_size)
+            is_clear = _has_clear_lamps(contents, rest)
+            made = scene_entries(
+                contents, notes, parameters, Surfaces(), textures, loaded=shapes, has_clear_lamps=is_clear
             )
             notes.warn(self.name, self._warned)
-            before = given, seen, load_quietly({**made.scene, **rest, "sensor": seen}, filter_name)
+            before = given, seen, load_quietly({**made, **rest, "sensor": seen}, filter_name)
             yield before[2]
 
     def _sensor(

@@ -157,7 +157,7 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
     for cage in (one, other, moved):
         notes = StageWarnings()
         shape = ShapeContents(cage.source.name, cage, np.eye(4))
-        entries.append(subdivision(shape, surfaces, None, None, {}, notes))
+        entries.append(subdivision(shape, surfaces, {}, None, {}, notes))
         with pytest.warns(CageWarning, match=f"^{cage.source.name}: 1 of 9 vertices"):
             notes.warn("stage")
     first, second, third = entries

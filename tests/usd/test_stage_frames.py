@@ -14,8 +14,7 @@ from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import Look
-from mitsuba_usd import shapes, stage_scenes
-from mitsuba_usd.scene_entries import SceneEntries
+from mitsuba_usd import scene_entries, stage_scenes
 from mitsuba_usd.shapes import Surfaces
 from mitsuba_usd.stage_scenes import StageScenes
 from mitsuba_usd.stage_walk import StageReader, _StageWalk, is_still, open_checked
@@ -109,7 +108,7 @@ def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
 def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, variant):
     """Points, transforms, instances, lights and camera move; weights are made once for each cage."""
     request.getfixturevalue(f"variant_{variant}")
-    made = recorded(monkeypatch, shapes, "subdivision")
+    made = recorded(monkeypatch, scene_entries, "subdivision")
     path, times = write(tmp_path, WHOLE), (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
     found = frames(path, times)
     assert sorted(shape.name for (shape, *_), _ in made) == ["/ball", "/moving", "/still", "/tinted"]
@@ -119,7 +118,7 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
 @scalar
 def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, monkeypatch):
     """On a rig, with its focal length and its focus."""
-    made = [recorded(monkeypatch, stage_scenes, "SceneEntries"), recorded(monkeypatch, _StageWalk, "contents")]
+    made = [recorded(monkeypatch, stage_scenes, "scene_entries"), recorded(monkeypatch, _StageWalk, "contents")]
     focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
     lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"
     rig = prim("Xform", "rig", RIG, CAMERA.replace("float focalLength = 35", lens))
@@ -220,14 +219,14 @@ def sides_of_stills(path, times, asked):
 def texture_side(entries):
     """Of the floor's texture, by entries that are made again of what the scene is made of."""
     given, more = entries
-    paint = SceneEntries(*given, **{**more, "loaded": None}).scene["paint"]
+    paint = scene_entries.scene_entries(*given, **{**more, "loaded": None})["paint"]
     return paint.get("bsdf", paint)["base_color"]["bitmap"].size()[0]
 
 
 @pytest.fixture
 def asked(monkeypatch):
     """What entries of scenes are made of."""
-    return recorded(monkeypatch, stage_scenes, "SceneEntries")
+    return recorded(monkeypatch, stage_scenes, "scene_entries")
 
 
 @scalar
