@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageSource
@@ -31,15 +31,6 @@ FACE_BYTES, TRIANGLE_BYTES = {"exact": 600, "vertex": 300}, 170
 MOST_PART, MOST_BYTES = 0.75, 6e9
 # Of a picture of so many instances, whose time grows with the square of their number.
 MEASURED_INSTANCES, MEASURED_SECONDS = 2_000, 65
-
-
-class _Copies(NamedTuple):
-    """Copies of a shape, with the transforms ``(n, 4, 4)`` and the rates ``(n,)`` that they need."""
-
-    name: str
-    shape: ShapeContents
-    to_world: NDArray[np.float64]
-    rates: IntArray
 
 
 def with_large_copies(contents: SceneContents) -> SceneContents:
@@ -81,14 +72,16 @@ def with_copies(
     gives way, down to the lowest; if that is not enough, instances stay.
     """
     are_many = len(contents.instances) >= LEAST_INSTANCES
-    of_group: dict[int, list[NDArray]] = {}
+    of_group: dict[int, list[NDArray[np.float64]]] = {}
     for instance in contents.instances if are_many else []:
         of_group.setdefault(instance.group, []).append(instance.to_world)
-    placed: list[_Copies] = []
+    # Name of all copies of a shape, their transforms (n, 4, 4) to the world, and the rates (n,) that they need.
+    placed: dict[ShapeContents, tuple[str, NDArray[np.float64]]] = {}
+    needed: dict[ShapeContents, IntArray] = {}
     for number, matrices in sorted(of_group.items()):
         for shape in contents.groups[number]:
-            needed = rates.get(shape, np.ones(len(matrices), np.int64))
-            placed.append(_Copies(f"/copies_{number}{shape.name}", shape, np.stack(matrices) @ shape.to_world, needed))
+            placed[shape] = f"/copies_{number}{shape.name}", np.stack(matrices) @ shape.to_world
+            needed[shape] = rates.get(shape, np.ones(len(matrices), np.int64))
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
         if len(shape.cage.face_sizes) < LARGE:
@@ -97,30 +90,29 @@ def with_copies(
     for alike in of_cage.values():
         if len(alike) >= LEAST_INSTANCES:
             together.update(alike)
-            needed = np.concatenate([rates.get(shape, np.ones(1, np.int64)) for shape in alike])
-            to_world = np.stack([shape.to_world for shape in alike])
-            placed.append(_Copies(f"/copies{alike[0].name}", alike[0], to_world, needed))
+            placed[alike[0]] = f"/copies{alike[0].name}", np.stack([shape.to_world for shape in alike])
+            needed[alike[0]] = np.concatenate([rates.get(shape, np.ones(1, np.int64)) for shape in alike])
     if not placed:
         return contents, {}
-    highest, allowed = max(int(copies.rates.max()) for copies in placed), _allowed_bytes()
+    highest, allowed = max(int(of_copies.max()) for of_copies in needed.values()), _allowed_bytes()
     limits = range(highest, min(lowest, highest) - 1, -1)
-    most = next((most for most in limits if _bytes(placed, most, shading) <= allowed), None)
+    most = next((most for most in limits if _bytes(needed, most, shading) <= allowed), None)
     if most is None:
         count = len(contents.instances)
-        faces = sum(len(copies.rates) * len(copies.shape.cage.face_sizes) for copies in placed)
+        faces = sum(len(of_copies) * len(shape.cage.face_sizes) for shape, of_copies in needed.items())
         seconds = MEASURED_SECONDS * (count / MEASURED_INSTANCES) ** 2
         notes.add(
-            f"copies with {faces:,} faces would take about {_bytes(placed, limits[-1], shading) / 1e9:.0f} GB as one "
+            f"copies with {faces:,} faces would take about {_bytes(needed, limits[-1], shading) / 1e9:.0f} GB as one "
             f"mesh, more than {allowed / 1e9:.1f} GB, and stay {count:,} instances: a picture may take {seconds:,.0f} "
             'seconds; expected fewer copies, smaller cages or shading="vertex"',
-            placed[0].shape.name,
+            next(iter(placed)).name,
         )
         return contents, {}
     joined: dict[ShapeContents, int] = {}
-    for copies in placed:
-        of_copies = np.minimum(copies.rates, most)
+    for shape, (name, to_world) in placed.items():
+        of_copies = np.minimum(needed[shape], most)
         for rate in np.unique(of_copies).tolist():
-            joined[_copied(copies.shape, copies.to_world[of_copies == rate], copies.name)] = rate
+            joined[_copied(shape, to_world[of_copies == rate], name)] = rate
     kept: dict[str, Any] = {"groups": [], "instances": []} if are_many else {}
     alone = [shape for shape in contents.shapes if shape not in together]
     return replace(contents, shapes=[*alone, *joined], **kept), joined
@@ -130,13 +122,13 @@ def _allowed_bytes() -> float:
     return min(MOST_BYTES, MOST_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
 
 
-def _bytes(placed: list[_Copies], most: int, shading: str) -> float:
+def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> float:
     """Memory of copies as one mesh, with rates up to the given one."""
     total = 0.0
-    for copies in placed:
-        cage, is_smooth, count = copies.shape.cage, copies.shape.cage.scheme is not None, len(copies.rates)
+    for shape, of_copies in rates.items():
+        cage, is_smooth, count = shape.cage, shape.cage.scheme is not None, len(of_copies)
         corners, faces = int(cage.face_sizes.sum()), len(cage.face_sizes)
-        squares = float(np.square(np.minimum(copies.rates, most)).sum())
+        squares = float(np.square(np.minimum(of_copies, most)).sum())
         triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * count
         total += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * count if is_smooth else 0)
     return total
