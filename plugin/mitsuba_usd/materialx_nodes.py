@@ -104,14 +104,11 @@ def _stacked(values: tuple[Values, ...]) -> Values:
 def _converted(n: SimpleNamespace) -> Values:
     """Of another width: repeated, cut off, or with an alpha of 1, or with zeros."""
     values, width = n.in_, n.width
-    there = values.shape[-1]
-    if there == 1 and n.kind == "color4":
-        return _stacked((values, values, values, np.ones_like(values)))
-    if there == 1:
-        return np.broadcast_to(values, (*values.shape[:-1], width))
-    if there >= width:
+    if values.shape[-1] == 1:
+        values = np.broadcast_to(values, (*values.shape[:-1], 3 if n.kind == "color4" else width))
+    if values.shape[-1] >= width:
         return values[..., :width]
-    rest = np.zeros((*values.shape[:-1], width - there), dtype=values.dtype)
+    rest = np.zeros((*values.shape[:-1], width - values.shape[-1]), dtype=values.dtype)
     if width == 4:
         rest[..., -1] = 1
     return _stacked((values, rest))

@@ -262,30 +262,22 @@ def _plane(number: Number) -> Polygons:
     return points, None, np.array([4]), np.arange(4)
 
 
-def _cylinder(radius: float, half: float) -> list[Line]:
-    return [
-        _line((0, -half), (radius, -half)),
-        _line((radius, -half), (radius, half)),
-        _line((radius, half), (0, half)),
-    ]
-
-
-def _capsule(radius: float, half: float) -> list[Line]:
-    side = _line((radius, -half), (radius, half))
-    return [_arc(radius, -90, 0, -half), side, _arc(radius, 0, 90, half)]
-
-
-def _cone(radius: float, half: float) -> list[Line]:
-    return [_line((0, -half), (radius, -half)), _line((radius, -half), (0, half))]
+def _round(
+    outline: Callable[[float, float], list[Line]], number: Number, radius: float = 1.0, height: float = 2.0
+) -> Polygons:
+    """A surface of revolution, by its outline for a radius and half a height."""
+    return _revolved(outline(number("radius", radius), number("height", height) / 2))
 
 
 GPRIMS: dict[str, Callable[[Number], Polygons]] = {
     "Cube": _cube,
     "Plane": _plane,
     "Sphere": lambda number: _revolved([_arc(number("radius", 1.0), -90, 90, 0.0)]),
-    "Cylinder": lambda number: _revolved(_cylinder(number("radius", 1.0), number("height", 2.0) / 2)),
-    "Cone": lambda number: _revolved(_cone(number("radius", 1.0), number("height", 2.0) / 2)),
-    "Capsule": lambda number: _revolved(_capsule(number("radius", 0.5), number("height", 1.0) / 2)),
+    "Cylinder": partial(_round, lambda r, h: _lines((0, -h), (r, -h), (r, h), (0, h))),
+    "Cone": partial(_round, lambda r, h: _lines((0, -h), (r, -h), (0, h))),
+    "Capsule": partial(
+        _round, lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)], radius=0.5, height=1.0
+    ),
 }
 
 
@@ -298,11 +290,13 @@ def _arc(radius: float, start: float, end: float, height: float) -> Line:
     return points, normals
 
 
-def _line(start: tuple[float, float], end: tuple[float, float]) -> Line:
-    points = np.array([start, end], dtype=np.float64)
-    along = points[1] - points[0]
-    normal = np.array([along[1], -along[0]]) / (np.linalg.norm(along) or 1)
-    return points, np.array([normal, normal])
+def _lines(*corners: tuple[float, float]) -> list[Line]:
+    lines = []
+    for ends in pairwise(np.array(corners, dtype=np.float64)):
+        along = ends[1] - ends[0]
+        normal = np.array([along[1], -along[0]]) / (np.linalg.norm(along) or 1)
+        lines.append((np.stack(ends), np.stack([normal, normal])))
+    return lines
 
 
 def _revolved(parts: list[Line]) -> Polygons:

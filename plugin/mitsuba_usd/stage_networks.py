@@ -18,7 +18,6 @@ from .materialx_nodes import (
     CHANNELS,
     OPERATIONS,
     SAMPLED,
-    affine,
     constant,
     evaluate,
     is_constant,
@@ -283,18 +282,11 @@ class NetworkReader:
         picture, scale = given["in"], given["scale"]
         if picture is None or scale is None or is_constant(picture):
             return None
-        if is_constant(scale):
-            x, y = constant(scale, 2).tolist()
-            factor, offset = [2 * x, 2 * y, 2.0], [-x, -y, -1.0]
-            turned = affine(picture, factor, offset)
-            if turned is not None:
-                return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0])
-            scaled = node("multiply", "vector3", in1=picture, in2=factor)
-            return node("add", "vector3", in1=scaled, in2=offset)
-        centred = node("add", "vector3", in1=node("multiply", "vector3", in1=picture, in2=2.0), in2=-1.0)
-        parts = [node("extract", "float", in_=scale, index=float(k)) for k in (0, 1)]
-        factors = node("combine3", "vector3", in1=parts[0], in2=parts[1], in3=1.0)
-        return node("multiply", "vector3", in1=centred, in2=factors)
+        x, y = (node("extract", "float", in_=scale, index=float(k)) for k in (0, 1))
+        factor = node("combine3", "vector3", in1=x, in2=y, in3=1.0)
+        turned = node("multiply", "vector3", in1=picture, in2=node("multiply", "vector3", in1=factor, in2=2.0))
+        turned = node("add", "vector3", in1=turned, in2=node("multiply", "vector3", in1=factor, in2=-1.0))
+        return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0]) if isinstance(turned, TextureContents) else turned
 
 
 _SPECIAL: dict[str, Callable[..., Input | None]] = {

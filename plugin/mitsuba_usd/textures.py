@@ -61,12 +61,9 @@ class Textures:
         most = None if is_radiance else 1.0
         if isinstance(given, NodeContents):
             values, to_uv, wrap = self._baked(given)
-            values = values[..., :3]
-            if values.shape[2] == 1:
-                values = np.repeat(values, 3, axis=2)
-            elif values.shape[2] == 2:
-                # Red and green.
-                values = np.pad(values, ((0, 0), (0, 0), (0, 1)))
+            values = np.repeat(values, 3, axis=2) if values.shape[2] == 1 else values[..., :3]
+            # Two components are red and green.
+            values = np.pad(values, ((0, 0), (0, 0), (0, 3 - values.shape[2])))
             return self._bitmap(np.clip(values, 0, most), to_uv, wrap, is_raw=False)
         picture = self._picture(given.file, given)
         if picture is None:
@@ -196,14 +193,10 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
 
 def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
     """Channels of a picture; of what has no colour or no alpha, those that `with_alpha` makes."""
-    there = pixels.shape[2]
-    if there >= 3 and max(channels) < there:
-        first = channels[0]
-        is_run = channels == list(range(first, first + len(channels)))
-        return pixels[..., first : first + len(channels)] if is_run else pixels[..., channels]
-    if len(channels) == 1 and channels[0] < 3:
-        return pixels[..., :1]
-    return with_alpha(pixels)[..., channels]
+    first, end = channels[0], channels[-1] + 1
+    if pixels.shape[2] >= max(3, end):
+        return pixels[..., first:end]
+    return pixels[..., :1] if len(channels) == 1 and first < 3 else with_alpha(pixels)[..., first:end]
 
 
 def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]) -> Baked:
