@@ -206,9 +206,8 @@ def _triangles(cage: CageContents) -> IntArray:
     first = np.cumsum(sizes) - sizes
     sizes[cage.holes] = 0
     counts = np.maximum(sizes - 2, 0)
-    index = ragged.index_in_row(counts)
-    start = np.repeat(first, counts)
-    return np.stack([start, start + index + 1, start + index + 2], axis=1)
+    second = ragged.ranges(first + 1, counts)
+    return np.stack([np.repeat(first, counts), second, second + 1], axis=1)
 
 
 class LoadedShapes:

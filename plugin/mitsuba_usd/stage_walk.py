@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import warnings
-import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
 from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
-from .materialx_layers import library, with_documents
+from .materialx_layers import with_documents
 from .stage_lights_and_camera import read_camera, read_light, read_settings
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
@@ -74,8 +73,6 @@ class StageReader:
         self._first: SceneContents | None = None
         self._is_still: bool | None = None
         self._warned = set() if warned is None else warned
-        # It takes a dozen megabytes, which no scene needs.
-        weakref.finalize(self, library.cache_clear)
 
     def at(self, time: float | None = None) -> SceneContents:
         """Contents of the stage at a time code. Warns about everything that is ignored, once for each kind.

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
-from mitsuba_usd.materialx_layers import library
 from mitsuba_usd.stage_walk import StageReader
 from pxr import Sdf
 from usd.stages import SQUARE, bound, camera, mesh, moved, prim, shader, told, write
@@ -98,14 +97,6 @@ def test_inputs_are_overridden_as_in_any_reference(stage):
     """On the material, whose inputs the shader's are; a later document wins over nothing."""
     over = 'over "Red" {\nfloat inputs:specular_roughness = 0.9\n}'
     assert material(stage(RED, RED_SQUARE, over)).inputs["roughness"] == pytest.approx(0.9)
-
-
-def test_the_library_of_nodes_goes_with_the_reader(stage):
-    reader = StageReader(stage(RED))
-    reader.at()
-    assert library.cache_info().currsize == 1
-    del reader
-    assert library.cache_info().currsize == 0
 
 
 def test_warnings_keep_their_kind_and_are_given_before_an_error(stage, monkeypatch):
