@@ -80,7 +80,7 @@ def test_pole_is_isolated_and_numbered_first(valence, closed):
     np.testing.assert_array_equal(cage.positions[0], [0, 0, 1])
     faces = cage.face_vertices.reshape(-1, 4)
     assert (faces[:valence, 0] == 0).all()
-    np.testing.assert_array_equal(topology.turn(4 * np.arange(valence)), 4 * np.roll(np.arange(valence), -1))
+    np.testing.assert_array_equal(topology.turn[4 * np.arange(valence)], 4 * np.roll(np.arange(valence), -1))
     # The control points of the patches around the pole are the corners of its two-ring.
     one_ring = np.isin(faces, [0]).any(axis=1)
     two_ring = np.isin(faces, faces[one_ring]).any(axis=1)

@@ -271,7 +271,7 @@ class RolledFaces(CatmullClark):
         if semi is not None:
             semi = replace(semi, edges=np.roll(semi.edges, 4), edges_refined=np.roll(semi.edges_refined, 4))
         quads = np.roll(t.face_vertices, 4)
-        return refinement._replace(topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.rules, semi))
+        return refinement._replace(topology=Topology(t.vertex_count, t.face_sizes, quads, None, t.vertex_rules, semi))
 
     def children(self, topology, refined, half_edge):
         parts = super().children(topology, refined, half_edge)
@@ -298,7 +298,7 @@ class LastingCreases(CatmullClark):
             return refinement
         sharpness = {each: getattr(t.semi_sharpness, each) for each in ("edges", "edges_refined")}
         semi = replace(t.semi_sharpness, **{each: np.where(s > 0, 2.5, 0) for each, s in sharpness.items()})
-        return refinement._replace(topology=t.with_rules(t.rules, semi))
+        return refinement._replace(topology=t.with_rules(t.vertex_rules, semi))
 
 
 @pytest.mark.parametrize("use", [lambda s: s.evaluate(np.arange(6), np.zeros((6, 2))), lambda s: s.tessellate(2)])

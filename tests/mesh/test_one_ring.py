@@ -134,9 +134,9 @@ def test_half_edges_around_each_corner_are_turns_apart(topology):
         fans = fan_half_edges(topology, half_edge, "face")
         counts = [len(behind) + len(ahead) for behind, ahead in fans]
         for fan, (_, ahead) in zip(np.split(half_edges_around(fans), np.cumsum(counts)[:-1]), fans, strict=True):
-            np.testing.assert_array_equal(topology.turn(fan[:-1]), fan[1:])
+            np.testing.assert_array_equal(topology.turn[fan[:-1]], fan[1:])
             assert ahead[0] in fan
-            assert topology.turn(fan[-1]) in (-1, ahead[0])
+            assert topology.turn[fan[-1]] in (-1, ahead[0])
 
 
 @pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
@@ -156,7 +156,7 @@ def test_signature_of_the_next_corner_is_rotated(topology):
         assert by_face.rotated(1) == signature_at(topology, int(topology.next[half_edge]), "face")
         assert by_face.rotated(1).rotated(len(by_face.fans) - 1) == by_face
         by_vertex = signature_at(topology, half_edge, "vertex")
-        assert by_vertex.rotated(1) == signature_at(topology, int(topology.turn(half_edge)), "vertex")
+        assert by_vertex.rotated(1) == signature_at(topology, int(topology.turn[half_edge]), "vertex")
 
 
 @pytest.mark.parametrize(

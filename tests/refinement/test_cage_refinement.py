@@ -237,6 +237,19 @@ def test_a_scheme_with_numbers_of_its_own_is_an_error():
         named_cages.tetrahedron().refined(Renumbered())
 
 
+@pytest.mark.parametrize(
+    ("scheme", "faces"),
+    [
+        ("catmull_clark", [[0, 1, 2, 2]]),
+        ("catmull_clark", [[3, 4, 4], [1, 5, 3, 4, 0], [1, 2, 3]]),
+        ("loop", [[1, 0, 1]]),
+    ],
+)
+def test_halves_of_an_edge_from_a_vertex_to_itself_stay_apart(scheme, faces, np_rng):
+    cage = ControlCage(np_rng.random((6, 3)), faces)
+    check_refined(LimitSurface(cage, scheme), np_rng, times=2)
+
+
 def test_holes_stay_holes_where_the_boundary_makes_them():
     cage = surface_of(SURFACES["sheet, creases interpolated"]).cage
     refinement = cage.refinement()

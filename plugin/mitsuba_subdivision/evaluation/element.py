@@ -347,5 +347,5 @@ def _vertex_ring(topology: Topology, valence: int) -> tuple[list[int], list[int]
         edge_ring.append(int(topology.face_vertices[ahead]))
         if topology.face_sizes[0] > 3:
             face_ring.append(int(topology.face_vertices[topology.next[ahead]]))
-        half_edge = int(topology.turn(half_edge))
+        half_edge = int(topology.turn[half_edge])
     return [0, *edge_ring, *face_ring], edge_ring

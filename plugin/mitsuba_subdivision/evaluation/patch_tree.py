@@ -322,7 +322,7 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
         return np.arange(ring.vertex_count)
     half_edge = 0
     for _ in range(corner):
-        half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn(half_edge))
+        half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn[half_edge])
     return one_ring(signature.rotated(corner)).gather(ring.topology, np.array([half_edge]))[0]
 
 

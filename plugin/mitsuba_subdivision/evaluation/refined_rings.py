@@ -37,7 +37,7 @@ def refined_ring(scheme: Scheme, signature: Signature) -> Refinement:
     if not signature.is_semi_sharp:
         return refined
     smooth, topology = refined_ring(scheme, signature.smoothed).topology, refined.topology
-    return Refinement(smooth.with_rules(topology.rules, topology.semi_sharpness), refined.stencils)
+    return Refinement(smooth.with_rules(topology.vertex_rules, topology.semi_sharpness), refined.stencils)
 
 
 @lru_cache(maxsize=1024)

@@ -16,8 +16,6 @@ from .sharpness import SemiSharpness
 IntArray = NDArray[np.integer]
 # Indices of half-edges, faces and edges. int32 halves the memory, and on large cages the time.
 IndexArray = NDArray[np.int32]
-# An array of half-edges, or a single one.
-HalfEdges = NDArray[np.integer] | np.integer | int
 
 
 class VertexRule(IntEnum):
@@ -47,7 +45,7 @@ class Topology:
         A number for each half-edge, equal for twins only. By default half-edges between the same two vertices are
         twins. A dual mesh needs names, as two of its faces may share several edges.
     rules : (n_v,) int8, optional
-        A `VertexRule` for each vertex. By default all are automatic.
+        A `VertexRule` for each vertex, later `vertex_rules`. By default all are automatic.
     semi_sharpness : SemiSharpness, optional
         Semi-sharp edges and vertices. By default there are none.
     """
@@ -65,7 +63,7 @@ class Topology:
         self.face_sizes = face_sizes
         self.face_vertices: IndexArray = np.asarray(face_vertices, dtype=np.int32)
         self.edge_names = edge_names
-        self.rules = rules
+        self.vertex_rules = np.zeros(vertex_count, dtype=np.int8) if rules is None else rules
         self.semi_sharpness = semi_sharpness
 
     @property
@@ -107,6 +105,16 @@ class Topology:
         first, last = self._face_ends
         preceding[first] = preceding[last] + 1
         return preceding
+
+    @cached_property
+    def turn(self) -> IndexArray:
+        """``(n_h,)`` outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
+        return self.twin[self.prev]
+
+    @cached_property
+    def turn_back(self) -> IndexArray:
+        """``(n_h,)`` outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
+        return np.where(self.twin < 0, -1, self.next[self.twin])
 
     @property
     def _face_ends(self) -> tuple[slice, slice] | tuple[IntArray, IntArray]:
@@ -239,40 +247,20 @@ class Topology:
             current = self.vertex_half_edge[vertices]
             for turn in range(valence):
                 half_edges[offsets[vertices] + turn] = current
-                current = self.turn(current)
+                current = self.turn[current]
         return offsets, half_edges
-
-    @cached_property
-    def vertex_rules(self) -> NDArray[np.int8]:
-        """``(n_v,)`` `VertexRule` of each vertex."""
-        return np.zeros(self.vertex_count, dtype=np.int8) if self.rules is None else self.rules
 
     def with_rules(self, rules: NDArray[np.int8] | None, semi_sharpness: SemiSharpness | None) -> Topology:
         """Return the same mesh with other rules. It shares the connectivity that is already computed."""
         same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules, semi_sharpness)
         for name, value in vars(self).items():
-            if name not in ("rules", "vertex_rules", "semi_sharpness"):
+            if name not in ("vertex_rules", "semi_sharpness"):
                 vars(same)[name] = value
         return same
 
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
         """Return the half-edges of the faces selected by ``is_chosen``, in ascending order."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
-
-    def turn(self, half_edge: HalfEdges) -> IndexArray:
-        """Return the outgoing half-edge of the same vertex in the next face counter-clockwise; -1 beyond a border."""
-        return self._turned[half_edge]
-
-    @cached_property
-    def _turned(self) -> IndexArray:
-        """``(n_h,)`` `turn` of each half-edge; cached, as it is used several times."""
-        return self.twin[self.prev]
-
-    def turn_back(self, half_edge: HalfEdges) -> IndexArray:
-        """Return the outgoing half-edge of the same vertex in the next face clockwise; -1 beyond a border."""
-        twin = self.twin[half_edge]
-        # Indexing by () converts the zero-dimensional result for one half-edge to a scalar.
-        return np.where(twin < 0, -1, self.next[twin])[()]
 
 
 def paired(

@@ -161,7 +161,7 @@ def cut_along_creases(mesh: SharpMesh) -> CutMesh:
     semi_sharpness = semi_sharpness_of_cut(mesh, cut, is_cut)
     if semi_sharpness is None:
         return cut
-    return CutMesh(cut.topology.with_rules(cut.topology.rules, semi_sharpness), cut.vertex)
+    return CutMesh(cut.topology.with_rules(cut.topology.vertex_rules, semi_sharpness), cut.vertex)
 
 
 def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray[np.bool_]) -> NDArray[np.int8]:
@@ -210,7 +210,7 @@ def _split_vertices(
     while len(current):
         face_vertices[current] = number
         continues = ~is_border[t.prev[current]]
-        current, number = t.turn(current[continues]).astype(np.int64), number[continues]
+        current, number = t.turn[current[continues]].astype(np.int64), number[continues]
         is_new = face_vertices[current] != number
         current, number = current[is_new], number[is_new]
     return face_vertices, vertex
@@ -221,7 +221,7 @@ def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: I
     is_divided = is_border[closed_fans]
     current, fan = closed_fans, np.arange(len(closed_fans))
     while len(current):
-        current = topology.turn(current)
+        current = topology.turn[current]
         continues = current != closed_fans[fan]
         current, fan = current[continues], fan[continues]
         is_divided[fan] |= is_border[current]

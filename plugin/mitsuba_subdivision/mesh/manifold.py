@@ -101,7 +101,7 @@ def _has_single_fans(topology: Topology) -> bool:
     start = np.where(t.open_fan_start < 0, t.vertex_half_edge, t.open_fan_start)[count > 0]
     current, count = start, count[count > 0]
     for faces in range(1, 1 + int(count.max(initial=0))):
-        current = t.turn(current)
+        current = t.turn[current]
         ends = (current < 0) | (current == start)
         if (ends != (count == faces)).any():
             return False
@@ -120,7 +120,7 @@ def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
     fan.
     """
     corners = np.arange(topology.half_edge_count)
-    jump = topology.turn(corners)
+    jump = topology.turn.copy()
     is_end = jump < 0
     jump[is_end] = corners[is_end]
     lowest = np.minimum(corners, jump)
@@ -157,7 +157,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
         separate = Topology(t.vertex_count, t.face_sizes, t.face_vertices, names)
     fan, is_first = fan_labels(separate)
     vertices = fan_counts(t, is_first) > 1
-    closed = np.flatnonzero(is_first & (separate.turn(np.arange(t.half_edge_count)) >= 0))
+    closed = np.flatnonzero(is_first & (separate.turn >= 0))
     closed = closed[vertices[start[closed]]]
     vertices[start[edges]] = vertices[end[edges]] = True
     if not vertices.any():

@@ -45,7 +45,7 @@ class OneRing:
         """Return the edge neighbours of the first vertex, counter-clockwise; on a border, from border to border."""
         t, half_edges = self.topology, self.around[0]
         neighbours = t.face_vertices[t.prev[half_edges]].tolist()
-        is_closed = int(t.turn(half_edges[-1])) >= 0
+        is_closed = int(t.turn[half_edges[-1]]) >= 0
         return neighbours if is_closed else [int(t.face_vertices[t.next[half_edges[0]]]), *neighbours]
 
     def gather(
@@ -105,9 +105,7 @@ def one_ring(signature: Signature) -> OneRing:
     edge_names = [min(half_edge, other) if other >= 0 else half_edge for half_edge, other in enumerate(twin)]
     rules = np.zeros(len(first), dtype=np.int8)
     rules[vertex[: len(fans)]] = [fan.rule for fan in fans]
-    local = Topology(
-        len(first), np.array(sizes), np.array(vertex), np.array(edge_names), rules if rules.any() else None
-    )
+    local = Topology(len(first), np.array(sizes), np.array(vertex), np.array(edge_names), rules)
     cut_fans = [
         (vertex[half_edges[0]], vertex[following[half_edges[0]]], vertex[preceding[half_edges[-1]]])
         for half_edges, fan in zip(around, fans, strict=True)
@@ -154,7 +152,7 @@ def _with_sharpness(ring: OneRing, signature: Signature) -> Topology:
     semi_sharpness = SemiSharpness(
         edges, refined, vertices, vertex.astype(np.int64), across_sharpness, across_refined, sharpens > 0
     )
-    return local.with_rules(local.rules, semi_sharpness)
+    return local.with_rules(local.vertex_rules, semi_sharpness)
 
 
 def _glued_faces(signature: Signature) -> tuple[list[int], list[int], list[int], list[int], list[list[int]]]:

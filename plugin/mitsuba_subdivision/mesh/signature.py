@@ -168,11 +168,11 @@ def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
 
 def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
     ahead, behind = [half_edge], list[int]()
-    while (current := int(topology.turn(ahead[-1]))) not in (half_edge, -1):
+    while (current := int(topology.turn[ahead[-1]])) not in (half_edge, -1):
         ahead.append(current)
     if current < 0:
         current = half_edge
-        while (current := int(topology.turn_back(current))) >= 0:
+        while (current := int(topology.turn_back[current])) >= 0:
             behind.append(current)
     return behind, ahead
 
@@ -185,7 +185,7 @@ def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: Element
         return tuple(t.face_sizes[t.face[half_edges]].tolist()) if half_edges else ()
 
     def fan(behind: list[int], ahead: list[int]) -> Fan:
-        is_closed = int(t.turn(ahead[-1])) >= 0
+        is_closed = int(t.turn[ahead[-1]]) >= 0
         rule = VertexRule(int(t.vertex_rules[t.face_vertices[ahead[0]]]))
         return Fan(sizes(ahead), None if is_closed else sizes(behind), rule)
 

@@ -393,7 +393,7 @@ def _faces_clockwise(topology: Topology) -> IntArray:
     current, face_count = t.open_fan_start[t.open_fan_start >= 0], 0
     while len(current):
         behind[current] = face_count
-        current = t.turn(current)
+        current = t.turn[current]
         current, face_count = current[current >= 0], face_count + 1
     return behind
 
@@ -427,7 +427,7 @@ def _codes_around(
         far, behind = cut
         ahead, back = face_count.copy(), far
         for step in range(NEAR_FACES):
-            back = np.where(step < behind, t.turn_back(back), back)
+            back = np.where(step < behind, t.turn_back[back], back)
         ahead[far], restart[far] = NEAR_FACES - behind, back
     least, greatest = np.full(t.vertex_count, np.iinfo(np.int64).max), np.zeros(t.vertex_count, dtype=np.int64)
     np.minimum.at(least, t.face_vertices, face_codes)
@@ -438,7 +438,7 @@ def _codes_around(
         current, columns = half_edges, []
         for step in range(1, n + 1):
             columns.append(face_codes[current])
-            following = t.turn(current)
+            following = t.turn[current]
             current = np.where((following < 0) | (step == ahead[half_edges]), restart[half_edges], following)
         differ = np.any([column != columns[0] for column in columns], axis=0)
         sequence_codes = 1 + row_codes(columns).astype(np.int64)

@@ -139,20 +139,17 @@ def _with_tags(
         creases = np.stack([*ends, sharpness.edges[sharp]], axis=1)
         contents = replace(contents, creases=creases, corners=sharpness.corners())
         refined = built(contents)
-        is_joined, is_torn, has_other_rule, is_sharper = differences(expected, refined.cut_mesh.topology)
-        refined_rules = refined.cut_mesh.topology.vertex_rules[refined.cut_mesh.topology.face_vertices]
-        is_other = has_other_rule & ~(stays & (refined_rules == VertexRule.CORNER))
-        is_missing = is_other & (stays | (rules == VertexRule.CORNER))
+        is_joined, has_other_rule, is_wrong = differences(expected, refined.cut_mesh.topology, stays)
+        is_missing = has_other_rule & (stays | (rules == VertexRule.CORNER))
         if not (is_joined.any() or is_missing.any()):
             break
         sharpness.edges[is_joined] = INFINITE
         sharpness.vertices[corners.vertex[is_missing]] = INFINITE
-    wrong = is_joined | is_torn | is_other | is_sharper
-    if wrong.any():
-        where = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(wrong)]]))
+    if is_wrong.any():
+        where = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(is_wrong)]]))
         raise CageError(
             f"{where} and another face share two edges or more, so that refined edges would have the same two ends; "
-            f"expected faces that share one edge at most ({wrong.sum()} such refined half-edges)"
+            f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
         )
     return contents, refined
 

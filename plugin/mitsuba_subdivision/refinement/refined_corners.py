@@ -264,12 +264,9 @@ def _common_mode(
     def first_wrong(mode: str) -> tuple[str, int] | None:
         """Return the first attribute and refined corner at which the value mesh differs; None if all are equal."""
         for name, (expected, stays, indices) in value_meshes.items():
-            t = value_mesh(refined.structure, mode, indices)[0]
-            is_joined, is_torn, has_other_rule, is_sharper = differences(expected, t)
-            is_corner = (t.vertex_rules == VertexRule.CORNER)[t.face_vertices]
-            wrong = is_joined | is_torn | (has_other_rule & ~(stays & is_corner)) | is_sharper
-            if wrong.any():
-                return name, int(np.argmax(wrong))
+            *_, is_wrong = differences(expected, value_mesh(refined.structure, mode, indices)[0], stays)
+            if is_wrong.any():
+                return name, int(np.argmax(is_wrong))
         return None
 
     cage_mode = cage.face_varying
@@ -288,18 +285,24 @@ def _common_mode(
     )
 
 
-def differences(expected: Topology, other: Topology) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
+def differences(
+    expected: Topology,
+    other: Topology,
+    stays: BoolArray,  # (n_h,) bool: half-edges whose origin does not move, so that it may be a corner
+) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Compare two meshes, half-edge by half-edge. Meshes without differences have equal refinements.
 
-    Returns four (n_h,) bool arrays. For each half-edge of ``other``: whether it has an unexpected twin; whether it
-    lacks the expected twin; whether its origin has another `VertexRule`; and whether the semi-sharpness of its edge or
-    at its origin differs.
+    Returns three (n_h,) bool arrays. For each half-edge of ``other``: whether it has an unexpected twin; whether its
+    origin has another `VertexRule`; and whether there is any difference, in these, or in the semi-sharpness of its edge
+    or at its origin.
     """
-    differs = expected.twin != other.twin
-    has_other_rule = expected.vertex_rules[expected.face_vertices] != other.vertex_rules[other.face_vertices]
+    has_other_twin = expected.twin != other.twin
+    rules = other.vertex_rules[other.face_vertices]
+    has_other_rule = expected.vertex_rules[expected.face_vertices] != rules
+    has_other_rule &= ~(stays & (rules == VertexRule.CORNER))
     is_sharper = (np.abs(_sharpness(expected) - _sharpness(other)) > MEAN_TOLERANCE).any(axis=0)
-    is_sharper |= _differs_across(expected, other)
-    return differs & (other.twin >= 0), differs & (expected.twin >= 0), has_other_rule, is_sharper
+    is_wrong = has_other_twin | has_other_rule | is_sharper | _differs_across(expected, other)
+    return has_other_twin & (other.twin >= 0), has_other_rule, is_wrong
 
 
 def _sharpness(t: Topology) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
-from .crease_masks import crease_masks, kept_rules, kept_sharpness
+from .crease_masks import crease_masks, kept_sharpness
 from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
 from .scheme import PhantomPoint, Refinement, Scheme, StencilTable, TriangleRule, tensor_basis
 
@@ -62,7 +62,7 @@ class CatmullClark(Scheme):
             n_v + n_e + n_f,
             np.full(len(quads), 4),
             quads.ravel(),
-            rules=kept_rules(t, n_e + n_f),
+            rules=np.append(t.vertex_rules, np.zeros(n_e + n_f, dtype=np.int8)),
             semi_sharpness=kept_sharpness(t, quads.ravel(), 3, n_e + n_f, self.crease_method),
         )
 

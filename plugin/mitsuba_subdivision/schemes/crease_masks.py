@@ -110,13 +110,6 @@ def _mean_of_smoothed(vertex: IntArray, before: FloatArray, after: FloatArray) -
     return np.minimum(total / np.maximum(count, 1), 1)
 
 
-def kept_rules(topology: Topology, new_count: int) -> NDArray[np.int8] | None:
-    """Return the vertex rules after a refinement that keeps the vertices and appends new ones."""
-    if topology.rules is None:
-        return None
-    return np.concatenate([topology.rules, np.zeros(new_count, dtype=np.int8)])
-
-
 def kept_sharpness(
     topology: Topology,
     # (n_h',) int: `Topology.face_vertices` of the refined mesh. The faces at coarse corners come first, each listed
@@ -134,6 +127,5 @@ def kept_sharpness(
     edges = np.zeros(len(face_vertices))
     corners = edges[: t.half_edge_count * (last + 1)].reshape(t.half_edge_count, last + 1)
     corners[:, 0] = semi.edges_refined
-    ahead = t.turn(np.arange(t.half_edge_count))
-    corners[:, last] = np.where(ahead < 0, 0, semi.edges_refined[ahead])
+    corners[:, last] = np.where(t.turn < 0, 0, semi.edges_refined[t.turn])
     return semi.refined(face_vertices, edges, new_count, method)

@@ -74,7 +74,7 @@ class DooSabin(Scheme):
         current = half_edge
         while not fan or current != half_edge:
             fan.append(current)
-            current = int(topology.turn(current))
+            current = int(topology.turn[current])
         if len(fan) != 4:
             return [(IDENTITY, half_edge)]
         parts = []
@@ -82,7 +82,7 @@ class DooSabin(Scheme):
             # The refined half-edge inside the coarse face; the child's (0, 0) is k faces before it.
             start = fan[k]
             for _ in range((4 - k) % 4):
-                start = int(refined.turn(start))
+                start = int(refined.turn[start])
             parts.append((child, start))
         return parts
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
-from .crease_masks import crease_masks, kept_rules, kept_sharpness
+from .crease_masks import crease_masks, kept_sharpness
 from .domain import TRIANGLE, AffineMap, FloatArray
 from .scheme import PhantomPoint, Refinement, Scheme, StencilTable, Unsupported
 
@@ -100,7 +100,7 @@ class Loop(Scheme):
             np.full(4 * t.face_count, 3),
             triangles,
             _edge_names(t),
-            rules=kept_rules(t, n_e),
+            rules=np.append(t.vertex_rules, np.zeros(n_e, dtype=np.int8)),
             semi_sharpness=kept_sharpness(t, triangles, 2, n_e, self.crease_method),
         )
 
