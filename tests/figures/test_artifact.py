@@ -5,12 +5,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.figures.artifact import ROWS, RULES, vertex_normal
+from mitsuba_subdivision.figures.artifact import ROWS, RULES, surface_of, vertex_normal
 from mitsuba_subdivision.figures.staging import project
 
 SCENES = Path(__file__).parents[2] / "scenes"
-# Sampled at u = v = offset, float32 loses the normal of Stam's form at |c1| = 10.
-OFFSETS = {3: 1e-6, 5: 1e-8}
 # Radius of the disc, about half an incident triangle.
 RADIUS = 0.035
 RESOLUTION, SPP, SEEDS = 48, 24, 4
@@ -25,8 +23,7 @@ def disc_luminance(valence, **parameters):
     scene = mi.load_file(
         str(SCENES / f"valence{valence}.xml"), resolution=str(RESOLUTION), spp=str(SPP), fov="5", **parameters
     )
-    row = next(row for row in ROWS if row.valence == valence)  # of Catmull-Clark, which come first
-    point = row.surface().evaluate(0, [[0.0, 0.0]]).p[0]
+    point = surface_of("catmull_clark", valence).evaluate(0, [[0.0, 0.0]]).p[0]
     centre, edge = project(scene.sensors()[0], np.stack([point, point + np.array([RADIUS, 0, 0])]), RESOLUTION)
     y, x = np.indices((RESOLUTION, RESOLUTION)) + 0.5
     disc = np.hypot(x - centre[0], y - centre[1]) < np.linalg.norm(edge - centre)
@@ -45,7 +42,7 @@ def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(valence, variant
     """Against a fine tessellation, exact at the vertex."""
     request.getfixturevalue(f"variant_{variant}")
     expected, error = disc_luminance(valence, rate="24")
-    offset = repr(OFFSETS[valence])
+    offset = repr(ROWS["catmull_clark", valence][0])
     stam, _ = disc_luminance(valence, evaluator="stam", sample_offset=offset)
     assert stam < DARKENED * expected
     for parameters in ({"evaluator": "stabilized", "sample_offset": offset}, {}):
@@ -54,21 +51,20 @@ def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(valence, variant
 
 
 def test_the_artefact_comes_from_the_offset_of_the_cage_and_one_rule_of_three_has_it():
-    for row in ROWS:
-        surface = row.surface()
+    for (scheme, valence), (offset, _) in ROWS.items():
+        surface = surface_of(scheme, valence)
         limit = surface.evaluate(0, [[0.0, 0.0]]).p[0]
         centred = type(surface)(surface.cage.with_positions(surface.cage.positions - limit))
-        uv = np.full((1, 2), row.sample_offset)
         for at, lost in ((surface, True), (centred, False)):
-            single = at.evaluate(0, uv, evaluator="stam", dtype=np.float32)
-            cosine = (single.n * at.evaluate(0, uv).n).sum()
-            assert (cosine < np.cos(np.radians(45))) == lost
-        stam, stabilised, limit = (vertex_normal(row, rule) for rule in RULES)
-        # Each is its level, the offset and the error.
+            assert (vertex_normal(at, "stam", offset)[2] > 45) == lost
+        stam, stabilised, limit = (
+            vertex_normal(surface, evaluator, offset if is_beside else 0.0) for _, evaluator, is_beside in RULES
+        )
+        # Each is its level, the distance from the origin and the error.
         assert stam[2] > 45
         assert max(stabilised[2], limit[2]) < 1e-4
         # Levels halve the domain: max(u, v) of the square, u + v of the triangle.
-        extent = row.sample_offset * (2 if row.scheme == "loop" else 1)
+        extent = offset * (2 if scheme == "loop" else 1)
         assert stam[0] == stabilised[0] == int(np.floor(-np.log2(extent)))
         assert limit[0] is None
         assert stam[1] == pytest.approx(10, abs=0.1)

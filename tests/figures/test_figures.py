@@ -2,6 +2,7 @@
 
 import hashlib
 import re
+from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -20,15 +21,22 @@ from mitsuba_subdivision.figures.cages import (
     labels,
     regular_elements,
 )
-from mitsuba_subdivision.figures.characteristic import CharacteristicMap, patch_of_valence, refinement_step, sub_domain
+from mitsuba_subdivision.figures.characteristic import (
+    characteristic_points,
+    on_patch,
+    patch_of_valence,
+    refinement_step,
+    sector,
+    sub_domain,
+)
 from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
 from mitsuba_subdivision.figures.normal_error import offset_cage
 from mitsuba_subdivision.figures.output import write_figure
-from mitsuba_subdivision.figures.own_cage import around_vertices, frame
 from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
 from mitsuba_subdivision.figures.staging import project, visible
-from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, TangentView, normals_by, sample
+from mitsuba_subdivision.figures.user_cage import around_vertices, frame
+from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, normals_by, sample
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
 from scipy.spatial import cKDTree
@@ -253,7 +261,8 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
 @pytest.mark.core
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_a_refinement_step_has_the_points_of_the_report(valence):
-    _, old, new, old_edges, new_edges = refinement_step(valence)
+    patch = patch_of_valence(scheme_named("catmull_clark"), valence)
+    old, new, old_edges, new_edges = refinement_step(patch, valence)
     assert len(old) == 2 * valence + 8
     assert len(new) == 2 * valence + 17
     # Neither set has two points in one place, and every new point has an edge.
@@ -267,12 +276,12 @@ def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
     for name in ("catmull_clark", "loop", "doo_sabin"):
         scheme = scheme_named(name)
         patch = patch_of_valence(scheme, 5)
-        image = CharacteristicMap(patch, 5)
+        image = partial(on_patch, scheme, patch.signature, characteristic_points(patch, 5))
         first, third = (image(sub_domain(scheme.domain, level, 2)) for level in (0, 2))
         np.testing.assert_allclose(third, patch.basis.subdominant**2 * first, atol=1e-12)
         # One sector ends where the next begins.
         edge = np.array([(0.0, 0.7), (0.7, 0.0)])
-        np.testing.assert_allclose(image(edge[:1]), image.sector(image(edge[1:]), 1), atol=1e-12)
+        np.testing.assert_allclose(image(edge[:1]), sector(image(edge[1:]), 1, 5), atol=1e-12)
 
 
 def test_subdivision_keeps_the_number_of_extraordinary_points():
@@ -316,13 +325,13 @@ def test_curvature_grows_as_the_eigenvalues_say(valence):
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
-    view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
+    surface = LimitSurface(offset_cage(extraordinary(VALENCE), OFFSET))
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
-        samples = sample(view, magnification, 8)
+        samples = sample(surface, magnification, 8)
         # The elements at the point cover the picture, at every magnification.
-        extent = np.abs(samples.positions[:, -1, :2]).max(axis=1)
+        extent = np.abs(samples[1][:, -1, :2]).max(axis=1)
         assert extent.min() > 0.9
-        stam, stabilised = (normals_by(view, samples, name)[2] for name in ("stam", "stabilized"))
+        stam, stabilised = (normals_by(surface, *samples, name)[2] for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)
 

@@ -19,7 +19,6 @@ from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
-from .own_cage import fitted, in_ball, read
 from .staging import (
     edge_rods,
     load_stage,
@@ -33,6 +32,7 @@ from .staging import (
     visible,
     visible_runs,
 )
+from .user_cage import fitted, in_ball, read
 
 LEVELS = 4
 # Of the ball that fills the picture, for cages of users.
@@ -42,29 +42,6 @@ REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
 EDGE_SEGMENTS = 24
 # Segments per edge of a patch of the last level, for its area and for the render of the limit surface.
 RATE = 6
-
-# Of the figure of creases.
-TITLES = {
-    "smooth": "smooth\ntags ignored",
-    "own": "semi-sharp\nthe cage's own tags",
-    "infinite": "infinitely sharp\nevery crease",
-}
-CAGE_TITLE = "control cage"
-# Height of the images, in widths.
-HEIGHT = 1.55
-CREASE_RATE = 24
-INFINITE = 10
-MATERIAL = {
-    "type": "principled",
-    "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]},
-    "roughness": 0.3,
-    "specular": 0.5,
-    "clearcoat": 0.6,
-    "clearcoat_gloss": 0.95,
-}
-# Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
-PALE = "#e4e4e1"
-EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
 
 
 def draw_subdivision(options: FigureOptions) -> list[Path]:
@@ -197,6 +174,30 @@ def _draw_cage(
     axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
 
 
+# Panels of the figure of creases, and their titles.
+TITLES = {
+    "smooth": "smooth\ntags ignored",
+    "own": "semi-sharp\nthe cage's own tags",
+    "infinite": "infinitely sharp\nevery crease",
+}
+CAGE_TITLE = "control cage"
+# Height of the pictures, in widths.
+HEIGHT = 1.55
+CREASE_RATE = 24
+INFINITE = 10
+MATERIAL = {
+    "type": "principled",
+    "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]},
+    "roughness": 0.3,
+    "specular": 0.5,
+    "clearcoat": 0.6,
+    "clearcoat_gloss": 0.95,
+}
+# Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
+PALE = "#e4e4e1"
+EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
+
+
 def draw_creases(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
@@ -226,13 +227,11 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
 
 def _cage_shapes(cage: ControlCage) -> SceneNode:
     """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
-    faces = np.split(cage.face_vertices, np.cumsum(cage.face_sizes)[:-1])
-    fans = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
     # Each triangle has three vertices of its own, so that no normals are averaged.
-    positions = cage.positions[np.array(fans).ravel()]
+    positions = cage.positions[cage.triangles.ravel()]
     shapes: SceneNode = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
-    topology, half_edges = cage.topology, cage.topology.edge_half_edge
-    ends = np.stack([topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]], axis=1)
+    t, half_edges = cage.topology, cage.topology.edge_half_edge
+    ends = t.face_vertices[np.stack([half_edges, t.next[half_edges]], axis=1)]
     sharpness = cage.tags.edges[half_edges]
     looks = [EDGES[max(least for least in EDGES if least <= value)] for value in sharpness]
     return shapes | edge_rods(cage, ends, sharpness, looks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -50,31 +51,28 @@ def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
     return patch
 
 
-class CharacteristicMap:
-    """The map from a patch's parameters to the plane, with the extraordinary point at (0, 0).
+def characteristic_points(patch: IrregularPatch, valence: int) -> FloatArray:
+    """Control points ``(K, 2)`` of the characteristic map, from a patch's parameters to the plane.
 
     The two subdominant eigenvectors could be any basis of their plane. In the basis chosen here, the edges at the
-    extraordinary point form a regular star, and the first edge lies along x.
+    extraordinary point form a regular star around (0, 0), and the first edge lies along x.
     """
+    points, turn = patch.basis.vectors[:, 1:3], 2 * np.pi / valence
+    begin, end = on_patch(patch.scheme, patch.signature, points, patch.scheme.domain.corners[[1, -1]])
+    star = np.array([(1, 0), (np.cos(turn), np.sin(turn))]).T
+    return np.asarray(points @ (star @ np.linalg.inv(np.stack([begin, end], axis=1))).T)
 
-    def __init__(self, patch: IrregularPatch, valence: int) -> None:
-        self.patch = patch
-        self.turn = 2 * np.pi / valence
-        # (K, 2): in the plane; the map is the patch that they make.
-        self.control_points = patch.basis.vectors[:, 1:3]
-        begin, end = self(patch.scheme.domain.corners[[1, -1]])
-        star = np.array([(1, 0), (np.cos(self.turn), np.sin(self.turn))]).T
-        self.control_points = self.control_points @ (star @ np.linalg.inv(np.stack([begin, end], axis=1))).T
 
-    def __call__(self, uv: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Map parameters ``(s, 2)`` to points ``(s, 2)``."""
-        stencils = element_stencils(self.patch.scheme, self.patch.signature, uv)
-        return (stencils[0] @ self.control_points).astype(np.float64, copy=False)
+def on_patch(scheme: Scheme, signature: Signature, points: FloatArray, uv: FloatArray) -> FloatArray:
+    """Points at parameters ``(s, 2)`` of the patch of a signature with these control points in the plane."""
+    return np.asarray(element_stencils(scheme, signature, uv)[0] @ points, dtype=np.float64)
 
-    def sector(self, points: NDArray[np.float64], index: int) -> NDArray[np.float64]:
-        """Rotate points of the patch into the ``index``-th patch around the extraordinary point."""
-        cos, sin = np.cos(index * self.turn), np.sin(index * self.turn)
-        return points @ np.array([(cos, sin), (-sin, cos)])
+
+def sector(points: FloatArray, index: int, valence: int) -> FloatArray:
+    """Rotate points of the first patch around an extraordinary point at (0, 0) into the ``index``-th one."""
+    angle = index * 2 * np.pi / valence
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([(cos, sin), (-sin, cos)])
 
 
 def outline(corners: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -95,7 +93,7 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     """Draw the domains of the regular children at each level, and their images under the characteristic map."""
     scheme = scheme_named(options.scheme)
     patch = patch_of_valence(scheme, VALENCE)
-    characteristic = CharacteristicMap(patch, VALENCE)
+    image = partial(on_patch, scheme, patch.signature, characteristic_points(patch, VALENCE))
     figure, axes = panels(options, 1, 2)
     flat, round_ = axes.flat
     # Light enough at every level for black labels.
@@ -111,9 +109,8 @@ def draw_domains(options: FigureOptions) -> list[Path]:
             if size > LEAST_LABEL:
                 label = rf"$\Omega_{child}^{{{level}}}$"
                 flat.text(*corners.mean(axis=0), label, fontsize=size, ha="center", va="center")
-            bent = characteristic(outline(corners))
-            for sector in range(VALENCE):
-                round_.fill(*characteristic.sector(bent, sector).T, **style)
+            for i in range(VALENCE):
+                round_.fill(*sector(image(outline(corners)), i, VALENCE).T, **style)
     flat.fill(*sub_domain(scheme.domain, LEVELS - 1, 0).T, facecolor="#d9d9d9", edgecolor=LINE, linewidth=0.2)
     for axis in (flat, round_):
         axis.set_aspect("equal")
@@ -134,23 +131,22 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     return write_figure(options, options.name_for_scheme("domains"), figure)
 
 
-def refinement_step(valence: int) -> tuple[CharacteristicMap, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """A Catmull-Clark patch with one extraordinary vertex and its four children, in the plane of its map.
+def refinement_step(patch: IrregularPatch, valence: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """A patch with one extraordinary vertex and its four children, in the plane of its characteristic map.
 
-    Returns the map; control points of the patch ``(K, 2)`` and of its children ``(M, 2)``: the different rows of A and
-    of the matrices of the regular ones; and both ends of the edges between either, ``(.., 2, 2)`` each.
+    Returns control points of the patch ``(K, 2)`` and of its children ``(M, 2)``: the different rows of A and of the
+    matrices of the regular ones; and both ends of the edges between either, ``(.., 2, 2)`` each.
     """
-    patch = patch_of_valence(scheme_named("catmull_clark"), valence)
-    characteristic = CharacteristicMap(patch, valence)
+    old = characteristic_points(patch, valence)
     stencils = np.unique(np.concatenate([patch.matrix, *patch.children]).round(DECIMALS), axis=0)
     ring = one_ring(patch.signature).topology
     refinement = patch.scheme.refine(ring)
     # Refined points without such a stencil belong to neighbouring patches.
     distance = np.abs(refinement.stencils.matrix.toarray()[:, None] - stencils).max(axis=2)
     needed = (distance < 10.0**-DECIMALS).any(axis=1)
-    edges, old = refinement.topology.edge_ends, characteristic.control_points
+    edges = refinement.topology.edge_ends
     new_edges = refinement.apply(old)[edges[needed[edges].all(axis=1)]]
-    return characteristic, old, stencils @ old, old[ring.edge_ends], new_edges
+    return old, stencils @ old, old[ring.edge_ends], new_edges
 
 
 def draw_refinement(options: FigureOptions) -> list[Path]:
@@ -159,8 +155,9 @@ def draw_refinement(options: FigureOptions) -> list[Path]:
     The points lie where the characteristic map puts them. The refined points come from the evaluator's subdivision
     matrices.
     """
-    characteristic, old, new, old_edges, new_edges = refinement_step(VALENCE)
-    domain = characteristic.patch.scheme.domain
+    patch = patch_of_valence(scheme_named("catmull_clark"), VALENCE)
+    old, new, old_edges, new_edges = refinement_step(patch, VALENCE)
+    image, domain = partial(on_patch, patch.scheme, patch.signature, old), patch.scheme.domain
     options.report(f"valence {VALENCE}: {len(old)} control points, {len(new)} after one refinement")
     figure, ((before, after),) = panels(options, 1, 2)
     for axis in (before, after):
@@ -170,11 +167,11 @@ def draw_refinement(options: FigureOptions) -> list[Path]:
         hide_frame(axis)
     style = {"edgecolor": "#30363c", "linewidth": 0.7, "zorder": 2}
     label = {"fontsize": 9, "ha": "center", "va": "center", "zorder": 6}
-    whole = characteristic(outline(domain.corners))
+    whole = image(outline(domain.corners))
     before.fill(*whole.T, facecolor=CHILD_COLOURS[0], **style)
     before.text(*whole.mean(axis=0), r"$\Omega$", **label)
     for k, colour in enumerate(CHILD_COLOURS):
-        child = characteristic(outline(sub_domain(domain, 0, k)))
+        child = image(outline(sub_domain(domain, 0, k)))
         after.fill(*child.T, facecolor=colour, **style)
         after.text(*child.mean(axis=0), rf"$\Omega_{k}$", **label)
     after.add_collection(LineCollection(list(new_edges), colors=NEW_EDGE, linewidths=0.5, zorder=3))
@@ -205,19 +202,16 @@ def draw_tree(options: FigureOptions) -> list[Path]:
     count, size = ring.vertex_count, len(form.bernstein.indices)
     options.report(f"{count} control points, {len(leaves)} leaves of {size} coefficients")
     flat = _in_the_plane(ring.topology)
-
-    def at(uv: FloatArray) -> FloatArray:
-        return np.asarray(element_stencils(scheme, signature, uv)[0] @ flat)
-
+    image = partial(on_patch, scheme, signature, flat)
     figure, ((face, matrix),) = panels(options, 1, 2)
     face.add_collection(LineCollection(list(flat[ring.topology.edge_ends]), colors="#b6bec6", linewidths=0.6))
     face.plot(*flat.T, "o", color="black", markersize=3, zorder=4)
     around = outline(scheme.domain.corners)
     coloured = [(domain, LEAF_COLOURS[level]) for domain, level, _ in leaves] + [(rest, REST) for rest in rests]
     for domain, colour in coloured:
-        corners = at(np.clip(domain(around), 0, 1))
+        corners = image(np.clip(domain(around), 0, 1))
         face.fill(*corners.T, facecolor=colour, edgecolor=LINE, linewidth=0.4, zorder=2)
-    face.plot(*at(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
+    face.plot(*image(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
     face.set_aspect("equal")
     hide_frame(face)
     face.set(

@@ -17,8 +17,8 @@ from ..schemes import scheme_named
 from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_figure
-from .own_cage import around_vertices, frame
 from .staging import grid_points
+from .user_cage import around_vertices, frame
 
 VALENCES = (3, 5, 8)
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -93,13 +93,8 @@ Panel = tuple[str, SceneNode]
 Picture = tuple[str, NDArray[np.float32]]
 # A box and the sharpness of its edges, those of `cube` in their order.
 Box = tuple[ControlCage, NDArray[np.float64]]
-
-
-class Course(NamedTuple):
-    """The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps."""
-
-    losses: list[float]
-    cages: dict[int, ControlCage]
+# The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps.
+Course = tuple[list[float], dict[int, ControlCage]]
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -207,12 +202,12 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
         refine=refine,
         spp=SPP,
     )
-    course = Course([], {0: fit.cage})
+    losses, cages = [], {0: fit.cage}
     for step in range(1, STEPS + 1):
-        course.losses.append(fit.step())
+        losses.append(fit.step())
         if _is_measured(step):
-            course.cages[step] = fit.cage
-    return course
+            cages[step] = fit.cage
+    return losses, cages
 
 
 def _fit_mesh(views: list[View]) -> Course:
@@ -231,7 +226,8 @@ def _fit_mesh(views: list[View]) -> Course:
     def squared_error(image: mi.TensorXf, view: int) -> mi.TensorXf:
         return dr.mean(dr.square(image - targets[view]), axis=None)
 
-    course, rate = Course([], {0: mesh}), Schedule.of([(0, MESH_RATES[0]), (STEPS, MESH_RATES[1])], "learning_rate")
+    rate = Schedule.of([(0, MESH_RATES[0]), (STEPS, MESH_RATES[1])], "learning_rate")
+    losses, meshes = [], {0: mesh}
     for step in range(STEPS):
         params[key] = large_steps.from_differential(optimizer["u"])
         params.update()
@@ -239,13 +235,13 @@ def _fit_mesh(views: list[View]) -> Course:
         dr.backward(loss / len(views))
         optimizer.set_learning_rate(rate(step) * DIAGONAL)
         optimizer.step()
-        course.losses.append(float(np.array(loss).item()) / len(views))
+        losses.append(float(np.array(loss).item()) / len(views))
         with dr.suspend_grad():
             params[key] = large_steps.from_differential(optimizer["u"])
         if _is_measured(step + 1):
             positions = np.array(params[key], dtype=np.float64).reshape(-1, 3)
-            course.cages[step + 1] = mesh.with_positions(positions)
-    return course
+            meshes[step + 1] = mesh.with_positions(positions)
+    return losses, meshes
 
 
 def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
@@ -308,7 +304,7 @@ def _rendered(shown: Sequence[Panel], field_of_view: float, options: FigureOptio
 
 def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
     """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
-    cages, mesh = courses["refined"].cages, courses["mesh"].cages[STEPS]
+    cages, mesh = courses["refined"][1], courses["mesh"][1][STEPS]
 
     def title(name: str, step: int, cage: ControlCage) -> str:
         return f"{name}\n{VIEWS * step} renders,\n{cage.vertex_count:,} points"
@@ -359,9 +355,9 @@ def _sharpness_colour(sharpness: float) -> tuple[float, float, float]:
 
 
 def _plot_courses(losses: Axes, chamfer: Axes, shape: ControlCage, courses: Mapping[str, Course]) -> None:
-    for (colour, marker), (name, course) in zip(SERIES, courses.items(), strict=True):
-        losses.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course.losses), color=colour)
-        steps, cages = zip(*list(course.cages.items())[1:], strict=True)
+    for (colour, marker), (name, (course, fitted)) in zip(SERIES, courses.items(), strict=True):
+        losses.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course), color=colour)
+        steps, cages = zip(*list(fitted.items())[1:], strict=True)
         label = f"{LABELS[name]}, {cages[-1].vertex_count:,} points"
         values = 100 * distances(shape, cages)
         chamfer.loglog(VIEWS * np.array(steps), values, marker=marker, color=colour, label=label)

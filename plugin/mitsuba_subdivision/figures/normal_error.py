@@ -20,7 +20,7 @@ from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_figure
-from .own_cage import around_vertices, frame
+from .user_cage import around_vertices, frame
 
 VALENCES = (3, 5)
 OFFSETS = (0, 1, 100)

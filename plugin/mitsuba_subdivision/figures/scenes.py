@@ -24,23 +24,6 @@ SCHEMES = {"catmull_clark": "Catmull-Clark", "doo_sabin": "Doo-Sabin", "loop": "
 SHADINGS = (("vertex", 2), ("vertex", 8), ("exact", 2))
 SHADING_TITLES = {"vertex": "normals of vertices", "exact": "exact at every hit"}
 
-# Of the jar: how far triangles may be from the surface, in pixels, and in the slice where they are drawn.
-PIXEL_ERROR, PIXEL_ERROR_OF_LINES = 0.08, 1.5
-SCALE = 0.115
-# Where slices end, as parts of the width.
-ENDS = (0.0, 0.35, 0.64, 1.0)
-# Of the image of heights, around the jar and along its profile.
-COLUMNS, ROWS = 1536, 1536
-# How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
-AROUND, UP = 12, 10
-LOWEST, HIGHEST = 0.10, 0.70
-# Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
-# its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
-BEAD, FADE, SOFT = 0.21, 0.5, 0.1
-GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
-# Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
-LINE, LINE_IMAGE = 0.045, 256
-
 
 def draw_hero(options: FigureOptions) -> list[Path]:
     """Render the scene `human`: the limit surface of a human figure beside its cage."""
@@ -70,6 +53,24 @@ def _draw_row(options: FigureOptions, name: str, cases: Mapping[str, Mapping[str
     rendered = render_panels(options, axes, scenes)
     metadata: dict[str, Any] = {key: [case[key] for case in cases.values()] for key in next(iter(cases.values()))}
     return write_figure(options, name, figure, rendered, **metadata)
+
+
+# Of the jar: how far triangles may be from the surface, in pixels, and in the slice where they are drawn.
+PIXEL_ERROR, PIXEL_ERROR_OF_LINES = 0.08, 1.5
+SCALE = 0.115
+# Where slices end, as parts of the width.
+ENDS = (0.0, 0.35, 0.64, 1.0)
+# Of the image of heights, around the jar and along its profile.
+COLUMNS, ROWS = 1536, 1536
+# How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
+AROUND, UP = 12, 10
+LOWEST, HIGHEST = 0.10, 0.70
+# Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
+# its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
+BEAD, FADE, SOFT = 0.21, 0.5, 0.1
+GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
+# Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
+LINE, LINE_IMAGE = 0.045, 256
 
 
 def draw_displacement(options: FigureOptions) -> list[Path]:

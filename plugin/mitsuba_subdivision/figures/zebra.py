@@ -20,7 +20,6 @@ from ..regression.scene import render_pixels
 from ..regression.tiers import normal_angle
 from ..surface import LimitSurface
 from .output import FigureOptions, hide_frame, panels, show, write_figure
-from .own_cage import around_vertices, frame
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .staging import (
     camera_matrix,
@@ -34,6 +33,7 @@ from .staging import (
     split_quads,
     staged,
 )
+from .user_cage import around_vertices, frame
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3

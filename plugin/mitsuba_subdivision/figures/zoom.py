@@ -6,9 +6,8 @@ is found.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +18,6 @@ from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ig
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import Evaluator
 from ..regression.tiers import normal_angle
@@ -29,9 +27,9 @@ from ..surface import LimitSurface
 from .characteristic import patch_of_valence
 from .normal_error import EQUATIONS, offset_cage
 from .output import FigureError, FigureOptions, label_powers, panels, scientific, write_figure
-from .own_cage import frame
 from .peers import osd_peer, osd_samples
 from .staging import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, project, render, staged
+from .user_cage import frame
 
 VALENCE = 5
 OFFSET = 10
@@ -55,30 +53,10 @@ LINE_POINTS = 33
 CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
 
 
-@dataclass(frozen=True, eq=False)
-class TangentView:
-    """The surface around the extraordinary point, seen along its normal."""
-
-    surface: LimitSurface  # Vertex 0 of its cage is extraordinary, and elements 0 to ``valence - 1`` lie around it
-    point: NDArray[np.float64]  # (3,): the limit point
-    frame: NDArray[np.float64]  # (3, 3): columns: two directions in the tangent plane, and the normal
-
-    @classmethod
-    def of(cls, cage: ControlCage) -> TangentView:
-        surface = LimitSurface(cage)
-        return cls(surface, *frame(surface)[:2])
-
-    def on_stage(self, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
-        """Points on the stage, where the image reaches from -1 to 1."""
-        return (points - self.point) @ self.frame * (magnification / HALF_WIDTH)
-
-
-class Samples(NamedTuple):
-    """Samples in every element at the point, with the positions and normals of exact arithmetic on the stage."""
-
-    uv: NDArray[np.float64]  # (s, 2): parameters, the same in each element
-    positions: NDArray[np.float64]  # (valence, s, 3), as the normals
-    normals: NDArray[np.float64]
+def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
+    """Points on the stage, seen along the normal of vertex 0, where the image reaches from -1 to 1."""
+    point, axes, _ = frame(surface)
+    return (points - point) @ axes * (magnification / HALF_WIDTH)
 
 
 def draw(options: FigureOptions) -> list[Path]:
@@ -91,7 +69,7 @@ def draw(options: FigureOptions) -> list[Path]:
     from float64: this far from the origin, float32 cannot tell the points of the last panels apart. OpenSubdiv's
     normals come from its patch tables (Far), where its program is found.
     """
-    view = TangentView.of(offset_cage(extraordinary(VALENCE), OFFSET))
+    surface = LimitSurface(offset_cage(extraordinary(VALENCE), OFFSET))
     stage, resolution = load_stage("zoom", resolution=options.resolution), options.resolution
     sensor, count = stage.sensors()[0], max(resolution // 2, 8)
     triangles = grid_triangles(count, VALENCE)
@@ -99,15 +77,15 @@ def draw(options: FigureOptions) -> list[Path]:
     figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
     rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
-        samples = sample(view, magnification, count)
+        uv, positions, exact = sample(surface, magnification, count)
         # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
-        positions = samples.positions.reshape(-1, 3)
+        points = positions.reshape(-1, 3)
         centres = grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
-        nearest = np.asarray(cKDTree(project(sensor, positions, resolution)).query(centres)[1])
-        lines = project(sensor, _level_lines(view, magnification), resolution)
+        nearest = np.asarray(cKDTree(project(sensor, points, resolution)).query(centres)[1])
+        lines = project(sensor, _level_lines(surface, magnification), resolution)
         for evaluator, axis in zip(rows, column, strict=True):
-            normals, errors, median = normals_by(view, samples, evaluator)
-            mesh = make_mesh(positions, triangles, CLAY, normals=(normals @ view.frame).reshape(-1, 3))
+            normals, errors, median = normals_by(surface, uv, positions, exact, evaluator)
+            mesh = make_mesh(points, triangles, CLAY, normals=(normals @ frame(surface)[1]).reshape(-1, 3))
             name = f"{LABELS[evaluator]}, x {magnification}".replace("\n", ", ")
             options.report(f"{name}: median normal error {median:.1e} degrees")
             rendered.append(render(staged(stage, mesh=mesh), options, name))
@@ -137,40 +115,50 @@ def parameter_extent(magnification: float) -> float:
     return float(magnification ** (1 / np.log2(patch.basis.subdominant)))
 
 
-def sample(view: TangentView, magnification: float, count: int) -> Samples:
-    """Sample a grid of ``count`` segments along each side in every element at the point, as far as a panel shows."""
+def sample(surface: LimitSurface, magnification: float, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sample a grid of ``count`` segments along each side in every element at the point, as far as a panel shows.
+
+    Returns parameters ``(s, 2)``, the same in each element; and positions on the stage and normals of exact arithmetic,
+    ``(valence, s, 3)`` each.
+    """
     uv = grid_points(np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
     uv[0] = 0.1 / count
     uv *= parameter_extent(magnification)
-    exact = [view.surface.evaluate(element, uv) for element in range(VALENCE)]
-    positions = np.stack([view.on_stage(samples.p, magnification) for samples in exact])
-    return Samples(uv, positions, np.stack([samples.n for samples in exact]))
+    exact = surface.evaluate(np.arange(VALENCE)[:, None], uv)
+    shape = VALENCE, len(uv), 3
+    return uv, on_stage(surface, exact.p, magnification).reshape(shape), exact.n.reshape(shape)
 
 
-def normals_by(view: TangentView, samples: Samples, evaluator: Method) -> tuple[FloatArray, FloatArray, float]:
+def normals_by(
+    surface: LimitSurface,
+    # As `sample` returns them
+    uv: FloatArray,
+    positions: FloatArray,
+    exact: FloatArray,
+    evaluator: Method,
+) -> tuple[FloatArray, FloatArray, float]:
     """Normals by one of our evaluators or by OpenSubdiv, both in float32, ``(valence, s, 3)``.
 
     Returns besides their angles to the exact normals in degrees ``(valence, s)``, and the median of those inside the
     image.
     """
-    normals = np.nan_to_num(np.stack([_normals(view.surface, i, samples.uv, evaluator) for i in range(VALENCE)]))
-    # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
-    angle = np.where(normals.any(axis=-1), normal_angle(normals, samples.normals), 180)
-    inside = np.abs(samples.positions[..., :2]).max(axis=-1) < 1
-    return normals, angle, float(np.median(angle[inside]))
-
-
-def _normals(surface: LimitSurface, element: int, uv: FloatArray, evaluator: Method) -> FloatArray:
+    elements = np.arange(VALENCE)[:, None]
     if evaluator == OPENSUBDIV:
         program = osd_peer()
         if program is None:
             raise FigureError("the program osd_peer is gone; expected it where it was found before")
-        return osd_samples(program, surface.cage, element, uv, "far", OPENSUBDIV_LEVEL)[1]
-    return surface.evaluate(element, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
+        normals = osd_samples(program, surface.cage, elements, uv, "far", OPENSUBDIV_LEVEL)[1]
+    else:
+        normals = surface.evaluate(elements, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
+    normals = np.nan_to_num(normals).reshape(exact.shape)
+    # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
+    angle = np.where(normals.any(axis=-1), normal_angle(normals, exact), 180)
+    inside = np.abs(positions[..., :2]).max(axis=-1) < 1
+    return normals, angle, float(np.median(angle[inside]))
 
 
-def _level_lines(view: TangentView, magnification: float) -> NDArray[np.float64]:
+def _level_lines(surface: LimitSurface, magnification: float) -> NDArray[np.float64]:
     """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
     along = np.linspace(0, 1, LINE_POINTS)
     line = np.stack([np.ones_like(along), along], axis=1)
@@ -181,9 +169,8 @@ def _level_lines(view: TangentView, magnification: float) -> NDArray[np.float64]
     for level in range(max(first, 0), first + 7):
         curves += [line * 2.0**-level, line[:, ::-1] * 2.0**-level]
     curves.append(np.stack([along, np.zeros_like(along)], axis=1) * extent)
-    uv = np.concatenate(curves)
-    lines = [view.on_stage(view.surface.evaluate(element, uv).p, magnification) for element in range(VALENCE)]
-    return np.concatenate(lines).reshape(-1, LINE_POINTS, 3)
+    points = surface.evaluate(np.arange(VALENCE)[:, None], np.concatenate(curves)).p
+    return on_stage(surface, points, magnification).reshape(-1, LINE_POINTS, 3)
 
 
 def _draw_halves(axis: Axes, pixels: NDArray[np.float32], errors: FloatArray, lines: FloatArray) -> None:
