@@ -37,30 +37,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
             except USER_ERRORS as error:
                 print_error(error)
                 return options.error_status
-        except KeyboardInterrupt as stop:
-            return _interrupted(stop)
+        except KeyboardInterrupt:
+            print_remark("interrupted")
+            return INTERRUPTED
 
 
-def _interrupted(stop: KeyboardInterrupt) -> int:
-    is_abandoned = isinstance(stop, Abandoned)
-    if is_abandoned:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        remove_unfinished()
+def _abandon() -> None:
+    """End the process: work that Ctrl-C interrupts goes on in its thread, which nothing else stops."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    remove_unfinished()
     print_remark("interrupted")
-    if is_abandoned:
-        os._exit(INTERRUPTED)
-    return INTERRUPTED
-
-
-class Abandoned(KeyboardInterrupt):
-    """Ctrl-C was pressed, and the work continues in a thread, which only the end of the process stops."""
+    os._exit(INTERRUPTED)
 
 
 def interruptible(work: Callable[[], T]) -> T:
-    """Run a function in another thread, so that this one can be interrupted.
+    """Run a function in another thread; if Ctrl-C is pressed before it is done, end the process.
 
     Python notices Ctrl-C only between two of its instructions, and a single one can be a render of hours.
-    Raises Abandoned if Ctrl-C is pressed before the work is done.
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
@@ -83,7 +76,7 @@ def interruptible(work: Callable[[], T]) -> T:
             if handler is not None:
                 signal.signal(signal.SIGINT, handler)
     except KeyboardInterrupt:
-        raise Abandoned from None
+        _abandon()
     if "error" in outcome:
         try:
             raise outcome["error"]

@@ -77,6 +77,19 @@ def set_variant(name: str | None) -> None:
 
 
 @contextmanager
+def threads_set(count: int | None) -> Iterator[None]:
+    """Compute with so many threads for a while. With one, nothing may be read or written; see `set_variant`."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    dr.set_thread_count(count or before)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
+
+
+@contextmanager
 def variant_set(mi: ModuleType | str) -> Iterator[ModuleType]:
     """The module ``mitsuba`` with a variant set, for a while; arguments and errors as of `variant_module`.
 

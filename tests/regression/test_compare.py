@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.regression import ImageError
+from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.compare import compare, relmse
 from mitsuba_subdivision.regression.image import Image
 from mitsuba_subdivision.regression.tiers import Status, Tolerances, compare_flip, flip_exposures, normal_angle
@@ -355,7 +355,7 @@ UNUSABLE = {
 
 @pytest.mark.parametrize(("message", "run"), UNUSABLE.items(), ids=UNUSABLE)
 def test_what_cannot_be_compared_is_said(reference, message, run):
-    with pytest.raises(ImageError, match=message):
+    with pytest.raises(RegressionError, match=message):
         run(reference)
 
 
@@ -369,7 +369,7 @@ def test_flip_tells_changes_of_plain_images_apart_and_refuses_what_it_does_not_s
     assert flip(truth(), LIMITS.with_values({"flip_mean": 0, "flip_p95": 0})).status is Status.PASS
     broken = truth()
     broken[0, 0] = np.nan
-    with pytest.raises(ImageError, match="not finite"):
+    with pytest.raises(RegressionError, match="not finite"):
         flip(broken)
     # Without samples and geometry, there is no other tier.
     assert statuses(compare(Image("a", truth()), Image("b", truth())))["flip"] == "pass"

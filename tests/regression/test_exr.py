@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from mitsuba_subdivision.regression import ImageError
+from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.image import (
     METADATA_ATTRIBUTE,
     load_image,
@@ -50,7 +50,7 @@ def test_any_file_with_r_g_b_is_an_image_and_standard_error_is_where_it_was_afte
     assert np.array_equal(result.pixels, PIXELS)
     assert result.estimate is result.probe is result.paired is None
     (tmp_path / "broken.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-20])
-    with pytest.raises(ImageError, match=r"broken\.exr"):
+    with pytest.raises(RegressionError, match=r"broken\.exr"):
         read_channels(tmp_path / "broken.exr")
     assert (os.fstat(2).st_dev, os.fstat(2).st_ino) == (before.st_dev, before.st_ino)
 
@@ -96,6 +96,6 @@ UNUSABLE = {
 def test_what_is_wrong_is_said_with_the_file(tmp_path, message, write):
     path = tmp_path / "broken.exr"
     write(path)
-    with pytest.raises(ImageError, match=message) as error:
+    with pytest.raises(RegressionError, match=message) as error:
         load_image(path)
     assert "broken.exr" in str(error.value)

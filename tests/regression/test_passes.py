@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.regression import ImageError, RegressionError
+from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.image import Estimate, combine, load_image, save_image
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
@@ -155,7 +155,7 @@ def test_variance_is_that_of_a_sample_and_one_batch_tells_none(np_rng):
 
 
 def test_nothing_and_other_sizes_are_refused(np_rng):
-    with pytest.raises(ImageError, match="nothing to combine"):
+    with pytest.raises(RegressionError, match="nothing to combine"):
         combine([])
-    with pytest.raises(ImageError, match="5 x 4 and 2 x 2"):
+    with pytest.raises(RegressionError, match="5 x 4 and 2 x 2"):
         combine([*batches(np_rng, 1), Estimate.of_batch(np.zeros((2, 2, 3)), 1)])

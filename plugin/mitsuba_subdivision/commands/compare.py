@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 from ..messages import PROGRAM, print_remark, print_result
-from ..regression import ImageError
+from ..regression import RegressionError
 from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..variants import variant_set
 from ..whole_file import require_folder, require_writable, write_text
@@ -73,10 +73,10 @@ def _compare(options: argparse.Namespace) -> int:
     renders = options.test.suffix.lower() == ".xml"
     given = "--spp" if options.spp else "--seed" if options.seed is not None else None
     if given and not renders:
-        raise ImageError(f'{given} is for a scene; "{options.test}" is rendered already')
+        raise RegressionError(f'{given} is for a scene; "{options.test}" is rendered already')
     if not options.reference.is_file():
         making = f"{PROGRAM} render SCENE -o {shlex.quote(str(options.reference))} --reference"
-        raise ImageError(f'there is no reference "{options.reference}"; make it with: {making}')
+        raise RegressionError(f'there is no reference "{options.reference}"; make it with: {making}')
     reference = load_image(options.reference)
     stored = Tolerances().with_values(reference.metadata.get("tolerances", {}))
     tolerances = stored.with_values(dict(options.tolerances))
@@ -113,7 +113,7 @@ def _merge(options: argparse.Namespace) -> None:
     from ..regression.passes import merge_passes, missing_passes
 
     if options.output.suffix.lower() != ".exr":
-        raise ImageError(f'output "{options.output}"; expected a name ending in .exr')
+        raise RegressionError(f'output "{options.output}"; expected a name ending in .exr')
     passes = [load_image(path) for path in options.passes]
     for image in passes:
         require_finite(image)

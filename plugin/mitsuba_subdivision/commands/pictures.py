@@ -6,14 +6,12 @@ import argparse
 import pickle
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
 from typing import Any
 from uuid import uuid4
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +25,7 @@ from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, shading_for
 from ..studio.saving import save_scene
 from ..studio.studio_entries import DEFAULT_VIEW, VIEWS, Look, sampler, variant_in_use
+from ..variants import threads_set
 from ..whole_file import require_writable
 
 # Options that select one mesh of a USD file.
@@ -41,7 +40,7 @@ def render_picture(
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
         seed = (options.seed * count + part) % 2**32
-        with _threads(options.threads):
+        with threads_set(options.threads):
             image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
                 # Each by itself, as its albedo and normals are those of its time.
@@ -86,7 +85,7 @@ def render_by_passes(options: argparse.Namespace, *, is_model: bool = False) -> 
         batch = sampler(batch)["sample_count"]
     sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
     settings = {"with_probe": options.reference}
-    with _threads(options.threads):
+    with threads_set(options.threads):
         if options.dask:
             variant = str(mi.variant())
             image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
@@ -98,17 +97,6 @@ def render_by_passes(options: argparse.Namespace, *, is_model: bool = False) -> 
         image = as_reference(image, options.scene, options.output, sampling, tolerances)
     save_image(options.output, image)
     print_result(options.output)
-
-
-@contextmanager
-def _threads(count: int | None) -> Iterator[None]:
-    """Render with so many threads. With one, nothing may be read or written meanwhile; see `set_variant`."""
-    before = dr.thread_count()
-    dr.set_thread_count(count or before)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(before)
 
 
 def _as_data(options: argparse.Namespace) -> dict[str, Any]:

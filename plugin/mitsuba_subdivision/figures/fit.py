@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from ..fit.point_fit import mesh_samples
 from ..schemes.domain import FloatArray
 from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
-from ..variants import SceneNode
+from ..variants import SceneNode, threads_set
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_figure
 from .staging import camera_matrix, edge_rods, in_8_bits, load_stage, make_mesh, project, render, staged
 
@@ -101,7 +100,8 @@ def draw(options: FigureOptions) -> list[Path]:
     """Fit the cages and the mesh, and draw the results."""
     if "_ad_" not in str(mi.variant()):
         raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
-    with _in_order():
+    # With several threads, the order of gradient sums, and so every later step, is not reproducible.
+    with threads_set(1):
         shape = _target()
         views = _views_of(make_mesh(shape.positions, shape.triangles, GREY), PIXELS)
         options.report(f"{STEPS} steps with a cage of one size")
@@ -131,17 +131,6 @@ def draw(options: FigureOptions) -> list[Path]:
     titles = [title.replace("\n", ", ") for title, _ in (*of_balls, *of_boxes)]
     rendered = [pixels for _, pixels in (*of_balls, *of_boxes)]
     return write_figure(options, "fit", figure, rendered, pictures=titles)
-
-
-@contextmanager
-def _in_order() -> Iterator[None]:
-    """Compute on one thread: with several, the order of gradient sums, and so every later step, is not reproducible."""
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        yield
-    finally:
-        dr.set_thread_count(threads)
 
 
 def _target() -> ControlCage:

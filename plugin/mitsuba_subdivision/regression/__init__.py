@@ -21,8 +21,4 @@ renders of any origin.
 
 
 class RegressionError(ValueError):
-    """A scene cannot be rendered as requested, or a reference cannot be used."""
-
-
-class ImageError(RegressionError):
-    """An image cannot be read, or two images cannot be compared."""
+    """A scene cannot be rendered as requested, or images cannot be read or compared."""

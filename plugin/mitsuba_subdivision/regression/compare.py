@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import ImageError
+from . import RegressionError
 from .image import Image
 from .tiers import (
     DEFAULT_TIERS,
@@ -132,18 +132,20 @@ def compare(
 
     Raises
     ------
-    ImageError
+    RegressionError
         If an image is denoised, the sizes differ, a tier is unknown, or the images lack what a chosen tier compares.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
-            raise ImageError(f'"{image.name}" is denoised, which removes what is compared; expected one as rendered')
+            raise RegressionError(
+                f'"{image.name}" is denoised, which removes what is compared; expected one as rendered'
+            )
     if reference.size != test.size:
         sizes = [f'"{image.name}" has {image.size[0]} x {image.size[1]} pixels' for image in (reference, test)]
-        raise ImageError(f"{sizes[0]} and {sizes[1]}; expected the same size")
+        raise RegressionError(f"{sizes[0]} and {sizes[1]}; expected the same size")
     unknown = [name for name in tiers or () if name not in TIERS]
     if unknown:
-        raise ImageError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
+        raise RegressionError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
     limits = tolerances or Tolerances().with_values(reference.metadata.get("tolerances", {}))
 
     for image, role in ((test, "test"), (reference, "reference")):
@@ -183,7 +185,7 @@ def _decide(
 ) -> None:
     """Let other tiers decide where one cannot, and where one proves that another's finding is chance.
 
-    Raises ImageError if a tier that was chosen cannot run, and no other stands in for it.
+    Raises RegressionError if a tier that was chosen cannot run, and no other stands in for it.
     """
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):
@@ -198,7 +200,7 @@ def _decide(
     for result in results.values():
         cannot_run = result.status is Status.SKIPPED and not (result is paired and is_replaced)
         if cannot_run and result.name in (chosen or ()):
-            raise ImageError(f'tier "{result.name}" cannot run: {result.lines[0]}')
+            raise RegressionError(f'tier "{result.name}" cannot run: {result.lines[0]}')
     tiles, probe = results.get("tile"), results.get("probe")
     same = paired and paired.numbers.get("changed_pixels") == 0 and probe and probe.status is Status.PASS
     if same and tiles and tiles.status is Status.FAIL:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from ..variants import chosen_variant, variant_set
-from . import ImageError, RegressionError
+from . import RegressionError
 from .compare import Comparison
 from .image import save_image
 from .passes import BATCH, Sampling
@@ -138,7 +138,7 @@ class RenderRegression:
         try:
             page = write_report(folder, comparison, f"{name}: {self.node.nodeid}")
             save_image(folder / "test.exr", comparison.test)
-        except (OSError, ImageError) as error:
+        except (OSError, RegressionError) as error:
             return f"\n  no report: {error}"
         self.reported = True
         return f"\n  report: {page}"

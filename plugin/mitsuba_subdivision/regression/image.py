@@ -17,7 +17,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from ..whole_file import whole_file
-from . import ImageError
+from . import RegressionError
 
 SCHEMA = 1
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
@@ -27,10 +27,9 @@ NOTHING = 2**32 - 1
 Channels = dict[str, NDArray]
 
 _RGB = ("R", "G", "B")
-# Channels of the fields of a probe.
-_FLOATS = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
-_INTEGERS = {"shape": "shape", "triangle": "prim", "element": "element"}
-_PROBE_CHANNELS = (*(name for names in _FLOATS.values() for name in names), *_INTEGERS.values())
+# Channels of the fields of a probe; those of one channel are indices.
+_PROBE = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
+_PROBE |= {"shape": ("shape",), "triangle": ("prim",), "element": ("element",)}
 _MAGIC = b"\x76\x2f\x31\x01"
 _LONGEST = 60
 _quieting = threading.Lock()
@@ -43,20 +42,11 @@ class Estimate:
     A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
     samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
     and a renderer needs to output images only.
-
-    Attributes
-    ----------
-    mean : (height, width, 3) float64
-    variance : (height, width, 3) float64
-        Of one sample. Zero if there is one batch only, from which it cannot be estimated.
-    count : (height, width) int64
-        Samples of each pixel.
-    batches : int
     """
 
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    count: NDArray[np.int64]
+    mean: NDArray[np.float64]  # (height, width, 3)
+    variance: NDArray[np.float64]  # (height, width, 3): of one sample; zero if there is one batch only
+    count: NDArray[np.int64]  # (height, width): samples of each pixel
     batches: int
 
     @classmethod
@@ -76,17 +66,17 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
     """Combine estimates with independent samples into one, in double precision.
 
     The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
-    same order, the same estimates give the same bits. Raises ImageError if there is no estimate, or their sizes differ.
+    same order, the same estimates give the same bits. Raises RegressionError if there is none, or their sizes differ.
     """
     rest = iter(estimates)
     total = next(rest, None)
     if total is None:
-        raise ImageError("there is nothing to combine")
+        raise RegressionError("there is nothing to combine")
     squares = total.variance * max(total.batches - 1, 0)
     for estimate in rest:
         if estimate.mean.shape != total.mean.shape:
             sizes = " and ".join(f"{e.mean.shape[1]} x {e.mean.shape[0]}" for e in (total, estimate))
-            raise ImageError(f"images of {sizes} pixels cannot be combined; expected one size")
+            raise RegressionError(f"images of {sizes} pixels cannot be combined; expected one size")
         count = total.count + estimate.count
         share = (estimate.count / count)[..., None]
         batches = total.batches + estimate.batches
@@ -101,22 +91,14 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """The geometry probe: AOVs of the first hits of the rays through pixel centres, which have no noise.
+    """The geometry probe: AOVs of the first hits of the rays through pixel centres, which have no noise."""
 
-    Attributes
-    ----------
-    position, normal : (height, width, 3) float32
-        In world space; the normal is the shading normal, of unit length. Zero where the ray hits nothing.
-    uv : (height, width, 2) float32
-        Surface parameters by the renderer: for a mesh without texture coordinates, those of the triangle.
-    shape, triangle, element : (height, width) uint32
-        Indices of the shape, of the triangle, and of the face of the cage that the triangle belongs to; `NOTHING` where
-        there is none.
-    """
-
+    # (height, width, 3) each, in world space, and unit shading normals. Zero where the ray hits nothing.
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
+    # (height, width, 2): parameters by the renderer; for a mesh without texture coordinates, those of the triangle
     uv: NDArray[np.float32]
+    # (height, width) each: indices of the shape, of the triangle, and of its face of the cage; `NOTHING` for none
     shape: NDArray[np.uint32]
     triangle: NDArray[np.uint32]
     element: NDArray[np.uint32]
@@ -128,8 +110,8 @@ class Probe:
 
     def channels(self) -> Channels:
         """Channels of an OpenEXR file."""
-        floats = {n: getattr(self, name)[..., i] for name, names in _FLOATS.items() for i, n in enumerate(names)}
-        return floats | {n: getattr(self, name) for name, n in _INTEGERS.items()}
+        fields = {name: np.atleast_3d(getattr(self, name)) for name in _PROBE}
+        return {channel: fields[name][..., i] for name, names in _PROBE.items() for i, channel in enumerate(names)}
 
     def describe(self, y: int, x: int) -> str:
         """Text of the first hit of the ray through a pixel."""
@@ -142,29 +124,15 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A linear RGB image, and the further data of its file.
+    """A linear RGB image, and the further data of its file."""
 
-    Attributes
-    ----------
-    name : str
-        For messages: the path of the file, in most cases.
-    pixels : (height, width, 3) float64
-    estimate : Estimate or None
-        Variance and number of samples; the mean of the estimate is ``pixels``.
-    paired : (height, width, 3) float64 or None
-        The first batch alone. A later render of the same scene repeats its samples one by one.
-    probe : Probe or None
-        What the ray through the centre of each pixel hits.
-    metadata : dict
-        How the image was made.
-    """
-
-    name: str
-    pixels: NDArray[np.float64]
-    estimate: Estimate | None = None
+    name: str  # For messages: the path of the file, in most cases
+    pixels: NDArray[np.float64]  # (height, width, 3)
+    estimate: Estimate | None = None  # Variance and number of samples; its mean is `pixels`
+    # (height, width, 3): the first batch alone, whose samples a later render of the same scene repeats one by one
     paired: NDArray[np.float64] | None = None
     probe: Probe | None = None
-    metadata: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
 
     @property
     def size(self) -> tuple[int, int]:
@@ -194,10 +162,10 @@ class Image:
 
 
 def require_finite(image: Image) -> None:
-    """Raise ImageError if an image has values that are not finite, which merging spreads and no tier can compare."""
+    """Raise RegressionError if an image is not finite: merging would spread that, and no tier can compare it."""
     broken = image.not_finite()
     if broken:
-        raise ImageError(f'image "{image.name}" is not finite: {broken[0]}')
+        raise RegressionError(f'image "{image.name}" is not finite: {broken[0]}')
 
 
 def save_image(path: str | Path, image: Image) -> None:
@@ -210,16 +178,18 @@ def save_image(path: str | Path, image: Image) -> None:
 def load_image(path: str | Path) -> Image:
     """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
 
-    Raises ImageError if the file cannot be read, channels are missing, or the number of samples or the variance is
+    Raises RegressionError if the file cannot be read, channels are missing, or the number of samples or the variance is
     impossible.
     """
     channels, metadata = read_channels(path)
     source = str(path)
     pixels = _rgb(channels, "", source)
     if pixels is None:
-        raise ImageError(f'image "{source}" has no channels R, G, B; found {", ".join(sorted(channels)) or "none"}')
+        raise RegressionError(
+            f'image "{source}" has no channels R, G, B; found {", ".join(sorted(channels)) or "none"}'
+        )
     if metadata.get("schema", SCHEMA) != SCHEMA:
-        raise ImageError(
+        raise RegressionError(
             f'image "{source}" has metadata of schema {metadata["schema"]}; this version reads schema {SCHEMA}'
         )
     _require_metadata(metadata, source)
@@ -234,14 +204,16 @@ def _estimate(
     if variance is None:
         return None
     if "N" not in channels:
-        raise ImageError(f'image "{source}" has a variance but no channel N; expected the samples of each pixel')
+        raise RegressionError(f'image "{source}" has a variance but no channel N; expected the samples of each pixel')
     if channels["N"].dtype.kind not in "ui":
-        raise ImageError(f'channel N of image "{source}" has numbers of type {channels["N"].dtype}; expected integers')
+        raise RegressionError(
+            f'channel N of image "{source}" has numbers of type {channels["N"].dtype}; expected integers'
+        )
     count = channels["N"].astype(np.int64)
     if count.min() < 1:
-        raise ImageError(f'image "{source}" has pixels without samples (channel N is 0); expected at least 1 each')
+        raise RegressionError(f'image "{source}" has pixels without samples (channel N is 0); expected at least 1 each')
     if (variance < 0).any():
-        raise ImageError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
+        raise RegressionError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
     ranges = metadata.get("sampling", {}).get("batches")
     # A file of another program records no batches: each sample then counts as a batch.
     batches = sum(end - start for start, end in ranges) if ranges else int(count.max())
@@ -249,14 +221,15 @@ def _estimate(
 
 
 def _probe(channels: Channels, source: str) -> Probe | None:
-    missing = [name for name in _PROBE_CHANNELS if name not in channels]
-    if len(missing) == len(_PROBE_CHANNELS):
+    expected = [channel for names in _PROBE.values() for channel in names]
+    missing = [channel for channel in expected if channel not in channels]
+    if missing == expected:
         return None
     if missing:
-        expected = f"without {', '.join(missing)}; expected {', '.join(_PROBE_CHANNELS)}"
-        raise ImageError(f'image "{source}" has a geometry probe {expected}')
-    floats: dict[str, Any] = {name: np.stack([channels[n] for n in ns], axis=-1) for name, ns in _FLOATS.items()}
-    return Probe(**floats, **{name: channels[n] for name, n in _INTEGERS.items()})
+        lacking = f"without {', '.join(missing)}; expected {', '.join(expected)}"
+        raise RegressionError(f'image "{source}" has a geometry probe {lacking}')
+    fields = {name: np.stack([channels[channel] for channel in names], axis=-1) for name, names in _PROBE.items()}
+    return Probe(**{name: values[..., 0] if values.shape[2] == 1 else values for name, values in fields.items()})
 
 
 def _rgb_channels(prefix: str, values: NDArray[np.floating]) -> Channels:
@@ -269,7 +242,7 @@ def _rgb(channels: Channels, prefix: str, source: str) -> NDArray[np.float64] | 
     if len(missing) == len(names):
         return None
     if missing:
-        raise ImageError(f'image "{source}" has no channel {", ".join(missing)}; expected {", ".join(names)}')
+        raise RegressionError(f'image "{source}" has no channel {", ".join(missing)}; expected {", ".join(names)}')
     return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
 
 
@@ -307,7 +280,7 @@ def _require_metadata(metadata: dict[str, Any], source: str) -> None:
         if name in metadata and not is_right(metadata[name]):
             text = str(metadata[name])
             shown = text[:_LONGEST] + ".." * (len(text) > _LONGEST)
-            raise ImageError(f'metadata of image "{source}": {name} is {shown}; expected {expected}')
+            raise RegressionError(f'metadata of image "{source}": {name} is {shown}; expected {expected}')
 
 
 def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
@@ -321,12 +294,8 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
     The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
     several, without a warning.
 
-    Parameters
-    ----------
-    channels : dict of (height, width)
-        Integers become 32 bits unsigned, all else float32. A dot in a name makes a layer: ``variance.R``.
-    metadata : dict, optional
-        Kept in the file as JSON, in the string attribute `METADATA_ATTRIBUTE`.
+    Integers become 32 bits unsigned, all else float32; a dot in a name makes a layer: ``variance.R``. Metadata are kept
+    as JSON, in the string attribute `METADATA_ATTRIBUTE`.
     """
     converted = {
         name: np.ascontiguousarray(values, dtype=np.uint32 if values.dtype.kind in "iu" else np.float32)
@@ -343,12 +312,12 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
-    Raises ImageError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts, deep
-    pixels or broken metadata.
+    Raises RegressionError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts,
+    deep pixels or broken metadata.
     """
     path = Path(path)
     if not path.is_file():
-        raise ImageError(f'image "{path}" is not a file; expected an OpenEXR file')
+        raise RegressionError(f'image "{path}" is not a file; expected an OpenEXR file')
     try:
         with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = len(file.parts)
@@ -360,17 +329,19 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     if not parts:
         with path.open("rb") as start:
             is_exr = start.read(len(_MAGIC)) == _MAGIC
-        raise ImageError(f'image "{path}" {"is truncated, or damaged" if is_exr else "is not an OpenEXR file"}')
+        raise RegressionError(f'image "{path}" {"is truncated, or damaged" if is_exr else "is not an OpenEXR file"}')
     if parts > 1:
-        raise ImageError(f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part')
+        raise RegressionError(
+            f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part'
+        )
     if any(values.dtype == object or values.ndim != 2 for values in channels.values()):
-        raise ImageError(f'image "{path}" has deep or subsampled channels; expected one value per pixel')
+        raise RegressionError(f'image "{path}" has deep or subsampled channels; expected one value per pixel')
     try:
         metadata = json.loads(header.get(METADATA_ATTRIBUTE, "{}"))
     except ValueError as error:
-        raise ImageError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is not JSON: {error}') from None
+        raise RegressionError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is not JSON: {error}') from None
     if not isinstance(metadata, dict):
-        raise ImageError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is no JSON object')
+        raise RegressionError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is no JSON object')
     return channels, metadata
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..llvm import best_variant
 from ..messages import PROGRAM
 from ..variants import variant_problem
-from . import ImageError, RegressionError
+from . import RegressionError
 from .compare import Comparison, compare
 from .image import Image, load_image, require_finite
 from .passes import Sampling, probe_scene, render_pass
@@ -53,7 +53,7 @@ def as_reference(
 ) -> Image:
     """Make a reference of an image: its metadata get tolerances, and the command that makes it.
 
-    Raises ImageError if the image is not finite.
+    Raises RegressionError if the image is not finite.
     """
     require_finite(image)
     limits, made_by = tolerances.as_dict(), image.metadata
@@ -79,7 +79,7 @@ def load_reference(path: Path) -> Image:
         raise UnusableReference(f'there is no reference "{path}"')
     try:
         reference = load_image(path)
-    except ImageError as error:
+    except RegressionError as error:
         raise UnusableReference(str(error)) from None
     sampling_of(reference)
     return reference

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..srgb import encoded
 from ..whole_file import write_text
-from . import ImageError
+from . import RegressionError
 from .compare import Comparison
 from .image import write_channels
 from .tiers import compare_flip, relative_difference
@@ -50,7 +50,7 @@ def write_report(folder: str | Path, comparison: Comparison, title: str | None =
     """Write the report of a comparison: ``index.html``, which needs no other file, ``comparison.json``, ``maps.exr``.
 
     The title is by default the reference's name. Returns the path of the page.
-    Raises ImageError if matplotlib is not installed.
+    Raises RegressionError if matplotlib is not installed.
     """
     folder = Path(folder)
     title = title or comparison.reference.name
@@ -92,7 +92,7 @@ def _panels(comparison: Comparison) -> bytes:
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ImageError("reports need matplotlib: pip install 'mitsuba-subdivision[figures]'") from None
+        raise RegressionError("reports need matplotlib: pip install 'mitsuba-subdivision[figures]'") from None
     a, b = comparison.reference.pixels, comparison.test.pixels
     finite = bool(np.isfinite(a).all() and np.isfinite(b).all())
     maps = {"relative": relative_difference(a, b), **_maps(comparison)} if finite else {}
@@ -123,7 +123,7 @@ def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
     """The maps of all tiers, with that of FLIP for inspection where its tier did not run but can."""
     maps = comparison.maps
     if "flip" not in maps:
-        with suppress(ImageError):
+        with suppress(RegressionError):
             maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
     return maps
 

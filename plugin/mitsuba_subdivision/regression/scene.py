@@ -7,7 +7,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Union
 
@@ -63,6 +63,7 @@ class LoadedScene:
         return int(width), int(height)
 
 
+@timed("Loading shapes and their hierarchy")
 def load_scene(
     source: SceneSource,
     # Values for parameters of the file, which it declares by `<default name=".."/>`
@@ -76,41 +77,42 @@ def load_scene(
     Raises RegressionError if there is no such file or sensor, or the filter of a scene that is already loaded is
     another.
     """
-    with timed("Loading shapes and their hierarchy"):
-        loaded = _loaded_scene(source, parameters, filter_name)
-    count = len(loaded.scene.sensors())
-    if not 0 <= sensor_index < count:
-        sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
-        raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
-    return replace(loaded, sensor_index=sensor_index)
-
-
-def _loaded_scene(source: SceneSource, parameters: Mapping[str, Any] | None, filter_name: str | None) -> LoadedScene:
     given = {name: str(value) for name, value in (parameters or {}).items()}
     if given and isinstance(source, (Mapping, mi.Scene)):
         what = "is a dictionary" if isinstance(source, Mapping) else "is loaded already"
         raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene {what}")
-    if isinstance(source, mi.Scene):
-        filter_of_scene = _filter_name(source)
-        if filter_name and filter_of_scene != filter_name:
-            raise RegressionError(
-                f'the loaded scene has the reconstruction filter "{filter_of_scene}"; expected "{filter_name}", which '
-                "a scene given as a file or a dictionary gets"
-            )
-        return LoadedScene(source, None, filter_of_scene)
-    path = None if isinstance(source, Mapping) else Path(source)
+    path = None if isinstance(source, (Mapping, mi.Scene)) else Path(source)
     if path and not path.is_file():
         raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
+    scene, files = (source, {}) if isinstance(source, mi.Scene) else _parsed_scene(path or source, given, filter_name)
+    if not isinstance(scene, mi.Scene) or not scene.sensors():
+        raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
+    filter_of_scene, count = _filter_name(scene), len(scene.sensors())
+    if isinstance(source, mi.Scene) and filter_name not in (None, filter_of_scene):
+        raise RegressionError(
+            f'the loaded scene has the reconstruction filter "{filter_of_scene}"; expected "{filter_name}", which '
+            "a scene given as a file or a dictionary gets"
+        )
+    if not 0 <= sensor_index < count:
+        sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
+        raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
+    return LoadedScene(scene, path, filter_of_scene, files, given, sensor_index)
+
+
+def _parsed_scene(
+    source: Path | Mapping[str, Any], parameters: dict[str, str], filter_name: str | None
+) -> tuple[Any, dict[str, str]]:
+    """A scene of a file or a dictionary, or what that holds instead; and checksums of the files that it names."""
     config = mi.parser.ParserConfig(str(mi.variant()))
     with kept_search_folders() as resolver:
         if isinstance(source, Mapping):
             state = mi.parser.parse_dict(config, dict(source))
         else:
             # As in `mi.load_file`, names in the scene are looked up in the scene's folder first.
-            resolver.prepend(str(Path(source).resolve().parent))
-            state = mi.parser.parse_file(config, str(path), **given)
+            resolver.prepend(str(source.resolve().parent))
+            state = mi.parser.parse_file(config, str(source), **parameters)
         try:
-            files = _checksums(path, state) if path else {}
+            files = _checksums(source, state) if isinstance(source, Path) else {}
             if filter_name:
                 _replace_filter(state, filter_name)
             # Where meshes are merged, the order of the area lights depends on addresses in memory, and with the order
@@ -120,15 +122,12 @@ def _loaded_scene(source: SceneSource, parameters: Mapping[str, Any] | None, fil
             # be compiled again in some processes.
             config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
             mi.parser.transform_all(config, state)
-            scene = mi.parser.instantiate(config, state)
+            made = mi.parser.instantiate(config, state)
         finally:
             # While a half-made scene is alive, in the traceback of an error, rendering another scene crashes.
             del state
-    if isinstance(scene, (list, tuple)):
-        (scene,) = scene
-    if not isinstance(scene, mi.Scene) or not scene.sensors():
-        raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
-    return LoadedScene(scene, path, _filter_name(scene), files, given)
+    # A single object comes in a list.
+    return (made[0] if isinstance(made, (list, tuple)) and len(made) == 1 else made), files
 
 
 def _file_resolver() -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import ImageError
+from . import RegressionError
 from .image import Estimate, Image
 
 __all__ = ["DEFAULT_TIERS", "TIERS", "Status", "TierResult", "Tolerances"]
@@ -83,55 +83,34 @@ class Tolerances:
     Those of the probe are at least four times as large as the differences between variants of Mitsuba (scalar against
     LLVM: 6e-5 degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and small enough to notice one weight
     of a refinement rule that is wrong by a thousandth (0.009 degrees, 1.2e-5 diagonals).
-
-    Attributes
-    ----------
-    mask_fraction : float
-        Part of the pixels whose ray may hit another shape or element, or hit where the other image has nothing.
-    angle_p999, angle_max : float
-        Degrees between shading normals: 99.9th percentile and maximum, away from silhouettes.
-    position : float
-        Distance of hit points, in diagonals of the bounding box of all hit points.
-    uv_p999 : float
-        Difference of the surface parameters where the same triangle is hit, 99.9th percentile.
-    paired_relative : float
-        Relative difference of pixels with the same samples; 0 demands equal bits.
-    alpha : float
-        Probability that any scene of a suite without changes fails the tile tier.
-    floor_relative, floor_absolute : float
-        What sums in single precision may add to the standard error of a tile: relative to its mean, and in radiance.
-    flip_mean, flip_p95 : float
-        Mean and 95th percentile of FLIP.
     """
 
+    # Part of the pixels whose ray may hit another shape or element, or hit where the other image has nothing
     mask_fraction: float = 1e-3
+    # Degrees between shading normals away from silhouettes: 99.9th percentile and maximum
     angle_p999: float = 0.002
     angle_max: float = 0.01
-    position: float = 5e-6
-    uv_p999: float = 1e-3
-    paired_relative: float = 1e-5
-    alpha: float = 0.01
+    position: float = 5e-6  # Distance of hit points, in diagonals of the bounding box of all hit points
+    uv_p999: float = 1e-3  # Difference of parameters where the same triangle is hit, 99.9th percentile
+    paired_relative: float = 1e-5  # Relative difference of pixels with the same samples; 0 demands equal bits
+    alpha: float = 0.01  # Probability that any scene of a suite without changes fails the tile tier
+    # What sums in single precision may add to the standard error of a tile: relative to its mean, and in radiance
     floor_relative: float = 2e-4
     floor_absolute: float = 1e-6
+    # Mean and 95th percentile of FLIP
     flip_mean: float = 0.005
     flip_p95: float = 0.02
 
     def with_values(self, values: Mapping[str, Any]) -> Tolerances:
-        """Tolerances with some values replaced.
-
-        Raises
-        ------
-        ImageError
-            If a name is unknown, or a value is not a finite number of at least 0.
-        """
+        """Replace some. Raises RegressionError if a name is unknown, or a value no finite number of at least 0."""
         known = [field.name for field in fields(self)]
         for name, value in values.items():
             if name not in known:
-                raise ImageError(f'unknown tolerance "{name}"; expected one of {", ".join(known)}')
+                raise RegressionError(f'unknown tolerance "{name}"; expected one of {", ".join(known)}')
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value < math.inf:
-                raise ImageError(f'tolerance "{name}" is {value!r}; expected a number of at least 0')
+                raise RegressionError(f'tolerance "{name}" is {value!r}; expected a number of at least 0')
         if not 0 < values.get("alpha", self.alpha) < 1:
-            raise ImageError(f'tolerance "alpha" is {values["alpha"]}; expected a probability between 0 and 1')
+            raise RegressionError(f'tolerance "alpha" is {values["alpha"]}; expected a probability between 0 and 1')
         return replace(self, **{name: float(value) for name, value in values.items()})
 
     def as_dict(self) -> dict[str, float]:
@@ -435,14 +414,14 @@ def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
 def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
     """Compare two converged images as an eye does that flips between them.
 
-    Raises ImageError if FLIP is not installed, or pixels are not finite, to which it gives good scores.
+    Raises RegressionError if FLIP is not installed, or pixels are not finite, to which it gives good scores.
     """
     try:
         import flip_evaluator
     except ImportError:
-        raise ImageError("FLIP is not installed: pip install 'mitsuba-subdivision[figures]'") from None
+        raise RegressionError("FLIP is not installed: pip install 'mitsuba-subdivision[figures]'") from None
     if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
-        raise ImageError("FLIP does not see pixels that are not finite; expected finite images")
+        raise RegressionError("FLIP does not see pixels that are not finite; expected finite images")
     start, stop, count = flip_exposures(reference.pixels)
     # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
     arrays = [np.ascontiguousarray(np.maximum(image.pixels, 0), dtype=np.float32) for image in (reference, test)]
