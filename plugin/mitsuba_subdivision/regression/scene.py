@@ -78,13 +78,14 @@ def load_scene(
     another.
     """
     given = {name: str(value) for name, value in (parameters or {}).items()}
-    if given and isinstance(source, (Mapping, mi.Scene)):
+    source = Path(source) if isinstance(source, str) else source
+    path = source if isinstance(source, Path) else None
+    if given and not path:
         what = "is a dictionary" if isinstance(source, Mapping) else "is loaded already"
         raise RegressionError(f"scene parameters {', '.join(given)} are for scene files; the scene {what}")
-    path = None if isinstance(source, (Mapping, mi.Scene)) else Path(source)
     if path and not path.is_file():
         raise RegressionError(f'scene "{path}" is not a file; expected a Mitsuba scene, an XML file')
-    scene, files = (source, {}) if isinstance(source, mi.Scene) else _parsed_scene(path or source, given, filter_name)
+    scene, files = (source, {}) if isinstance(source, mi.Scene) else _parsed_scene(source, given, filter_name)
     if not isinstance(scene, mi.Scene) or not scene.sensors():
         raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
     filter_of_scene, count = _filter_name(scene), len(scene.sensors())
