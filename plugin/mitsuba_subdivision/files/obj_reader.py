@@ -25,17 +25,11 @@ _CORNER = rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?"
 
 
 def read_obj(path: str | Path) -> CageContents:
-    """Read vertices, faces, texture coordinates and tags of a Wavefront OBJ file.
+    """Read vertices, faces, texture coordinates, materials and OpenSubdiv's tags of a Wavefront OBJ file.
 
-    - ``v`` statements give positions. Further columns, such as a weight or a colour, must be numbers and are dropped.
-    - ``vt`` statements give texture coordinates u and v; v is 0 if it is missing. Further columns must be numbers and
-      are dropped.
-    - ``f`` statements give faces of any size, with face corners in the forms ``v``, ``v/vt``, ``v//vn`` and
-      ``v/vt/vn``. Indices count from 1, or backwards from the last statement above the line (-1).
-    - ``usemtl`` statements name the material of the faces that follow; faces before the first one have the name "".
-    - ``t`` statements are OpenSubdiv's tags.
-
-    All other statements are skipped. A backslash at the end of a line continues the line, except in a comment.
+    Further columns of ``v`` and ``vt`` must be numbers and are dropped; the v of a texture coordinate is 0 if it is
+    missing. Indices count from 1, or backwards from the last statement above the line (-1). Faces before the first
+    ``usemtl`` have the material "". All other statements are skipped.
 
     Raises CageError if the file is malformed; the message names the line. The cage itself is not validated. Warns if a
     tag is not supported. Warns if face corners have indices of texture coordinates, but some have none, or there are no

@@ -21,9 +21,8 @@ ROWS = 1 << 16
 def write_obj(contents: CageContents, path: str | Path) -> None:
     """Write a cage to an OBJ file, with creases, corners, holes and rules as OpenSubdiv's tags.
 
-    Numbers have all digits that distinguish float64 numbers. Raises OSError if the file cannot be written. Warns if the
-    cage has more than OBJ files can hold: attributes, a scheme, texture coordinates that are not face-varying, several
-    materials of one face, or names of materials that are not one line of text.
+    Numbers have all digits that distinguish float64 numbers. Raises OSError if the file cannot be written. Warns of
+    what it cannot hold; of materials, these are names that are not one line of text, and all but one of a face.
     """
     texcoords, owner = contents.texcoords, contents.material_of_face
     if texcoords is not None and texcoords.interpolation != "face_varying":

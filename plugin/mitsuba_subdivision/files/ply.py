@@ -41,22 +41,11 @@ _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): 
 
 
 def read_ply(path: str | Path) -> CageContents:
-    """Read polygons and data at vertices of a PLY file, ASCII or binary.
+    """Read polygons, data at vertices and materials of faces of a PLY file, ASCII or binary.
 
-    The list ``vertex_indices`` or ``vertex_index`` of the element ``face`` gives the polygons. The properties of the
-    element ``vertex`` are read as follows:
-
-    - ``x``, ``y`` and ``z`` are the position.
-    - ``s`` and ``t``, or ``u`` and ``v``, or ``texture_u`` and ``texture_v`` are texture coordinates.
-    - ``red``, ``green`` and ``blue``, or ``r``, ``g`` and ``b``, are the attribute "color", and ``alpha`` or ``a``
-      beside them the attribute "alpha"; unsigned integers are scaled to 0 to 1.
-    - ``nx``, ``ny`` and ``nz`` are dropped, as the normals of the surface follow from its points.
-    - ``name_0``, ``name_1`` and so on, from 0 or from 1, and ``name_x``, ``name_y`` and ``name_z`` are one attribute
-      "name"; ``name_r``, ``name_g`` and ``name_b`` are "name_color".
-    - Any other number is an attribute of its own.
-
-    Of faces, the integer ``material_index``, ``material_id`` or ``texnumber`` is the material: "material_0" and so on,
-    or "" for negative numbers.
+    Polygons are the list ``vertex_indices`` or ``vertex_index`` of the element ``face``. Normals are dropped, as those
+    of the surface follow from its points. Of the properties of vertices, `_TEXCOORDS` name texture coordinates, and
+    `grouped` makes attributes of all others; unsigned integers of colours are scaled to 0 to 1.
 
     Raises CageError if the package plyfile is missing, or the file is malformed, OSError if it cannot be read. The cage
     itself is not validated. Warns if faces have other data, or vertices have lists, which are not read.
@@ -238,9 +227,8 @@ def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 def write_ply(contents: CageContents, path: str | Path) -> None:
     """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
 
-    Raises OSError if the file cannot be written. Warns if the cage has more than PLY files can hold: creases, corners,
-    holes, rules other than the default, a scheme, data that is varying or face-varying, attributes whose names cannot
-    be names of properties, several materials of one face, or names of materials other than "material_0" and so on.
+    Raises OSError if the file cannot be written. Warns of what it cannot hold. Of materials, these are names other than
+    "material_0" and so on, and all but one of a face.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "vertex":

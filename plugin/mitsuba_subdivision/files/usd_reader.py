@@ -41,16 +41,9 @@ def read_usd(
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
     The orientation of faces is reversed in left-handed meshes and in those that their transform mirrors, so that faces
-    are counter-clockwise from outside. Points are not transformed for the stage's units and up axis. Skeletons and
-    blend shapes move the points, as usd-core evaluates them.
+    are counter-clockwise from outside. Skeletons and blend shapes move the points, as usd-core evaluates them.
 
-    Raises CageError if the package usd-core is missing; if the file is malformed; if there is no such mesh, or more
-    than one; if the mesh is not a subdivision surface of a known scheme and none is given; if attributes contradict
-    each other; if meshes that become one cage differ in scheme or rules. The cage itself is not validated. Raises
-    OSError if the file cannot be read.
-
-    Warns if the scheme that is given is not the mesh's own, the file refers to something that is not there, or meshes,
-    primvars or skinning are not read.
+    Raises CageError and OSError, and warns, as `ControlCage.from_file`; the cage itself is not validated.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):

@@ -23,8 +23,7 @@ def write_usd(contents: CageContents, path: str | Path) -> None:
     """Write a cage to a USD file in single precision, with its subdivision attributes and primvars.
 
     A cage that names no scheme becomes a Catmull-Clark mesh. Raises CageError if the package usd-core is missing,
-    OSError if the file cannot be written. Warns if the cage has more than USD files can hold: Chaikin's rule, a scheme
-    other than Catmull-Clark and Loop, or attributes whose names cannot be names of primvars.
+    OSError if the file cannot be written. Warns of what it cannot hold.
     """
     with _new_mesh(path, "cage", contents.positions, contents.face_sizes, contents.face_vertices) as mesh:
         attributes = {name: values for name, values in contents.attributes.items() if is_possible(name)}
