@@ -130,11 +130,11 @@ def test_what_is_not_to_be_seen_or_smoothed_is_left_out_with_a_warning_unless_it
 
 ERRORS = [
     # Numbers that are another mesh's.
-    ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face corners have the index 6 at position 6; expected 0 to 5"),
-    ("holeIndices = [1]", "holeIndices = [2]", "prim /sheet: holes have the index 2 at position 0; expected 0 to 1"),
-    ("3, 4, 5]", "3, 4]", 'sheet: attribute "w" has 5 values or indices; expected 6, one per v'),
-    ("0, 1, 2, 3]", "0, 1, 2]", 'sheet: attribute "texcoords" has 7 values or indices; expected 8, one per f'),
-    ("0, 1, 2, 3]", "0, 1, 2, 4]", 'prim /sheet: attribute "texcoords" has the index 4 at position 7; expected 0 to 3'),
+    ("1, 2, 5, 4]", "1, 2, 6, 4]", "prim /sheet: face 1 has the vertex index 6; expected 0 to 5"),
+    ("holeIndices = [1]", "holeIndices = [2]", "prim /sheet: hole 2 is no face; expected one of 2 faces"),
+    ("3, 4, 5]", "3, 4]", 'sheet: attribute "w" has 5 values; expected 6, one per vertex'),
+    ("0, 1, 2, 3]", "0, 1, 2]", r'sheet: attribute "st" has indices of shape \(7,\) and type int64; expected 8 int'),
+    ("0, 1, 2, 3]", "0, 1, 2, 4]", '/sheet: face 1: corner 3 has index 4 into attribute "st"; expected 0 to 3'),
     # Mistakes that only the whole cage shows.
     ("es = [3]", "es = [-1]", "prim /sheet: value 0 of cornerSharpnesses has sharpness -1; expected 0 for smooth"),
     ("(2, 0.5, 0)", "(2, nan, 0)", "prim /sheet: vertex 5 has the coordinates"),

@@ -102,7 +102,7 @@ def validated_faces(
     _check_sizes(sizes, len(flat_vertices), source)
     sizes = sizes.astype(np.int64)
     vertices = _integers(flat_vertices, "face_vertices", source, sizes)
-    _check_vertices(vertex_count, sizes, vertices, source)
+    require_vertices(vertex_count, sizes, vertices, source)
     vertices = np.array(vertices, dtype=np.int32)
     if (sizes == sizes[0]).all():
         # A broadcast scalar saves memory.
@@ -284,7 +284,8 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         )
 
 
-def _check_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
+def require_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
+    """Raise CageError unless the vertices of all faces are some of ``vertex_count``, which are not too many."""
     if vertex_count > MOST_VERTICES:
         raise CageError(f"{source.name}: there are {vertex_count} vertices; expected at most {MOST_VERTICES}")
     if vertices.min() < 0 or vertices.max() >= vertex_count:

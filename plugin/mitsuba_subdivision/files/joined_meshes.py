@@ -10,7 +10,6 @@ import numpy as np
 
 from ..cage.contents import RULES, Attribute, CageContents
 from ..cage.errors import CageError, CageSource, shortened, warn
-from ..cage.validation import require_range
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 
@@ -26,8 +25,7 @@ _PARTS = {
 
 
 def joined(
-    # One or more, with the same rules by name. Creases and corners name vertices of their mesh. A single mesh is
-    # returned as it is.
+    # One or more, with the same rules by name; their indices are checked. A single mesh is returned as it is.
     meshes: Sequence[CageContents],
     name: str,  # Of the file in messages
 ) -> CageContents:
@@ -35,7 +33,7 @@ def joined(
 
     Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width, else
     there is a warning. The source names vertices and faces by their mesh and their numbers there. Raises CageError if
-    meshes have different rules or schemes, or an index is out of the range of its own mesh.
+    meshes have different rules or schemes.
     """
     if len(meshes) == 1:
         return meshes[0]
@@ -43,8 +41,6 @@ def joined(
         rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in RULES if rule in meshes[0].rules
     }
     scheme = _common("scheme", meshes, [mesh.scheme for mesh in meshes])
-    for mesh in meshes:
-        _require_own_indices(mesh)
     starts = {
         part: ragged.starts(np.array([len(getattr(mesh, rows)) for mesh in meshes])) for part, rows in _PARTS.items()
     }
@@ -76,25 +72,6 @@ def _common(rule: str, meshes: Sequence[CageContents], values: Sequence[Value]) 
                 f"expected the same in all meshes, or {rule} as an argument"
             )
     return values[0]
-
-
-def _require_own_indices(mesh: CageContents) -> None:
-    """Raise an error if an index would be one of another mesh, or data would shift those of later meshes."""
-    source, vertex_count = mesh.source.name, len(mesh.positions)
-    require_range(mesh.face_vertices, vertex_count, f"{source}: face corners have")
-    require_range(mesh.holes, len(mesh.face_sizes), f"{source}: holes have")
-    for name, attribute in {**mesh.attributes, "texcoords": mesh.texcoords}.items():
-        if attribute is None:
-            continue
-        where = f'{source}: attribute "{shortened(name)}" has'
-        if attribute.indices is not None:
-            require_range(attribute.indices, len(attribute.values), where)
-        count = len(attribute.values if attribute.indices is None else attribute.indices)
-        expected, per = vertex_count, "vertex"
-        if attribute.interpolation == "face_varying":
-            expected, per = len(mesh.face_vertices), "face corner"
-        if count != expected:
-            raise CageError(f"{where} {count} values or indices; expected {expected}, one per {per}")
 
 
 def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:

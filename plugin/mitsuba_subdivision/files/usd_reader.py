@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from ..cage.contents import RULES, Attribute, CageContents, validated_attribute
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
-from ..cage.validation import require_range, require_sharpness, validated_face_indices
+from ..cage.validation import (
+    require_range,
+    require_sharpness,
+    require_vertices,
+    validated_face_indices,
+    validated_positions,
+)
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from . import usd_stage
@@ -61,7 +67,7 @@ def read_usd(
         skinning = Skinning(code, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))
     contents = []
     for mesh, location in zip(meshes, locations, strict=True):
-        # When the cage is validated, numbers that are not finite become errors that name their location.
+        # Numbers that are not finite become errors that name their location.
         with usd_stage.usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
             contents.append(MeshReader(mesh, location, skinning, rules).contents())
     return joined(contents, name)
@@ -81,7 +87,7 @@ class MeshReader:
         report: Callable[[str, object], None] | None = None,
     ) -> None:
         self.mesh, self.location, self.skinning = mesh, location, skinning
-        self._rules, self._report = rules or {}, report
+        self._rules, self._report, self._source = rules or {}, report, CageSource(location)
 
     def contents(self, attributes: Collection[str] | None = None, texcoords: str | None = None) -> CageContents:
         """The mesh as contents of a cage in the world's space, with all primvars.
@@ -106,22 +112,15 @@ class MeshReader:
             vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
-        topology = None
-        if self._report is not None:
-            # What comes of the mesh takes its indices and points as they are.
-            require_range(vertices, len(points), f"{self.location}: faceVertexIndices have")
-            if not np.isfinite(points).all():
-                raise self.error("there are points that are not finite", "finite numbers")
-            topology = Topology(len(points), sizes, vertices)
-        count, left_out = len(points), "the {} are left out".format
-        no_holes: IntArray = np.zeros(0, np.int64)
-        creases = self.fitting(
-            mesh.GetCreaseIndicesAttr(), left_out("creases"), partial(self._creases, count), np.zeros((0, 3))
-        )
-        corners = self.fitting(
-            mesh.GetCornerIndicesAttr(), left_out("corners"), partial(self._corners, count), np.zeros((0, 2))
-        )
-        holes = self.fitting(mesh.GetHoleIndicesAttr(), left_out("holes"), partial(self._holes, topology), no_holes)
+        # What is made of several meshes, or for a scene, takes indices and points as they are.
+        points = validated_positions(points, self._source)
+        require_vertices(len(points), sizes, vertices, self._source)
+        topology = Topology(len(points), sizes, vertices)
+
+        def tags(noun: str, read: Callable[[Topology], NDArray], otherwise: NDArray) -> NDArray:
+            attribute = mesh.GetPrim().GetAttribute(f"{noun}Indices")
+            return self.fitting(attribute, f"the {noun}s are left out", partial(read, topology), otherwise)
+
         rules = {rule: self._rule(rule) for rule in RULE_ATTRIBUTES if rule not in self._rules}
         uv, data = self._primvars(order, topology, attributes, texcoords)
         is_flat = str(self.value(mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
@@ -129,14 +128,14 @@ class MeshReader:
             points,
             sizes,
             vertices,
-            creases=creases,
-            corners=corners,
-            holes=holes,
+            creases=tags("crease", self._creases, np.zeros((0, 3))),
+            corners=tags("corner", self._corners, np.zeros((0, 2))),
+            holes=tags("hole", self._holes, np.zeros(0, np.int64)),
             texcoords=uv,
             attributes=data,
             rules=rules,
             scheme=None if is_local and is_flat else self._scheme(),
-            source=CageSource(self.location),
+            source=self._source,
         )
 
     def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
@@ -237,7 +236,7 @@ class MeshReader:
             warn(f'{self.location}: subdivisionScheme is "{asked}"; the scheme "{given}" is used in its place')
         return given
 
-    def _creases(self, vertex_count: int) -> NDArray[np.float64]:
+    def _creases(self, topology: Topology) -> NDArray[np.float64]:
         """Rows (vertex, vertex, sharpness)."""
         mesh = self.mesh
         indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
@@ -258,9 +257,9 @@ class MeshReader:
             expected = f"{len(lengths)}, one per crease, or {edges.sum()}, one per edge"
             raise self.error(f"creaseSharpnesses has {len(sharpness)} entries", expected)
         start = np.delete(np.arange(len(indices)), np.cumsum(lengths) - 1)
-        return self._rows_of_mesh(np.stack([indices[start], indices[start + 1], sharpness], 1), vertex_count, "crease")
+        return self._rows_of_mesh(np.stack([indices[start], indices[start + 1], sharpness], 1), topology, "crease")
 
-    def _corners(self, vertex_count: int) -> NDArray[np.float64]:
+    def _corners(self, topology: Topology) -> NDArray[np.float64]:
         """Rows (vertex, sharpness)."""
         indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
         sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
@@ -270,11 +269,11 @@ class MeshReader:
             problem = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
             raise self.error(problem, "as many")
         require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
-        return self._rows_of_mesh(np.stack([indices, sharpness], axis=1), vertex_count, "corner")
+        return self._rows_of_mesh(np.stack([indices, sharpness], axis=1), topology, "corner")
 
-    def _rows_of_mesh(self, rows: NDArray[np.float64], vertex_count: int, noun: str) -> NDArray[np.float64]:
+    def _rows_of_mesh(self, rows: NDArray[np.float64], topology: Topology, noun: str) -> NDArray[np.float64]:
         """Rows of creases or corners that name vertices of the mesh; among other meshes, others would be theirs."""
-        vertices = rows[:, :-1]
+        vertices, vertex_count = rows[:, :-1], topology.vertex_count
         is_inside = ((vertices >= 0) & (vertices < vertex_count)).all(axis=1)
         for row in np.flatnonzero(~is_inside)[:1]:
             numbers = ", ".join(f"{vertex:.0f}" for vertex in vertices[row])
@@ -284,10 +283,10 @@ class MeshReader:
             self._tell(f"{self.location}: {noun} at ({numbers}) is ignored; {expected} ({such})", path)
         return rows[is_inside]
 
-    def _holes(self, topology: Topology | None) -> IntArray:
-        """Faces that are holes; checked against a topology if there is one."""
-        holes = self.array(self.mesh.GetHoleIndicesAttr(), np.int64)
-        return holes if topology is None else validated_face_indices(topology, holes, "hole", CageSource(self.location))
+    def _holes(self, topology: Topology) -> IntArray:
+        return validated_face_indices(
+            topology, self.array(self.mesh.GetHoleIndicesAttr(), np.int64), "hole", self._source
+        )
 
     def _local_to_world(self) -> NDArray[np.float64]:
         """The transform to world space, as a matrix for row vectors."""
@@ -302,7 +301,7 @@ class MeshReader:
         self,
         # (n_h,) int64, if the orientation of faces is reversed: which face corner of the file becomes each face corner
         order: IntArray | None,
-        topology: Topology | None,  # What values are checked against. By default, the cage does so later.
+        topology: Topology,
         chosen: Collection[str] | None,  # As for `contents`
         first_name: str | None,
     ) -> tuple[Attribute | None, dict[str, Attribute]]:
@@ -354,10 +353,10 @@ class MeshReader:
         primvar: UsdGeom.Primvar,
         values: NDArray[np.float64],
         order: IntArray | None,
-        topology: Topology | None,
+        topology: Topology,
         width: int | None,
     ) -> Attribute:
-        """A primvar as an attribute, checked against a topology if there is one."""
+        """A primvar as an attribute, checked."""
         where = f'{self.location}: primvar "{shortened(primvar.GetPrimvarName())}"'
         indices = self.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
         interpolation = primvar.GetInterpolation()
@@ -367,25 +366,21 @@ class MeshReader:
                 values = values[indices]
             attribute = Attribute(values, INTERPOLATIONS[interpolation])
         else:
-            sizes = self.array(self.mesh.GetFaceVertexCountsAttr(), np.int64)
-            vertices = self.array(self.mesh.GetFaceVertexIndicesAttr(), np.int64)
+            sizes, vertices = topology.face_sizes, topology.face_vertices
             rows, count, per = order, len(vertices), "face corner"
             if interpolation == "uniform":
                 # Values of faces become those of their corners, which a change of the orientation leaves as they are.
                 rows, count, per = np.repeat(np.arange(len(sizes)), sizes), len(sizes), "face"
             elif indices is None:
-                values, indices = _with_shared_values(values, sizes, vertices)
+                # The order is its own inverse.
+                values, indices = _with_shared_values(values, sizes, vertices if order is None else vertices[order])
             if rows is not None:
                 indices = np.arange(len(values)) if indices is None else indices
                 if len(indices) != count:
                     raise CageError(f"{where} has {len(indices)} values or indices; expected {count}, one per {per}")
                 indices = indices[rows]
             attribute = Attribute(values, "face_varying", indices)
-        if topology is None:
-            return attribute
-        return validated_attribute(
-            attribute, primvar.GetPrimvarName(), topology, CageSource(self.location), width=width
-        )
+        return validated_attribute(attribute, primvar.GetPrimvarName(), topology, self._source, width=width)
 
 
 def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
