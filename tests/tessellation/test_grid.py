@@ -3,8 +3,7 @@ import pytest
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
-from mitsuba_subdivision.tessellation.quad_grid import QuadGrid
-from mitsuba_subdivision.tessellation.uniform_grid import TriangleGrid
+from mitsuba_subdivision.tessellation import UniformGrid
 from patches.closed_cages import SURFACES, cage_of
 
 # Odd and even, each more than once: from here on they differ in numbers only.
@@ -15,8 +14,8 @@ COLLAPSED = {("catmull_clark", "valence 2", 1), ("catmull_clark", "valence 2 bes
 
 
 def grid_of(scheme, name, rate):
-    elements = PatchTable(cage_of(scheme, name).topology, scheme_named(scheme)).elements
-    return (TriangleGrid if scheme == "loop" else QuadGrid)(elements, rate)
+    patches = PatchTable(cage_of(scheme, name).topology, scheme_named(scheme))
+    return UniformGrid(patches.scheme.domain, patches.elements, rate)
 
 
 @EVERY_SURFACE
@@ -83,6 +82,6 @@ def test_faces_without_corners_leave_nothing_behind(scheme, rate):
     at_vertex, sizes = np.unique(t.face[t.face_vertices == 0]), t.face_sizes.copy()
     sizes[at_vertex] = 0
     kept = t.face_vertices[sizes[t.face] > 0]
-    grid = (TriangleGrid if scheme == "loop" else QuadGrid)(Topology(t.vertex_count, sizes, kept), rate)
+    grid = UniformGrid(scheme_named(scheme).domain, Topology(t.vertex_count, sizes, kept), rate)
     np.testing.assert_array_equal(np.unique(grid.triangles()), np.arange(grid.vertex_count))
     assert not np.isin(at_vertex, grid.element()).any()

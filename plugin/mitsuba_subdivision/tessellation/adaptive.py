@@ -71,7 +71,7 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     # Runs of one vertex each.
     kind = np.cumsum(is_new) - 1
     samples, ones = ragged.index_in_row(counts), np.ones_like(distinct)
-    runs = VertexRuns(patch_class[distinct], ones, samples, kind, patch[order], order)
+    runs = VertexRuns(patch_class[distinct], ones, samples, 0 * ones, kind, patch[order], order)
     return vertex_polynomials(table.scheme, table.classes, uv_of_class, runs)
 
 

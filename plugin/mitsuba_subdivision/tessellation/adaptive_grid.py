@@ -339,8 +339,9 @@ class AdaptiveGrid:
 
     def _along(self, samples: IntArray | slice) -> FloatArray:
         """Positions of samples along their sides, in [0, 1): exact, as dyadic fractions."""
-        begin, end, side = self.sides.begin, self.sides.end, self._side[samples]
-        return (self.position[samples] - begin[side]) / (end - begin)[side]
+        side = self._side[samples]
+        begin, end = self.sides.begin[side], self.sides.end[side]
+        return (self.position[samples] - begin) / (end - begin)
 
     def _parameters(self, samples: IntArray | slice) -> tuple[IndexArray, FloatArray]:
         """The tile of some samples on sides and of all inner ones, and their parameters ``(2, n)`` in its patch."""

@@ -14,8 +14,7 @@ from ..mesh.shared import Content, Shared
 from ..patches import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .memory import require_memory
-from .quad_grid import QuadGrid
-from .uniform_grid import GridPart, TriangleGrid, UniformGrid, first_sides
+from .uniform_grid import GridPart, UniformGrid, first_sides
 from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
 
 # Most vertices of a tessellation: buffer sizes have 32 bits, and there are two triangles, of three indices, per vertex.
@@ -37,7 +36,7 @@ def uniform_table(
     checked = checked_rate(rate)
 
     def make() -> VertexTable:
-        grid = (QuadGrid if patches.scheme.domain.corner_count == 4 else TriangleGrid)(patches.elements, checked)
+        grid = UniformGrid(patches.scheme.domain, patches.elements, checked)
         if grid.vertex_count > MOST_VERTICES:
             raise ValueError(
                 f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, "
@@ -71,26 +70,25 @@ def _polynomials(patches: PatchTable, grid: UniformGrid) -> tuple[VertexPolynomi
     """The polynomials on which the vertices lie, class by class and part by part of the grid."""
     classes: list[PatchClass] = []
     uv: list[FloatArray] = []
-    # The class, samples, patches and first vertices of each kind of run.
-    kinds: list[tuple[int, IntArray, IntArray, IntArray]] = []
+    # The class, part, and patches of each kind of run.
+    kinds: list[tuple[int, GridPart, slice, int]] = []
     for layout_classes, layout_uv, parts in _layouts(patches, grid):
         bounds = ragged.offsets([len(patch_class.corners) for patch_class in layout_classes])
         for part in parts:
             ends = np.searchsorted(part.patches, bounds).tolist()
             for index, (begin, end) in enumerate(pairwise(ends)):
                 if begin < end and len(part.samples):
-                    patch = part.patches[begin:end] - bounds[index]
-                    kinds.append((len(classes) + index, part.samples, patch, part.first_vertex[begin:end]))
+                    kinds.append((len(classes) + index, part, slice(begin, end), bounds[index]))
         classes += layout_classes
         uv += [layout_uv] * len(layout_classes)
-    class_of_kind, samples_of_kind, patches_of_kind, first_vertices = zip(*kinds, strict=True)
     runs = VertexRuns(
-        np.array(class_of_kind),
-        np.array([len(samples) for samples in samples_of_kind]),
-        np.concatenate(samples_of_kind),
-        np.repeat(np.arange(len(kinds)), [len(patch) for patch in patches_of_kind]),
-        np.concatenate(patches_of_kind),
-        np.concatenate(first_vertices),
+        np.array([kind for kind, *_ in kinds]),
+        np.array([len(part.samples) for _, part, *_ in kinds]),
+        np.concatenate([part.samples for _, part, *_ in kinds]),
+        np.concatenate([part.offsets for _, part, *_ in kinds]),
+        np.repeat(np.arange(len(kinds)), [of_kind.stop - of_kind.start for *_, of_kind, _ in kinds]),
+        np.concatenate([part.patches[of_kind] - first for _, part, of_kind, first in kinds]),
+        np.concatenate([part.first_vertex[of_kind] for _, part, of_kind, _ in kinds]),
     )
     return vertex_polynomials(patches.scheme, classes, uv, runs)
 
@@ -105,14 +103,10 @@ def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[Patc
         # which is the valence of the element's centre in the cage refined once.
         element = patches.elements.face[corners[:1]]
         by_wholeness[bool(patches.is_whole[element][0])].append((patch_class, corners))
-    for classes in filter(None, by_wholeness.values()):
-        corners = np.concatenate([class_corners for _, class_corners in classes])
-        if refined is not None and isinstance(grid, QuadGrid):
-            # A patch of the cage refined once covers only one corner of an element, even of a whole one.
-            layout = grid.corner_layout(corners)
-        else:
-            layout = grid.layout(corners)
-        yield [patch_class for patch_class, _ in classes], *layout
+    for pairs in filter(None, by_wholeness.values()):
+        classes, corners_of_class = zip(*pairs, strict=True)
+        # A patch of the cage refined once covers only one corner of an element, even of a whole one.
+        yield [*classes], *grid.layout(np.concatenate(corners_of_class), are_corners=refined is not None)
 
 
 def _copies(patches: PatchTable, grid: UniformGrid, control_of_vertex: IntArray) -> IntArray:

@@ -1,4 +1,4 @@
-"""Numbering of uniform tessellations: the common base of grids over squares and over triangles, and that of triangles.
+"""Numbering of uniform tessellations.
 
 The two elements at an edge share the samples on it, so there are no cracks. Corners of the elements are numbered first,
 then samples inside edges, then samples inside elements. The samples inside an edge, and those inside an element, have
@@ -7,7 +7,7 @@ consecutive numbers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
-from ..schemes.domain import FloatArray
+from ..schemes.domain import FloatArray, ParameterDomain
 
 # Vertices per slice when computing triangles, so that arrays stay in a core's cache.
 VERTICES_AT_ONCE = 1 << 16
@@ -25,135 +25,77 @@ VERTICES_AT_ONCE = 1 << 16
 class GridPart(NamedTuple):
     """A part of the grids of several patches, such as their inside or one of their sides.
 
-    In every patch, the samples of the part are consecutive vertices. Where patches share samples, at corners and along
-    edges, only the patch that evaluates them is in the part.
+    Where patches share samples, at corners and along edges, only the patch that evaluates them is in the part.
     """
 
     samples: IntArray  # (S,) int64: indices into the parameters of `UniformGrid.layout`
+    offsets: IntArray  # (S,): from the first vertex of a patch to the vertex of each sample
     patches: IntArray  # (P,): patches in ascending order
-    first_vertex: IntArray  # (P,): vertex of the first sample in each patch; ``samples[i]`` is ``first_vertex + i``
+    first_vertex: IntArray  # (P,): number to which each patch adds the offsets
     corners: IntArray  # (P,): a corner of each patch's element, not always the one at which the patch begins
     uv: FloatArray  # (S, 2) float64: parameters of the samples, starting at `corners`
 
     @property
     def vertices(self) -> IntArray:
         """``(P, S)`` vertices of the samples of each patch."""
-        return self.first_vertex.astype(np.int64)[:, None] + np.arange(len(self.samples))
+        return self.first_vertex.astype(np.int64)[:, None] + self.offsets
 
 
 class UniformGrid:
     """Numbering of a uniform tessellation: the same for all surfaces over the same elements.
 
+    An element that fits the domain is one grid with ``rate`` segments along each side. Any other polygon has a square
+    grid at each of its corners, which reaches half way along the corner's two edges. For an even rate, these grids meet
+    along spokes, which run from the midpoints of the edges to the polygon's centre. For an odd rate, strips of
+    triangles join them, and a fan of triangles closes the middle.
+
     `AdaptiveGrid` has the members that `VertexTable` asks for as well.
     """
 
-    whole_size: int
-    """Corners of elements that fit the domain."""
-
     def __init__(
         self,
+        domain: ParameterDomain,
         # Of the elements: each face with corners is an element, and a half-edge represents the corner at which it
         # begins
         topology: Topology,
         rate: int,  # Segments on every edge
     ) -> None:
-        self.topology, self.rate = topology, rate
+        self.domain, self.topology, self.rate = domain, topology, rate
+        self._is_whole = topology.face_sizes == domain.corner_count
+        # Whole cells from a corner of a polygon to the midpoints of its edges.
+        self._half, self._is_odd = rate // 2, rate % 2 == 1
+        # Steps from a corner of a polygon to samples inside its grid: for an even rate, the last one is on a spoke.
+        self._inside = np.arange(1, self._half + self._is_odd)
 
-    @property
-    def inner_counts(self) -> IntArray:
-        """``(n_f,)`` vertices strictly inside each element."""
-        raise NotImplementedError
-
-    @property
-    def triangle_counts(self) -> IntArray:
-        """``(n_f,)`` triangles of each element."""
-        raise NotImplementedError
-
-    def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
-        """The grids of the patches that begin at ``corners``, which are all whole elements or all not.
-
-        Returns
-        -------
-        uv : (S, 2) float64
-            Parameters of the samples of a patch, starting at the corner at which the patch begins.
-        parts : list of GridPart
-            Parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in
-            the order of ``corners``.
-        """
-        raise NotImplementedError
-
-    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """Parameters at the corners of an element's triangles.
-
-        Returns
-        -------
-        whole : (T, 3, 2) float64
-            Triangles of a whole element; parameters start at its first corner.
-        corner : (T, 3, 2) float64
-            Triangles of one corner of any other element; parameters start at that corner. Some triangles may reach
-            beyond u = 1, into the patch of the next corner.
-        """
-        raise NotImplementedError
-
-    def triangles(self) -> NDArray[np.uint32]:
-        """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
-        raise NotImplementedError
-
-    def element(self) -> NDArray[np.uint32]:
-        """``(m,)`` element of each triangle."""
-        counts = self.triangle_counts
-        # `repeat` is faster with a scalar.
-        repeats = counts[0] if (counts == counts[0]).all() else counts
-        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
-
-    def at_rate(self, rate: int) -> UniformGrid:
-        """A grid of another rate over the same elements."""
-        return type(self)(self.topology, rate)
-
-    def cut(self, topology: Topology) -> UniformGrid:
-        """The same triangles over elements with the same half-edges, cut along more edges.
-
-        Vertices on a cut have a copy on each side, which is located on that side.
-        """
-        return type(self)(topology, self.rate)
-
-    def vertices_of(self, other: Any) -> IntArray:
-        """``(vertex_count,)`` the original of each vertex in a grid of which this one is a `cut`."""
-        t, steps = self.topology, np.arange(1, self.rate)
-        originals = np.empty(self.vertex_count, dtype=np.int64)
-        originals[self.corner_vertex[t.face_vertices]] = other.corner_vertex[other.topology.face_vertices]
-        originals[self.edge_start(t.edge_half_edge)[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
-        originals[self.inner_begin :] = np.arange(other.inner_begin, other.vertex_count)
-        return originals
-
-    def locations(self) -> tuple[IntArray, FloatArray]:
-        """Locations of the vertices on the surface.
-
-        Returns
-        -------
-        half_edge : (vertex_count,) int64
-            Corner of an element at which the parameters are (0, 0), a half-edge of `PatchTable.elements`.
-        uv : (vertex_count, 2) float64
-            Parameters. Vertices at corners of elements have (0, 0).
-        """
-        t = self.topology
-        half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
-        is_whole = t.face_sizes == self.whole_size
-        for corners in (t.face_offsets[:-1][is_whole], t.half_edges_of(~is_whole)):
-            for part in self.layout(corners)[1] if len(corners) else ():
-                half_edge[part.vertices] = part.corners[:, None]
-                uv[part.vertices] = part.uv
-        return half_edge, uv
+    # Numbers of vertices
 
     @cached_property
     def vertex_count(self) -> int:
         """Vertices of the tessellation."""
-        return self.inner_begin + int(self.inner_counts.sum())
+        return self.inner_begin + int(self._inner_counts.sum())
+
+    @cached_property
+    def _inner_counts(self) -> IntArray:
+        """``(n_f,)`` vertices strictly inside each element."""
+        sizes, of_whole = self.topology.face_sizes, (self.rate - 1) * (self.rate - 1)
+        if self.domain.corner_count == 3:
+            of_whole = (self.rate - 1) * (self.rate - 2) // 2
+        # Polygons have a centre and, for an even rate, spokes.
+        of_corner = len(self._inside) * (len(self._inside) + (not self._is_odd))
+        return np.where(self._is_whole, of_whole, sizes * of_corner + (sizes > 0))
 
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:
         """``(n_v,)`` number of each vertex of the topology; undefined where no face uses it."""
         return np.cumsum(self._is_used, dtype=np.uint32) - 1
+
+    @cached_property
+    def _is_used(self) -> NDArray[np.bool_]:
+        return self.topology.vertex_half_edge >= 0
+
+    @cached_property
+    def _corner_count(self) -> int:
+        return int(np.count_nonzero(self._is_used))
 
     def edge_start(self, corners: IntArray) -> IntArray:
         """Number of the first vertex inside the edge that begins at each corner, along the edge's lowest half-edge."""
@@ -167,28 +109,17 @@ class UniformGrid:
         """Number of the first vertex inside an element."""
         return self._corner_count + self.topology.edge_count * (self.rate - 1)
 
-    def inner_start(self, faces: IntArray) -> IntArray:
-        """Number of the first vertex inside each of the faces."""
-        return self.inner_begin + self._inner_counts_before[faces]
-
     @cached_property
-    def _inner_counts_before(self) -> IntArray:
-        return ragged.starts(self.inner_counts)
-
-    @cached_property
-    def _corner_count(self) -> int:
-        return int(np.count_nonzero(self._is_used))
-
-    @cached_property
-    def _is_used(self) -> NDArray[np.bool_]:
-        return self.topology.vertex_half_edge >= 0
+    def inner_start(self) -> IntArray:
+        """``(n_f,)`` number of the first vertex inside each element."""
+        return self.inner_begin + ragged.starts(self._inner_counts)
 
     def along(self, corners: IntArray, steps: IntArray) -> NDArray[np.uint32]:
         """Vertices ``steps`` segments along the edges that begin at corners: ``(*corners.shape, len(steps))``.
 
         Steps 0 and ``rate`` are the ends of the edge.
         """
-        is_forward = self.owns_edge[corners]
+        is_forward = self._owns_edge[corners]
         # Unsigned sums wrap around 2^32, so that 2^32 - 1 acts as -1.
         start = self.edge_start(corners).astype(np.uint32)
         start += np.where(is_forward, np.uint32(2**32 - 1), np.uint32(self.rate - 1))
@@ -202,141 +133,314 @@ class UniformGrid:
             numbers[steps == self.rate] = self._at_corners(self.topology.next[corners])
         return np.moveaxis(numbers, 0, -1)
 
+    def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
+        return self.corner_vertex[self.topology.face_vertices[corners]]
+
     @cached_property
-    def owns_edge(self) -> NDArray[np.bool_]:
+    def _owns_edge(self) -> NDArray[np.bool_]:
         """``(n_h,)`` whether each half-edge's element evaluates the edge: the element of the lower half-edge does."""
         twin = self.topology.twin
         return (twin < 0) | (twin > np.arange(len(twin), dtype=np.int32))
 
-    @cached_property
-    def owns_vertex(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether the element of each corner evaluates the vertex there."""
-        owns = np.zeros(self.topology.half_edge_count, dtype=bool)
-        owns[self.topology.vertex_half_edge[self._is_used]] = True
-        return owns
+    def _whole_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
+        """``(f, S)`` vertices of whole elements, in the order of `_steps`."""
+        # Faces are the last axis, so that NumPy's inner loops are long. Samples on the sides are assigned afterwards,
+        # where each side ends where the next one begins.
+        before = np.cumsum(self._is_inside, dtype=np.uint32) - self._is_inside
+        vertices = np.add.outer(before, self.inner_start[faces].astype(np.uint32))
+        corners = np.add.outer(np.arange(self.domain.corner_count, dtype=np.int32), self.topology.face_offsets[faces])
+        for side, along in zip(self._sides, self.along(corners, np.arange(self.rate)), strict=True):
+            vertices[side[:-1]] = along.T
+        return np.ascontiguousarray(vertices.T)
 
-    def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
-        """Vertices at corners."""
-        return self.corner_vertex[self.topology.face_vertices[corners]]
+    def _corner_vertices(self, corners: IntArray) -> NDArray[np.uint32]:
+        """``(c, half + 1, half + 1)`` vertices of the grids at corners of polygons, indexed ``[:, v, u]``."""
+        t, h, n = self.topology, self._half, len(self._inside)
+        numbers = np.empty((len(corners), h + 1, h + 1), dtype=np.uint32)
+        numbers[:, 1 : n + 1, 1 : n + 1] = self._corner_start(corners)[:, None, None] + np.arange(n**2).reshape(n, n)
+        if not self._is_odd:
+            # Two adjacent corners share a spoke.
+            numbers[:, 1:-1, -1] = self._spoke_start(corners)[:, None] + np.arange(n)
+            numbers[:, -1, 1:-1] = self._spoke_start(t.prev[corners])[:, None] + np.arange(n)
+            numbers[:, -1, -1] = self.inner_start[t.face[corners]]
+        steps = np.arange(h + 1)
+        numbers[:, 0, :] = self.along(corners, steps)
+        numbers[:, :, 0] = self.along(t.prev[corners], self.rate - steps)
+        return numbers
 
-    def side_parts(
-        self,
-        corners: IntArray,  # (p,): corners at which the patches begin
-        samples: IntArray,  # samples of a patch from a corner along the edge that begins there
-        along: FloatArray,  # parameters of these samples along the edge
-    ) -> list[GridPart]:
-        """The part of the samples inside edges, and that of the sample at the corners."""
-        uv = np.stack([along, np.zeros_like(along)], axis=1)
-        at_edge, at_vertex = np.flatnonzero(self.owns_edge[corners]), np.flatnonzero(self.owns_vertex[corners])
-        inside, begin = corners[at_edge], corners[at_vertex]
-        return [
-            GridPart(samples[1:], at_edge, self.edge_start(inside), inside, uv[1:]),
-            GridPart(samples[:1], at_vertex, self._at_corners(begin), begin, uv[:1]),
-        ]
+    def _corner_start(self, corners: IntArray) -> IntArray:
+        """First vertex inside the grid of each polygon corner. The polygon's centre comes before all grids."""
+        t, face = self.topology, self.topology.face[corners]
+        return self.inner_start[face] + 1 + (corners - t.face_offsets[face]) * len(self._inside) ** 2
 
-    def whole_layout(
-        self,
-        corners: IntArray,
-        uv: FloatArray,
-        # For each corner, the samples inside the element in the order in which they are numbered from its first corner,
-        # if the patch begins at this one
-        inside: Sequence[IntArray],
-        sides: Sequence[IntArray],  # Samples along the sides of a patch, counter-clockwise
-    ) -> tuple[FloatArray, list[GridPart]]:
-        """`layout` of patches that are whole elements."""
-        t, parts = self.topology, []
-        face = t.face[corners]
-        for turn, samples in enumerate(inside):
-            patches = np.flatnonzero(corners - t.face_offsets[face] == turn)
-            if len(patches):
-                faces = face[patches]
-                parts.append(GridPart(samples, patches, self.inner_start(faces), t.face_offsets[faces], uv[inside[0]]))
-        along = np.arange(self.rate) / self.rate
-        for side in sides:
-            parts += self.side_parts(corners, side[:-1], along)
-            corners = t.next[corners]
-        return uv, parts
+    def _spoke_start(self, corners: IntArray) -> IntArray:
+        """First vertex inside the spoke from the midpoint of the edge at each polygon corner, after all grids."""
+        t, face, n = self.topology, self.topology.face[corners], len(self._inside)
+        return self.inner_start[face] + 1 + t.face_sizes[face] * n**2 + (corners - t.face_offsets[face]) * n
 
-
-class TriangleGrid(UniformGrid):
-    """Numbering of a tessellation over unit triangles.
-
-    Each element is divided into ``rate^2`` triangles. The samples of an element are ordered by v, then by u.
-    """
-
-    whole_size = 3
-
-    @property
-    def inner_counts(self) -> IntArray:
-        """See `UniformGrid`."""
-        return np.where(self.topology.face_sizes > 0, (self.rate - 1) * (self.rate - 2) // 2, 0)
-
-    @property
-    def triangle_counts(self) -> IntArray:
-        """See `UniformGrid`."""
-        return np.where(self.topology.face_sizes > 0, self.rate**2, 0)
+    # Samples of whole elements
 
     @cached_property
-    def _steps(self) -> tuple[IntArray, IntArray]:
-        """``(S,)`` grid indices along u and along v of each sample."""
-        v, u = np.indices((self.rate + 1, self.rate + 1)).reshape(2, -1)
-        inside = u + v <= self.rate
-        return u[inside], v[inside]
+    def _steps(self) -> IntArray:
+        """``(S, 2)`` grid indices along u and v of the samples of a whole element, u fastest."""
+        return self.domain.indices(self.rate)
 
-    def _index(self, u: IntArray, v: IntArray) -> IntArray:
-        """The sample with given grid indices along u and v."""
-        return v * (self.rate + 1) - v * (v - 1) // 2 + u
+    def _sample_at(self, steps: FloatArray) -> IntArray:
+        """Samples of a whole element with grid indices ``(.., 2)``."""
+        u, v = np.rint(steps).astype(np.int64).T
+        in_triangle = v * (v - 1) // 2 if self.domain.corner_count == 3 else 0
+        return v * (self.rate + 1) - in_triangle + u
+
+    @cached_property
+    def _is_inside(self) -> NDArray[np.bool_]:
+        """``(S,)`` whether each sample lies strictly inside a whole element."""
+        return self.domain.inside(self._steps / self.rate) > 1 / (2 * self.rate)
 
     @cached_property
     def _sides(self) -> list[IntArray]:
-        along = np.arange(self.rate + 1)
-        back, zero = along[::-1], np.zeros_like(along)
-        return [self._index(along, zero), self._index(back, along), self._index(zero, back)]
+        """Samples along each side of a whole element, counter-clockwise."""
+        ends = zip(self.domain.corners, np.roll(self.domain.corners, -1, axis=0), strict=True)
+        along = np.arange(self.rate + 1)[:, None]
+        return [self._sample_at(self.rate * begin + along * (end - begin)) for begin, end in ends]
+
+    def _turned_inside(self, turn: int) -> IntArray:
+        """Samples inside a whole element, in the order of their numbers, if the patch begins at corner ``turn``."""
+        uv = self._steps[self._is_inside] / self.rate
+        return self._sample_at(self.rate * self.domain.rotation(turn).inverse()(uv))
+
+    # Triangles
 
     @cached_property
-    def _inner(self) -> IntArray:
-        """Samples strictly inside an element."""
-        u, v = self._steps
-        return np.flatnonzero((u > 0) & (v > 0) & (u + v < self.rate))
+    def triangle_counts(self) -> IntArray:
+        """``(n_f,)`` triangles of each element."""
+        of_whole = (self.domain.corner_count - 2) * self.rate**2
+        return np.where(self._is_whole, of_whole, self.topology.face_sizes * self._corner_triangles)
 
-    def layout(self, corners: IntArray) -> tuple[FloatArray, list[GridPart]]:
-        """See `UniformGrid`."""
-        u, v = (steps[self._inner] for steps in self._steps)
-        w = self.rate - u - v
-        inside = [self._index(u, v), self._index(v, w), self._index(w, u)]
-        return self.whole_layout(corners, np.stack(self._steps, axis=1) / self.rate, inside, self._sides)
-
-    @cached_property
-    def _cells(self) -> IntArray:
-        """``(rate^2, 3)`` samples at the corners of each triangle."""
-        u, v = self._steps
-        cells = []
-        for room, steps in ((0, ((0, 0), (1, 0), (0, 1))), (1, ((1, 0), (1, 1), (0, 1)))):
-            at = np.flatnonzero(u + v < self.rate - room)
-            cells.append(np.stack([self._index(u[at] + i, v[at] + j) for i, j in steps], axis=1))
-        return np.concatenate(cells)
-
-    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """See `UniformGrid`."""
-        uv = np.stack(self._steps, axis=1) / self.rate
-        return uv[self._cells], np.empty((0, 3, 2))
+    @property
+    def _corner_triangles(self) -> int:
+        """Triangles of one corner of a polygon."""
+        return 2 * self._half**2 + (2 * self._half + 1 if self._is_odd else 0)
 
     def triangles(self) -> NDArray[np.uint32]:
-        """See `UniformGrid`."""
-        cells, t, steps = self._cells, self.topology, np.arange(self.rate + 1)
-        elements = np.flatnonzero(t.face_sizes)
-        triangles, begin = np.empty((len(elements), cells.size), dtype=np.uint32), 0
-        for faces in slices_of(elements, self.rate**2):
-            vertices = np.empty((len(faces), len(self._steps[0])), dtype=np.uint32)
-            vertices[:, self._inner] = self.inner_start(faces)[:, None] + np.arange(len(self._inner))
-            for corner, side in enumerate(self._sides):
-                vertices[:, side] = self.along(t.face_offsets[faces] + corner, steps)
-            np.take(vertices, cells.ravel(), axis=1, out=triangles[begin : begin + len(faces)], mode="clip")
-            begin += len(faces)
-        return triangles.reshape(-1, 3)
+        """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
+        t, counts, cells = self.topology, self.triangle_counts, self._whole_cells
+        start = ragged.starts(counts)
+        triangles = np.empty((int(counts.sum()), 3), dtype=np.uint32)
+        for faces in _slices(np.flatnonzero(self._is_whole), self.rate**2):
+            vertices, count = self._whole_vertices(faces), len(faces) * len(cells)
+            if start[faces[-1]] - start[faces[0]] == count - len(cells):
+                # The faces' triangles are contiguous in memory, as on a cage of whole elements only.
+                target = triangles[start[faces[0]] :][:count].reshape(len(faces), -1)
+                np.take(vertices, cells.ravel(), axis=1, out=target, mode="clip")
+            else:
+                triangles[start[faces][:, None] + np.arange(len(cells))] = vertices[:, cells]
+        for corners in _slices(t.half_edges_of(~self._is_whole), self._half**2 + 1):
+            face = t.face[corners]
+            first = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
+            triangles[first[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
+        return triangles
+
+    @cached_property
+    def _whole_cells(self) -> IntArray:
+        """``(T, 3)`` samples at the corners of each triangle of a whole element."""
+        if self.domain.corner_count == 4:
+            return _cut_cells(self.rate + 1, self.rate + 1)
+        room, cells = self.rate - self._steps.sum(axis=1), []
+        for least, corners in ((1, ((0, 0), (1, 0), (0, 1))), (2, ((1, 0), (1, 1), (0, 1)))):
+            cells.append(self._sample_at(self._steps[room >= least][:, None] + np.array(corners)).T)
+        return np.concatenate(cells)
+
+    def _triangles_of_corners(self, corners: IntArray) -> NDArray[np.uint32]:
+        """``(c, n, 3)`` triangles of each polygon corner."""
+        grids, count = self._corner_vertices(corners), self._half + 1
+        parts = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
+        if self._is_odd:
+            # A strip across the midpoint of the common edge joins the next corner's grid.
+            t = self.topology
+            following = self._corner_vertices(t.next[corners])[:, -1, :]
+            strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
+            centre = self.inner_start[t.face[corners]].astype(np.uint32)
+            parts.append(strip[:, _cut_cells(count, 2)])
+            parts.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
+        return np.concatenate(parts, axis=1)
+
+    def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
+        """Parameters at the corners of an element's triangles.
+
+        Returns
+        -------
+        whole : (T, 3, 2) float64
+            Triangles of a whole element; parameters start at its first corner.
+        corner : (T, 3, 2) float64
+            Triangles of one corner of any other element; parameters start at that corner. Some triangles may reach
+            beyond u = 1, into the patch of the next corner.
+        """
+        whole = (self._steps / self.rate)[self._whole_cells]
+        if self.domain.corner_count == 3:
+            return whole, np.empty((0, 3, 2))
+        rows, count = self._corner_parameters, self._half + 1
+        parts = [rows.reshape(-1, 2)[_cut_cells(count, count)]]
+        if self._is_odd:
+            # In this corner's parameters, the last row of the next corner's grid is a column beyond u = 1.
+            beyond = np.stack([2 - rows[-1, :, 1], rows[-1, :, 0]], axis=1)
+            strip = np.stack([rows[:, -1], beyond], axis=1).reshape(-1, 2)
+            parts += [strip[_cut_cells(count, 2)], np.stack([rows[-1, -1], beyond[-1], np.ones(2)])[None]]
+        return whole, np.concatenate(parts)
+
+    @property
+    def _corner_parameters(self) -> FloatArray:
+        """``(half + 1, half + 1, 2)`` parameters of the grid at a corner of a polygon, indexed ``[v, u]``."""
+        along = np.arange(self._half + 1) * 2 / self.rate
+        return np.stack(np.meshgrid(along, along), axis=-1)
+
+    def element(self) -> NDArray[np.uint32]:
+        """``(m,)`` element of each triangle."""
+        counts = self.triangle_counts
+        # `repeat` is faster with a scalar.
+        repeats = counts[0] if (counts == counts[0]).all() else counts
+        return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
+
+    # Grids of patches
+
+    def layout(self, corners: IntArray, *, are_corners: bool = False) -> tuple[FloatArray, list[GridPart]]:
+        """The grids of the patches that begin at ``corners``, which are all in whole elements or all not.
+
+        ``are_corners`` tells that whole elements have patches at their corners, too, which meet at their centres.
+
+        Returns
+        -------
+        uv : (S, 2) float64
+            Parameters of the samples of a patch, starting at the corner at which the patch begins.
+        parts : list of GridPart
+            Parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in
+            the order of ``corners``.
+        """
+        t, r = self.topology, self.rate
+        face = t.face[corners]
+        turns, is_whole = corners - t.face_offsets[face], self._is_whole[face[0]]
+        if are_corners or not is_whole:
+            return self._corner_layout(corners, turns, is_whole)
+        uv, parts = self._steps / r, []
+        inside = [self._turned_inside(turn) for turn in range(self.domain.corner_count)]
+        for turn, samples in enumerate(inside):
+            patches = np.flatnonzero(turns == turn)
+            first, begin = self.inner_start[face[patches]], t.face_offsets[face[patches]]
+            parts.append(GridPart(samples, np.arange(len(samples)), patches, first, begin, uv[inside[0]]))
+        for side in self._sides:
+            parts += self._side_parts(corners, side[:-1], np.arange(r) / r)
+            corners = t.next[corners]
+        return uv, parts
+
+    def _side_parts(
+        self,
+        corners: IntArray,  # (p,): corners at which the edges of patches begin
+        samples: IntArray,  # samples of a patch from these corners along the edges
+        along: FloatArray,  # parameters of these samples along the edge
+    ) -> list[GridPart]:
+        """The part of the samples inside edges, and that of the sample at the corners."""
+        uv, steps = np.stack([along, np.zeros_like(along)], axis=1), np.arange(len(samples))
+        at_edge = np.flatnonzero(self._owns_edge[corners])
+        at_vertex = np.flatnonzero(self.topology.vertex_half_edge[self.topology.face_vertices[corners]] == corners)
+        inside, begin = corners[at_edge], corners[at_vertex]
+        return [
+            GridPart(samples[1:], steps[:-1], at_edge, self.edge_start(inside), inside, uv[1:]),
+            GridPart(samples[:1], steps[:1], at_vertex, self._at_corners(begin), begin, uv[:1]),
+        ]
+
+    def _corner_layout(self, corners: IntArray, turns: IntArray, is_whole: bool) -> tuple[FloatArray, list[GridPart]]:
+        """`layout` of patches that lie at single corners of elements.
+
+        A patch reaches half way along its corner's two edges, and to the element's centre, which is (1, 1).
+        """
+        t, r, count, grid = self.topology, self.rate, self._half + 1, self._corner_parameters
+        # The element's centre is an additional sample after the grid. For an even rate, some samples of the grid are
+        # evaluated otherwise: the last row, with the midpoint of the preceding edge, by the preceding corner's patch,
+        # and the last sample of the grid is the centre itself.
+        uv, index = np.append(grid.reshape(-1, 2), [[1.0, 1.0]], axis=0), np.arange(count**2).reshape(count, count)
+        n, centre = len(self._inside), np.array([count**2])
+        parts = self._side_parts(corners, index[0], grid[0, :, 0])
+
+        def add(samples: IntArray, offsets: IntArray, patches: IntArray, first_vertex: IntArray) -> None:
+            parts.append(GridPart(samples, offsets, patches, first_vertex, corners[patches], uv[samples]))
+
+        previous = t.prev[corners]
+        at_back = np.flatnonzero(self._owns_edge[previous])
+        add(index[self._inside, 0], r - 1 - self._inside, at_back, self.edge_start(previous[at_back]))
+        if not is_whole:
+            patches, first = np.arange(len(corners)), np.flatnonzero(turns == 0)
+            inside = index[1 : n + 1, 1 : n + 1].ravel()
+            add(inside, np.arange(n**2), patches, self._corner_start(corners))
+            add(centre, np.zeros(1, dtype=np.int64), first, self.inner_start[t.face[corners[first]]])
+            if not self._is_odd:
+                add(index[self._inside, -1], np.arange(n), patches, self._spoke_start(corners))
+            return uv, parts
+        # A patch evaluates the samples that are nearest to its corner and, for an even rate, those on its spoke; the
+        # first corner's patch evaluates the centre.
+        nearest = index[1 : n + 1, 1:].ravel()
+        for turn in range(4):
+            samples = nearest if turn or self._is_odd else np.append(nearest, centre)
+            x, y = np.rint(r * self.domain.rotation(turn)(uv[samples] / 2)).astype(np.int64).T
+            patches = np.flatnonzero(turns == turn)
+            add(samples, (y - 1) * (r - 1) + x - 1, patches, self.inner_start[t.face[corners[patches]]])
+        # The centre has parameters of 1 in a patch, and of 1/2 in the element.
+        return uv, [part._replace(uv=part.uv / 2) for part in parts]
+
+    def locations(self) -> tuple[IntArray, FloatArray]:
+        """Locations of the vertices on the surface.
+
+        Returns
+        -------
+        half_edge : (vertex_count,) int64
+            Corner of an element at which the parameters are (0, 0), a half-edge of `PatchTable.elements`.
+        uv : (vertex_count, 2) float64
+            Parameters. Vertices at corners of elements have (0, 0).
+        """
+        t = self.topology
+        half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
+        for corners in (t.face_offsets[:-1][self._is_whole], t.half_edges_of(~self._is_whole)):
+            for part in self.layout(corners)[1] if len(corners) else ():
+                half_edge[part.vertices] = part.corners[:, None]
+                uv[part.vertices] = part.uv
+        return half_edge, uv
+
+    # Other grids
+
+    def at_rate(self, rate: int) -> UniformGrid:
+        """A grid of another rate over the same elements."""
+        return UniformGrid(self.domain, self.topology, rate)
+
+    def cut(self, topology: Topology) -> UniformGrid:
+        """The same triangles over elements with the same half-edges, cut along more edges.
+
+        Vertices on a cut have a copy on each side, which is located on that side.
+        """
+        return UniformGrid(self.domain, topology, self.rate)
+
+    def vertices_of(self, other: Any) -> IntArray:
+        """``(vertex_count,)`` the original of each vertex in a grid of which this one is a `cut`."""
+        t, steps = self.topology, np.arange(1, self.rate)
+        originals = np.empty(self.vertex_count, dtype=np.int64)
+        originals[self.corner_vertex[t.face_vertices]] = other.corner_vertex[other.topology.face_vertices]
+        originals[self.edge_start(t.edge_half_edge)[:, None] + steps - 1] = other.along(t.edge_half_edge, steps)
+        originals[self.inner_begin :] = np.arange(other.inner_begin, other.vertex_count)
+        return originals
 
 
-def slices_of(indices: IntArray, size: int) -> Iterator[IntArray]:
+def _cut_cells(rows: int, columns: int) -> IntArray:
+    """Triangles of a grid of ``rows x columns`` vertices, as indices into it: ``(cells * 2, 3)``.
+
+    Diagonals start at the grid's corners and do not cut these off: two grids that meet in two edges, at a vertex of
+    valence 2, would both have the same triangle there.
+    """
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    v, u = np.indices((rows - 1, columns - 1)).reshape(2, -1)
+    across = (2 * u + 1 > columns - 1) != (2 * v + 1 > rows - 1)
+    a, b, c, d = (np.where(across, second, first) for first, second in ((a, b), (b, c), (c, d), (d, a)))
+    return np.stack([a, b, c, a, c, d], axis=1).reshape(-1, 3)
+
+
+def _slices(indices: IntArray, size: int) -> Iterator[IntArray]:
     """Split indices, each of which represents ``size`` vertices, into slices of about `VERTICES_AT_ONCE` vertices."""
     length = max(1, VERTICES_AT_ONCE // size)
     for begin in range(0, len(indices), length):

@@ -197,15 +197,15 @@ class VertexPolynomials:
 
 
 class VertexRuns(NamedTuple):
-    """The vertices of a tessellation, in runs of consecutive vertices.
+    """The vertices of a tessellation, in runs: samples of one patch.
 
-    The vertices of a run are samples of one patch. All runs of a kind have the same samples, on different patches of
-    one class.
+    All runs of a kind have the same samples and offsets, on different patches of one class.
     """
 
     patch_class: IntArray  # (k,): index of the class of each kind
     counts: IntArray  # (k,): number of samples of each kind
     samples: IntArray  # (n,): samples of all kinds, as indices in their classes
+    offsets: IntArray  # (n,): from the first vertex of a run to the vertex of each sample
     kind: IntArray  # (r,): kind of each run
     patch: IntArray  # (r,): patch of each run, 0-based in its class
     first_vertex: IntArray  # (r,): first vertex of each run
@@ -281,7 +281,7 @@ def _of_form(
         run_kind[order].astype(np.int32),
         runs.first_vertex[run[order]].astype(np.uint32),
         np.append(first_entry, len(entry)),
-        ragged.index_in_row(runs.counts)[entry].astype(np.int32),
+        runs.offsets[entry].astype(np.int32),
         st,
     )
 
