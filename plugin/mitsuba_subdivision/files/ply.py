@@ -23,7 +23,7 @@ from ..whole_file import whole_file
 from .formats import warn_of_losses
 
 if TYPE_CHECKING:
-    from plyfile import PlyElement
+    from plyfile import PlyData, PlyElement
 
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -69,7 +69,7 @@ def read_ply(path: str | Path) -> CageContents:
         return _contents(_elements(content, name, lines, binary), name, lines)
 
 
-def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: bool) -> dict[str, PlyElement]:
+def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: bool) -> PlyData:
     try:
         from plyfile import PlyData
     except ImportError:
@@ -90,9 +90,9 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
                     lengths = {"face": dict.fromkeys(_FACE_LISTS, corners)}
                     with suppress(Exception):
                         file.seek(0)
-                        return {element.name: element for element in PlyData.read(file, known_list_len=lengths)}
+                        return PlyData.read(file, known_list_len=lengths)
         try:
-            return {element.name: element for element in PlyData.read(io.BytesIO(content), mmap=False)}
+            return PlyData.read(io.BytesIO(content), mmap=False)
         except UnicodeDecodeError:
             raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
         # Damaged files make plyfile raise errors of its own, of Python and of NumPy.
@@ -106,10 +106,10 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
             raise CageError(f"{where}: {shortened(what, 200)}{cut}; expected a PLY file") from None
 
 
-def _contents(elements: dict[str, PlyElement], name: str, lines: dict[str, IntArray]) -> CageContents:
+def _contents(elements: PlyData, name: str, lines: dict[str, IntArray]) -> CageContents:
     for wanted in ("vertex", "face"):
         if wanted not in elements or not len(elements[wanted].data):
-            there = _listed([f"{element.name} ({len(element.data)})" for element in elements.values()]) or "none"
+            there = _listed([f"{element.name} ({len(element.data)})" for element in elements]) or "none"
             raise CageError(f'{name}: there is no element "{wanted}" with rows; the file has {there}')
     vertex, face = elements["vertex"], elements["face"]
     numbers, lists = _properties(vertex)

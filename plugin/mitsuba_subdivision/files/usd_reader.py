@@ -36,20 +36,15 @@ Read = TypeVar("Read")
 
 def read_usd(
     path: str | Path,
-    # Path of the mesh, or of a prim with one mesh below it, or "*" for all meshes as one cage. By default, the file's
-    # only mesh.
     prim: str | None = None,
-    # Time code. By default, each value is the one that does not depend on time, or else the one at its first time. If a
-    # mesh has no points or faces at its first time, it is read at the first time at which it has both.
     time: float | None = None,
     rules: Mapping[str, str] | None = None,  # Rules and scheme that replace the mesh's own, which are then not read
 ) -> CageContents:
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
-    The orientation of faces is reversed in left-handed meshes and in those that their transform mirrors, so that faces
-    are counter-clockwise from outside. Skeletons and blend shapes move the points, as usd-core evaluates them.
-
-    Raises CageError and OSError, and warns, as `ControlCage.from_file`; the cage itself is not validated.
+    ``prim`` and ``time`` are those of `ControlCage.from_file`, and so are errors and warnings; the cage itself is not
+    validated. The orientation of faces is reversed in left-handed meshes and in those that their transform mirrors, so
+    that faces are counter-clockwise from outside. Skeletons and blend shapes move the points, as usd-core does.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):

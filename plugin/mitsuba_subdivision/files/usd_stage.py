@@ -258,11 +258,10 @@ def chosen_meshes(
 
     def without(paths: list[Sdf.Path], is_skipped: Callable[[UsdGeom.Mesh], bool], why: str) -> list[Sdf.Path]:
         """The meshes that are not skipped, with a warning about the others; all if all would be skipped."""
-        skipped = {mesh for mesh in paths if is_skipped(meshes[mesh])}
-        if not skipped or len(skipped) == len(paths):
-            return paths
-        warn(f"{name}: meshes {_listed(mesh for mesh in paths if mesh in skipped)} left out, as {why}")
-        return [mesh for mesh in paths if mesh not in skipped]
+        kept = [mesh for mesh in paths if not is_skipped(meshes[mesh])]
+        if kept and len(kept) < len(paths):
+            warn(f"{name}: meshes {_listed(mesh for mesh in paths if mesh not in kept)} left out, as {why}")
+        return kept or paths
 
     if path == ALL:
         why = "they are invisible, guides or proxies; expected meshes to be seen"
