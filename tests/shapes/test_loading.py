@@ -248,6 +248,20 @@ def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
     assert patches[0] is patches[1] is not patches[2]
 
 
+@every_array_variant
+@shadings
+def test_shapes_of_equal_cages_share_their_vertices_until_control_points_of_one_move(shading):
+    cage = cube(creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10)])
+    one, two = (mi.traverse(made(cage, shading=shading)) for _ in range(2))
+    assert one["vertex_positions"].index == two["vertex_positions"].index
+    before = {name: np.array(two[name]) for name in ("vertex_positions", "vertex_normals")}
+    update(one, control_points=one["control_points"] * 2, to_world=mi.ScalarTransform4f().scale(3))
+    np.testing.assert_allclose(np.array(one["vertex_positions"]), 6 * before["vertex_positions"], rtol=SINGLE)
+    dr.scatter(two["vertex_positions"], 7.0, dr.uint32_array_t(type(two["vertex_positions"]))(0))
+    for name, values in before.items():
+        np.testing.assert_array_equal(np.array(mi.traverse(made(cage, shading=shading))[name]), values)
+
+
 @exact
 @every_array_variant
 def test_nothing_is_kept_when_the_last_shape_has_gone():

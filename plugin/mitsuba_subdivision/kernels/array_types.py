@@ -7,6 +7,7 @@ array has a number or a vector for each lane; inactive lanes read zeros and writ
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -40,6 +41,25 @@ Ray = Any
 # Mode of scatters to distinct indices. With other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
 _UPLOADED: Shared[SharedArray] = Shared()
+
+
+class LaterArrays:
+    """A value of `Shared` that computes its arrays at their first use, as this waits for Dr.Jit."""
+
+    # Without `__dict__`, so that Dr.Jit does not traverse it as a shape's state.
+    __slots__ = ("__weakref__", "_arrays")
+
+    def __init__(self) -> None:
+        self._arrays: Any = None
+
+    def get(self, compute: Callable[[], Any]) -> Any:
+        """Return the arrays; the first call computes them, and waits: kernels of other threads would not."""
+        if self._arrays is None:
+            arrays = compute()
+            dr.eval(arrays)
+            dr.sync_thread()
+            self._arrays = arrays
+        return self._arrays
 
 
 class ArrayTypes:

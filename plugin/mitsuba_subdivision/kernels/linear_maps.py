@@ -18,9 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.shared import Content, LaterArray, Shared, SharedArray
+from ..mesh.shared import Content, Shared, SharedArray
 from ..patches.piece_table import NOTHING, PACKET, piece_packets
-from .array_types import NO_CONFLICTS, ArrayTypes, FloatBuffer, Index, IndexBuffer, Mask, Value, Vector3, Vector4
+from .array_types import (
+    NO_CONFLICTS,
+    ArrayTypes,
+    FloatBuffer,
+    Index,
+    IndexBuffer,
+    LaterArrays,
+    Mask,
+    Value,
+    Vector3,
+    Vector4,
+)
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -29,7 +40,7 @@ if TYPE_CHECKING:
 
 _MATRICES: Shared[SparseMatrix] = Shared()
 _MAPS: Shared[CoefficientMap] = Shared()
-_MADE: Shared[LaterArray] = Shared()
+_MADE: Shared[LaterArrays] = Shared()
 
 
 def attached(values: Any, argument: Any, forward: Callable[..., Any], backward: Callable[..., Any]) -> Any:
@@ -363,7 +374,7 @@ class ControlValues:
         # Never replaced, because other objects may hold a reference to the array.
         self.flat: FloatBuffer = types.float()
         # Keeps the array that is shared with objects of equal values.
-        self._shared: SharedArray | LaterArray | None = None
+        self._shared: SharedArray | LaterArrays | None = None
 
     def load(self, values: NDArray[np.floating]) -> ControlValues:
         """Set the values ``(n, k)`` of the cage, and return this object.
@@ -375,7 +386,7 @@ class ControlValues:
             self._shared = types.shared_floats(values)
             self.take(self._shared.array)
         else:
-            self._shared = _MADE.get((linear_map, Content(values)), LaterArray)
+            self._shared = _MADE.get((linear_map, Content(values)), LaterArrays)
             self.take(self._shared.get(lambda: linear_map(types.floats(values), self.size)))
         return self
 

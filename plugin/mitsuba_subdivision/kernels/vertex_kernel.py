@@ -63,7 +63,8 @@ class VertexKernel:
         padded, buffers = self._padded(control_points), self._buffers()
         for part in self._parts:
             part.evaluate(padded, buffers)
-        return EvaluatedVertices(self, control_points, *buffers)
+        positions, normals = buffers
+        return EvaluatedVertices(self, control_points, positions, normals, self.welded(positions))
 
     def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, ...]:
         """Directional derivatives of points and normals for a change of the control points; flat, detached."""
@@ -91,8 +92,9 @@ class VertexKernel:
         """Positions that are bitwise equal on both sides of a crease, see `VertexTable.weld_target`."""
         return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
 
-    def _buffers(self) -> tuple[FloatBuffer, ...]:
-        return tuple(dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(2))
+    def _buffers(self) -> tuple[FloatBuffer, FloatBuffer]:
+        positions, normals = (dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(2))
+        return positions, normals
 
 
 class _Part:
@@ -200,6 +202,7 @@ class EvaluatedVertices:
     # flat Dr.Jit float arrays, (3 vertex_count): points and unit normals; detached
     positions: FloatBuffer
     normals: FloatBuffer
+    welded: FloatBuffer  # Positions, see `VertexKernel.welded`
 
     def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Attach positions and normals to control points if these are differentiated, without evaluating again.
@@ -208,6 +211,8 @@ class EvaluatedVertices:
 
         Returns positions, normals, flat Dr.Jit float arrays, (3 vertex_count).
         """
+        if not dr.grad_enabled(control_points):
+            return self.welded, self.normals
         kernel, values = self.kernel, (self.positions, self.normals)
         derivatives = (partial(function, self.control_points) for function in (kernel.changes, kernel.gradient))
         positions, normals = attached(values, control_points, *derivatives)

@@ -46,22 +46,6 @@ class SharedArray:
     array: Any
 
 
-class LaterArray:
-    """A value of `Shared` that creates its array later, for arrays whose creation may wait for Dr.Jit."""
-
-    # Without `__dict__`, so that Dr.Jit does not traverse it as a shape's state.
-    __slots__ = ("__weakref__", "_array")
-
-    def __init__(self) -> None:
-        self._array: Any = None
-
-    def get(self, make: Callable[[], Any]) -> Any:
-        """Return the array; the first call creates it."""
-        if self._array is None:
-            self._array = make()
-        return self._array
-
-
 class Shared(Generic[Value]):
     """Cache of values that are created at their first use and kept while they are referenced elsewhere."""
 

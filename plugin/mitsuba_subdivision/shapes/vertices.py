@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import mapped, take_over
-from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, Matrix4
+from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays, Matrix4
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray
 from ..surface import LimitSurface
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 # Kernels and arrays, shared by shapes with the same tessellation.
 _KERNELS: Shared[VertexKernel] = Shared()
 _SHARED: Shared[SharedArray] = Shared()
+# Vertices of loaded control points in object space, shared by shapes of equal cages, and their largest number: few take
+# longer to trace than to compute, and more take memory.
+_LOADED: Shared[LaterArrays] = Shared()
+MOST_SHARED = 1 << 14
 
 
 class MovingVertices:
@@ -69,6 +74,10 @@ class MovingVertices:
         self.are_differentiable = self._kernel is not None and dr.is_diff_v(variant.Float)
         self._computed: set[int] = set()
         self._evaluated: EvaluatedVertices | None = None
+        # None if vertices are not shared, or control points have moved.
+        self._loaded: LaterArrays | None = None
+        if self._kernel is not None and table.vertex_count <= MOST_SHARED:
+            self._loaded = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
         # differently and averaged; with exact shading, only one of them is kept.
         copied, kept, self._displaced = attributes.surface_vertex, None, None
@@ -100,6 +109,8 @@ class MovingVertices:
     ) -> dict[str, FloatBuffer]:
         """Evaluate the mesh's buffers, and update exact shading. Returns the buffers by name."""
         points, surface = self._points(control_points), self._surface
+        if moves_points:
+            self._loaded = None
         if surface is not None and moves_points:
             surface.set_control_points(points)
         elif surface is not None and self.are_differentiable and dr.grad_enabled(points):
@@ -111,9 +122,11 @@ class MovingVertices:
         self._evaluated = None
         if self._kernel is None:
             return self._placed(*self._on_host(points), points, placement)
-        evaluated = self._kernel.evaluated(dr.detach(points))
-        # Also kept for a displacement, as gradients of heights may be enabled later.
-        self._evaluated = evaluated if moves or self._displaced is not None else None
+        evaluate = partial(self._kernel.evaluated, dr.detach(points))
+        evaluated = evaluate() if self._loaded is None else self._loaded.get(evaluate)
+        # Shared vertices are kept for frozen functions; others for a displacement, as gradients of heights may be
+        # enabled later.
+        self._evaluated = evaluated if moves or self._displaced is not None or self._loaded is not None else None
         return self._placed(*evaluated.attached(points), points, placement)
 
     def attached(self, control_points: FloatBuffer, placement: Placement) -> dict[str, FloatBuffer]:
