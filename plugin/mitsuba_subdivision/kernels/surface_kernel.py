@@ -348,7 +348,8 @@ class SurfaceKernel:
 
     def line_hits(self, p: Vector3, d: Vector3, location: Location, active: Mask = True, **limits: Float) -> LineHits:
         """Intersect lines with the surface near given locations, see `line_hits`. Results are detached."""
-        with dr.suspend_grad():
+        # Optimised loops are traced twice, which takes longer than it saves.
+        with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             piece = partial(self._piece, dr.detach(self.coefficients))
             return line_hits(self.walk, piece, p, d, location, active, **limits)
 

@@ -93,8 +93,8 @@ class VertexKernel:
         return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
 
     def _buffers(self) -> tuple[FloatBuffer, FloatBuffer]:
-        positions, normals = (dr.empty(self._types.float, 3 * self.vertex_count) for _ in range(2))
-        return positions, normals
+        kind, size = self._types.float, 3 * self.vertex_count
+        return dr.empty(kind, size), dr.empty(kind, size)
 
 
 class _Part:

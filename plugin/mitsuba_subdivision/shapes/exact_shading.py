@@ -223,29 +223,31 @@ class ExactShading:
         """Value of a mesh attribute; in spectral variants the coefficients of a colour's spectrum."""
         if name not in self._attributes:
             return None
-        vector3 = self.kernel.types.vector3
+        vector3, wi = self.kernel.types.vector3, dr.detach(si.wi)
         # The interaction contains the triangle, but not the location. Intersect the line through its point along the
-        # ray again; where a BSDF has swapped front and back, along the mirrored ray.
-        start = self._located(si.prim_index, 1 / 3, 1 / 3, active)
-        to_world, wi = self._map, dr.detach(si.wi)
-        hit = to_world.inverse_point(vector3(dr.detach(si.p)))
-        direction, mirrored = self._direction(si, wi), self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
+        # ray again.
+        to_world, direction = self._map, self._direction(si, wi)
+        start, hit = self._located(si.prim_index, 1 / 3, 1 / 3, active), to_world.inverse_point(vector3(dr.detach(si.p)))
         hits = self.kernel.line_hits(hit, to_world.inverse_direction(direction), start, active)
-        with dr.suspend_grad():
-            # Texture coordinates, or parameters if the cage has none: the components of ``si.uv``.
-            u, v = hits.location.u, hits.location.v
-            if self._texcoords is not None:
-                u, v = self._texcoords(hits.location, active)[0]
-        is_mirrored = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
-        mirrored_hits = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_mirrored)
-        location = hits.location.chosen(is_mirrored, mirrored_hits.location)
+        location, kind, shape = hits.location, hits.kind, self._shape()
+        if shape is None or int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide):
+            # Where `twosided` has swapped front and back, intersect the mirrored ray.
+            mirrored = self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
+            with dr.suspend_grad():
+                # Texture coordinates, or parameters if the cage has none: the components of ``si.uv``.
+                u, v = location.u, location.v
+                if self._texcoords is not None:
+                    u, v = self._texcoords(location, active)[0]
+            is_mirrored = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
+            hits = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_mirrored)
+            location, kind = location.chosen(is_mirrored, hits.location), dr.select(is_mirrored, hits.kind, kind)
+            direction = dr.select(is_mirrored, mirrored, direction)
         if dr.grad_enabled(si.p):
             # The hit stays on its line. So does the point of the interaction, even if it is that of the triangle.
-            is_held = dr.select(is_mirrored, mirrored_hits.kind, hits.kind) == ON_LINE
             if dr.grad_enabled(self.to_world):
                 to_world = AffineMap.of(self.to_world)
-            d = to_world.inverse_direction(dr.select(is_mirrored, mirrored, direction))
-            lines = Lines(to_world.inverse_point(vector3(si.p)), d, is_held)
+            o, d = to_world.inverse_point(vector3(si.p)), to_world.inverse_direction(direction)
+            lines = Lines(o, d, kind == ON_LINE)
             location = self.kernel.at(location, active, constraint=lines).location
         value = self._attributes[name](location, active)[0]
         return self._upsampling(value) if self._upsampling and name in self._colors else value

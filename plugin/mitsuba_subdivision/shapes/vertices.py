@@ -123,7 +123,7 @@ class MovingVertices:
         if self._kernel is None:
             return self._placed(*self._on_host(points), points, placement)
         evaluate = partial(self._kernel.evaluated, dr.detach(points))
-        evaluated = evaluate() if self._loaded is None else self._loaded.get(evaluate)
+        evaluated: EvaluatedVertices = evaluate() if self._loaded is None else self._loaded.get(evaluate)
         # Shared vertices are kept for frozen functions; others for a displacement, as gradients of heights may be
         # enabled later.
         self._evaluated = evaluated if moves or self._displaced is not None or self._loaded is not None else None
