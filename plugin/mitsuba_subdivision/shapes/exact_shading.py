@@ -227,7 +227,8 @@ class ExactShading:
         # The interaction contains the triangle, but not the location. Intersect the line through its point along the
         # ray again.
         to_world, direction = self._map, self._direction(si, wi)
-        start, hit = self._located(si.prim_index, 1 / 3, 1 / 3, active), to_world.inverse_point(vector3(dr.detach(si.p)))
+        start = self._located(si.prim_index, 1 / 3, 1 / 3, active)
+        hit = to_world.inverse_point(vector3(dr.detach(si.p)))
         hits = self.kernel.line_hits(hit, to_world.inverse_direction(direction), start, active)
         location, kind, shape = hits.location, hits.kind, self._shape()
         if shape is None or int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide):
