@@ -35,7 +35,7 @@ def main(stage, camera):
     )
     lap()
     scene = bpy.context.scene
-    _subdivide([each for each in bpy.data.objects if each.type == "MESH"])
+    _subdivide([mesh for mesh in bpy.data.objects if mesh.type == "MESH"])
     _set_up(scene, camera)
     lap()
     with tempfile.TemporaryDirectory() as folder:
@@ -51,12 +51,12 @@ def main(stage, camera):
 
 
 def _subdivide(meshes):
-    for each in meshes:
+    for mesh in meshes:
         # Materials that it could not read would be black, where paths end, or magenta, which may emit light.
-        if not all(_is_read(material) for material in each.data.materials):
-            each.data.materials.clear()
+        if not all(_is_read(material) for material in mesh.data.materials):
+            mesh.data.materials.clear()
         # The importer adds a modifier where the scheme is catmullClark. Polygons at one pixel would be other work.
-        for modifier in each.modifiers:
+        for modifier in mesh.modifiers:
             if modifier.type == "SUBSURF":
                 modifier.use_adaptive_subdivision = True
                 modifier.adaptive_space, modifier.adaptive_pixel_size = "PIXEL", 1.0

@@ -29,13 +29,13 @@ def main(task, obj, binary, rate, repeats, variant):
             clocks.append(Clock())
             run(clocks[-1])
     cold, *warm = clocks
-    found = {
+    result = {
         "cold": {name: seconds[0] for name, seconds in cold.seconds.items()},
         "warm": {name: min(clock.seconds[name][0] for clock in warm) for name in cold.seconds},
         "memory": {name: max(clock.memory[name] for clock in warm) for name in cold.memory},
         "peak": max(clock.peak for clock in clocks),
     }
-    print(json.dumps(found))
+    print(json.dumps(result))
 
 
 def total(_obj, binary, rate, _variant, _folder):

@@ -27,11 +27,11 @@ def main(arguments=None):
         surface, rng = msub.LimitSurface(msub.ControlCage.from_file(path)), np.random.default_rng(0)
         classes = surface.patches.class_count
         places = [random_locations(surface, rng, options.samples) for _ in range(options.repeats)]
-        first = seconds(lambda where=places[0], own=surface: own.evaluate(*where))
-        again = min(seconds(lambda at=where, own=surface: own.evaluate(*at)) for where in places)
+        first = seconds(surface.evaluate, *places[0])
+        again = min(seconds(surface.evaluate, *where) for where in places)
         table = surface.sampling(options.rate)
         vertex_count = len(table.apply(surface.cage.positions)[0])
-        vertices = min(seconds(lambda own=table, at=surface: own.apply(at.cage.positions)) for _ in places)
+        vertices = min(seconds(table.apply, surface.cage.positions) for _ in places)
         sample, vertex = again / options.samples, vertices / vertex_count
         print(
             f"{path.stem}, {surface.patches.patch_count} patches, {classes} classes: first {1e3 * first:.0f} ms; again "
@@ -47,10 +47,10 @@ def random_locations(surface, rng, count):
     return element, uv, rng.integers(0, elements.face_sizes[element])
 
 
-def seconds(work):
+def seconds(work, *arguments):
     """Of the processor, that some work takes."""
     begin = time.process_time()
-    work()
+    work(*arguments)
     return time.process_time() - begin
 
 

@@ -44,9 +44,9 @@ def test_benchmarks_of_the_smallest_cage_run(tmp_path):
 )
 def test_other_benchmarks_run(words, expected):
     program, *options = words.split()
-    found = said(HERE / program, *options)
-    assert expected in found
-    assert "failed" not in found
+    printed = said(HERE / program, *options)
+    assert expected in printed
+    assert "failed" not in printed
 
 
 STAGE = """#usda 1.0
@@ -84,10 +84,10 @@ def test_a_whole_stage_is_measured_without_cycles(tmp_path):
     assert done.returncode == 1
     assert "there is no such file; expected a USD stage" in done.stderr
     stage.write_text(STAGE)
-    found = said(*words, "--cycles", sys.executable)
-    assert "Cycles: left out" in found
-    (ratios,) = re.findall("exact / vertex: (.*)", found)
-    stages = [re.sub(r" [0-9.]+ \(CPU [0-9.]+\)$", "", each) for each in ratios.split(", ")]
+    printed = said(*words, "--cycles", sys.executable)
+    assert "Cycles: left out" in printed
+    (ratios,) = re.findall("exact / vertex: (.*)", printed)
+    stages = [re.sub(r" [0-9.]+ \(CPU [0-9.]+\)$", "", ratio) for ratio in ratios.split(", ")]
     assert stages == ["program to picture", "file to picture", "next picture"]
 
 

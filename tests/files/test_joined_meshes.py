@@ -63,9 +63,9 @@ def test_the_surface_of_joined_meshes_is_that_of_each(read):
         alone, uv = LimitSurface(read(SHEET, HOUSE, prim=name)), [[0.2, 0.3], [0.5, 0.1]]
         np.testing.assert_array_equal(whole.evaluate(element, uv).p, alone.evaluate(face, uv).p)
         for data in ("texcoords", "w"):
-            found, expected = (whole.evaluate_attribute(data, element, uv), alone.evaluate_attribute(data, face, uv))
+            values, expected = (whole.evaluate_attribute(data, element, uv), alone.evaluate_attribute(data, face, uv))
             # Alone they may be cut apart at every edge, and are linear then.
-            np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
+            np.testing.assert_allclose(values, expected, rtol=0, atol=ROUNDING)
 
 
 def test_one_mesh_is_joined_to_none_and_a_mesh_among_others_is_still_an_error(read):

@@ -66,18 +66,18 @@ def read_quietly(path):
 
 
 def assert_reads_as(content, path):
-    found = read_quietly(path)
+    contents = read_quietly(path)
     positions, sizes, vertices, vertex_lines, face_lines, values, indices = slow_read(content)
-    np.testing.assert_array_equal(found.positions, positions)
-    np.testing.assert_array_equal(found.face_sizes, sizes)
-    np.testing.assert_array_equal(found.face_vertices, vertices)
-    assert [*found.source.vertex_lines] == vertex_lines
-    assert [*found.source.face_lines] == face_lines
+    np.testing.assert_array_equal(contents.positions, positions)
+    np.testing.assert_array_equal(contents.face_sizes, sizes)
+    np.testing.assert_array_equal(contents.face_vertices, vertices)
+    assert [*contents.source.vertex_lines] == vertex_lines
+    assert [*contents.source.face_lines] == face_lines
     if not values or None in indices:
-        assert found.texcoords is None
+        assert contents.texcoords is None
     else:
-        np.testing.assert_array_equal(found.texcoords.values, values)
-        np.testing.assert_array_equal(found.texcoords.indices, indices)
+        np.testing.assert_array_equal(contents.texcoords.values, values)
+        np.testing.assert_array_equal(contents.texcoords.indices, indices)
 
 
 def test_file_with_every_feature(obj_file):
@@ -164,10 +164,10 @@ def test_a_million_digits_are_read_as_fast_as_any_text(obj_file, statement, end)
 
 
 def test_old_mac_line_ends_and_faces_before_their_vertices(obj_file):
-    found = read_quietly(obj_file(b"# old\rf 1 2 3\rv 0 0 0\rv 1 0 0\rv 0 1 0\rf 3 2 1\r"))
-    np.testing.assert_array_equal(found.positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    np.testing.assert_array_equal(found.face_vertices, [0, 1, 2, 2, 1, 0])
-    np.testing.assert_array_equal(found.source.face_lines, [2, 6])
+    contents = read_quietly(obj_file(b"# old\rf 1 2 3\rv 0 0 0\rv 1 0 0\rv 0 1 0\rf 3 2 1\r"))
+    np.testing.assert_array_equal(contents.positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(contents.face_vertices, [0, 1, 2, 2, 1, 0])
+    np.testing.assert_array_equal(contents.source.face_lines, [2, 6])
 
 
 AT_LEAST_3, DECIMAL = "expected at least 3", "expected a decimal number"
@@ -191,7 +191,7 @@ MALFORMED = [
     (f"v 0 0 {'x' * 999}\nf 1 2 3\n", [f'line 1: malformed number "{"x" * 80}..."', DECIMAL]),
     (b"v 0 0 1\xe2\x80\xa8\nf 1 2 3\n", [r'line 1: malformed number "1\xe2\x80\xa8"', DECIMAL]),
     (b"v 0 0 \xff\nf 1 2 3\n", [r'line 1: malformed number "\xff"', DECIMAL]),
-    *((f"{TRIANGLE}f 1 2 3\nf 1 {each} 3\n", [f'line 5: malformed number "{each}"', FORMS]) for each in NO_CORNERS),
+    *((f"{TRIANGLE}f 1 2 3\nf 1 {bad} 3\n", [f'line 5: malformed number "{bad}"', FORMS]) for bad in NO_CORNERS),
     (TRIANGLE + "f 1 0 3\n", ["line 4: vertex index 0 is out of range", "expected 1 to 3", "has 3 vertices"]),
     (TRIANGLE + "f 1 2 \\\n 4\n", ["line 5: vertex index 4 is out of range", "expected 1 to 3", "has 3 vertices"]),
     (TRIANGLE + "f 1 2 99999999999999999999\n", ["line 4: vertex index", "expected 1 to 3"]),
@@ -264,6 +264,6 @@ def test_names_of_materials_may_have_a_number_sign(tmp_path):
     uses += ["usemtl # none"]
     faces = (f"{use}\nf {2 * i + 1} {2 * i + 3} {2 * i + 4} {2 * i + 2}\n" for i, use in enumerate(uses))
     (tmp_path / "a.obj").write_text(quads + "".join(faces))
-    found = ControlCage.from_file(tmp_path / "a.obj").materials
+    materials = ControlCage.from_file(tmp_path / "a.obj").materials
     expected = {"a#1": [0], "Material #25": [1, 2], "plain": [3], "": [4]}
-    assert {name: faces.tolist() for name, faces in found.items()} == expected
+    assert {name: faces.tolist() for name, faces in materials.items()} == expected

@@ -68,8 +68,8 @@ def test_corners_propagate_with_their_rule_only(read):
 
 def test_tags_of_several_items(read):
     cage = read("t crease 4/1/0 1 4 0 1 2.5\nt crease 4/2/0 1 2 0 3 3 4\nt corner 2/1/0 0 2 1.5\n")
-    found = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.contents.creases.tolist()}
-    assert found == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
+    sharpness_of = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.contents.creases.tolist()}
+    assert sharpness_of == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
     assert cage.contents.corners.tolist() == [[0, 1.5], [2, 1.5]]
 
 
@@ -206,9 +206,9 @@ def test_many_tags_are_read_as_one_by_one(tmp_path):
         with open(tmp_path / "cage.obj", "a") as file:
             file.writelines(lines[i] for i in order)
         cages.append(ControlCage.from_file(tmp_path / "cage.obj"))
-    for found in cages[1:]:
-        assert same(found.contents, cages[0].contents)
-        assert same(found.source.tag_lines, cages[0].source.tag_lines)
+    for cage in cages[1:]:
+        assert same(cage.contents, cages[0].contents)
+        assert same(cage.source.tag_lines, cages[0].source.tag_lines)
 
 
 def test_a_malformed_line_among_many_tags_is_named(read):

@@ -45,16 +45,16 @@ def read(tmp_path):
 
 
 def element(name, count, *properties):
-    return f"element {name} {count}\n" + "".join(f"property {each}\n" for each in properties)
+    return f"element {name} {count}\n" + "".join(f"property {prop}\n" for prop in properties)
 
 
 def with_data(properties, rows):
     """The sheet with further properties of vertices."""
     lines = SHEET.splitlines()
     start = lines.index("end_header") + 1
-    found = [*lines[:7], *(f"property {name}" for name in properties), *lines[7:start]]
-    found += [f"{line} {row}" for line, row in zip(lines[start : start + 5], rows, strict=True)]
-    return "\n".join([*found, *lines[start + 5 :], ""])
+    changed = [*lines[:7], *(f"property {name}" for name in properties), *lines[7:start]]
+    changed += [f"{line} {row}" for line, row in zip(lines[start : start + 5], rows, strict=True)]
+    return "\n".join([*changed, *lines[start + 5 :], ""])
 
 
 def test_polygons(read):
@@ -116,11 +116,11 @@ def test_tables_and_lists_of_any_length_are_read(tmp_path, np_rng, byte_order, c
     path.write_bytes(content)
 
     with pytest.warns(CageWarning, match='"id" of faces, "none" of faces, the list "pair" of vertices, the list "one"'):
-        found = read_ply(path)
-    np.testing.assert_array_equal(found.face_sizes, corner_counts)
-    np.testing.assert_array_equal(found.face_vertices, np.concatenate(faces))
-    np.testing.assert_array_equal(found.positions[:, 1], points[:, 1])
-    np.testing.assert_array_equal(found.attributes["weight"].values[:, 0], weights)
+        contents = read_ply(path)
+    np.testing.assert_array_equal(contents.face_sizes, corner_counts)
+    np.testing.assert_array_equal(contents.face_vertices, np.concatenate(faces))
+    np.testing.assert_array_equal(contents.positions[:, 1], points[:, 1])
+    np.testing.assert_array_equal(contents.attributes["weight"].values[:, 0], weights)
 
 
 def test_binary_files_are_read_where_no_temporary_file_can_be_made(tmp_path, monkeypatch):
@@ -154,14 +154,14 @@ def test_coordinates_that_are_lists_are_errors(read):
 def test_a_pipe_is_read_once(tmp_path):
     cube().save(tmp_path / "cube.ply")
     os.mkfifo(tmp_path / "pipe.ply")
-    content, found = (tmp_path / "cube.ply").read_bytes(), []
+    content, results = (tmp_path / "cube.ply").read_bytes(), []
     writer = threading.Thread(target=lambda: (tmp_path / "pipe.ply").write_bytes(content), daemon=True)
-    reader = threading.Thread(target=lambda: found.append(read_ply(tmp_path / "pipe.ply")), daemon=True)
+    reader = threading.Thread(target=lambda: results.append(read_ply(tmp_path / "pipe.ply")), daemon=True)
     writer.start()
     reader.start()
     reader.join(timeout=60)
-    assert found
-    assert same(found[0], read_ply(tmp_path / "cube.ply"))
+    assert results
+    assert same(results[0], read_ply(tmp_path / "cube.ply"))
 
 
 @pytest.mark.parametrize("names", ["s t", "u v", "texture_u texture_v"])
@@ -178,8 +178,8 @@ def test_attributes(read):
     cage = read(with_data(properties, [f"0 0 1 255 51 {i} {i / 2} 1 {i} 7" for i in range(5)]))
     expected = {"color": [[1, 0.2, i / 255] for i in range(5)], "quality": [[i / 2] for i in range(5)]}
     expected |= {"flow": [[i, 1] for i in range(5)], "group": [[7]] * 5}
-    assert {name: each.values.tolist() for name, each in cage.attributes.items()} == expected
-    assert {each.interpolation for each in cage.attributes.values()} == {"vertex"}
+    assert {name: attribute.values.tolist() for name, attribute in cage.attributes.items()} == expected
+    assert {attribute.interpolation for attribute in cage.attributes.values()} == {"vertex"}
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_colors_of_bytes_are_scaled_and_those_of_floats_taken_as_they_are(read, 
         ("r g b a", {"color": "rgb", "alpha": "a"}),
         ("alpha red", {"alpha": ["alpha"], "red": ["red"]}),
         ("red green blue r g b", {"color": ["red", "green", "blue"], "r": "r", "g": "g", "b": "b"}),
-        ("color red green blue", {each: [each] for each in ("color", "red", "green", "blue")}),
+        ("color red green blue", {name: [name] for name in ("color", "red", "green", "blue")}),
         ("n_x n_y n_z n_w", {"n": ["n_x", "n_y", "n_z"], "n_w": ["n_w"]}),
         ("n_x n_y", {"n_x": ["n_x"], "n_y": ["n_y"]}),
         ("k_r k_g k_b", {"k_color": ["k_r", "k_g", "k_b"]}),
@@ -209,8 +209,8 @@ def test_colors_of_bytes_are_scaled_and_those_of_floats_taken_as_they_are(read, 
     ],
 )
 def test_names_of_columns(properties, expected):
-    found = {name: list(columns) for name, columns in grouped(properties.split()).items()}
-    assert found == {name: list(columns) for name, columns in expected.items()}
+    columns_of = {name: list(columns) for name, columns in grouped(properties.split()).items()}
+    assert columns_of == {name: list(columns) for name, columns in expected.items()}
 
 
 def test_a_warning_names_what_is_left_out(read):
@@ -228,8 +228,8 @@ def test_integers_of_faces_are_materials(read, name, before):
     text = SHEET.replace("property list", f"{prop}property list") if before else SHEET.replace("end_", f"{prop}end_")
     for row, number in (("4 0 1 2 3", "7"), ("3 1 4 2", "-1")):
         text = text.replace(row, f"{number} {row}" if before else f"{row} {number}")
-    found = read(text).materials
-    assert {name: faces.tolist() for name, faces in found.items()} == {"": [1], "material_7": [0]}
+    materials = read(text).materials
+    assert {name: faces.tolist() for name, faces in materials.items()} == {"": [1], "material_7": [0]}
 
 
 def test_other_elements_are_skipped(read):
@@ -300,9 +300,9 @@ def test_numbers_that_are_not_finite_are_errors_and_no_warnings(read):
 
 def test_many_properties_and_long_names_are_read(read):
     names = [f"a{i}_0" for i in range(1500)] + ["b_" + "9" * 5000, "c_0", "c_1", "d_00", "d_01"]
-    found = read(with_data([f"uchar {name}" for name in names], [" ".join("1" * len(names))] * 5)).attributes
-    assert len(found) == len(names) - 1
-    assert found["c"].values.shape == (5, 2)
+    attributes = read(with_data([f"uchar {name}" for name in names], [" ".join("1" * len(names))] * 5)).attributes
+    assert len(attributes) == len(names) - 1
+    assert attributes["c"].values.shape == (5, 2)
 
 
 @pytest.mark.parametrize("option", [{"prim": "/a"}, {"time": 0}])
@@ -350,9 +350,9 @@ def test_names_of_materials_have_no_place(tmp_path):
     named = ControlCage(cube().positions, faces, materials=materials)
     with pytest.warns(CageWarning, match='no place for the name of material "red" of the cage; written'):
         named.save(tmp_path / "cage.ply")
-    found = ControlCage.from_file(tmp_path / "cage.ply").materials
+    again = ControlCage.from_file(tmp_path / "cage.ply").materials
     expected = {"": [0, 3, 4, 5], "material_0": [2], "material_1": [1]}
-    assert {name: faces.tolist() for name, faces in found.items()} == expected
+    assert {name: faces.tolist() for name, faces in again.items()} == expected
 
 
 def test_faces_of_more_than_255_vertices(tmp_path):

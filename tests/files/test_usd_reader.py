@@ -150,14 +150,14 @@ def test_primvars_become_attributes_and_a_warning_names_those_of_other_kinds(rea
     message = r'prim /World/sheet: primvars "area" \(float\[\], uniform\), "ids" \(int\[\], vertex\) left out; expected'
     with pytest.warns(CageWarning, match=message):
         cage = read(lines)
-    found = cage.attributes
+    attributes = cage.attributes
     kinds = {"displayColor": ("vertex", (6, 3)), "weight": ("varying", (6, 1))}
     kinds |= {"mask": ("face_varying", (8, 1)), "pair": ("vertex", (6, 2))}
-    assert {name: (each.interpolation, each.values.shape) for name, each in found.items()} == kinds
-    np.testing.assert_array_equal(found["displayColor"].values[:, 1], [0, 1, 0, 1, 1, 0])
-    np.testing.assert_array_equal(found["weight"].values[:, 0], np.arange(6))
-    np.testing.assert_array_equal(found["pair"].values, np.arange(12).reshape(6, 2))
-    assert found["mask"].indices.tolist() == list(range(8))
+    assert {name: (attribute.interpolation, attribute.values.shape) for name, attribute in attributes.items()} == kinds
+    np.testing.assert_array_equal(attributes["displayColor"].values[:, 1], [0, 1, 0, 1, 1, 0])
+    np.testing.assert_array_equal(attributes["weight"].values[:, 0], np.arange(6))
+    np.testing.assert_array_equal(attributes["pair"].values, np.arange(12).reshape(6, 2))
+    assert attributes["mask"].indices.tolist() == list(range(8))
 
 
 LEFT_HANDED = "uniform token orientation = 'leftHanded'\n"
@@ -245,7 +245,7 @@ def test_every_attribute_of_a_mesh_is_its_default_or_else_its_first_sample(tmp_p
         (tmp_path / "cage.usda").write_text(f'#usda 1.0\ndef Mesh "sheet" {{\n{lines}\n}}\n')
         contents.append(ControlCage.from_file(tmp_path / "cage.usda").contents)
     assert len(contents[0].creases) == len(contents[0].corners) == len(contents[0].holes) == 1
-    assert all(same(contents[0], each) for each in contents[1:])
+    assert all(same(contents[0], other) for other in contents[1:])
 
 
 def test_every_operation_of_a_transform_has_its_own_first_time(read):

@@ -33,11 +33,11 @@ def test_mitsuba_reads_files(tmp_path, triangles, variant_scalar_rgb, np_rng, ki
     texcoords, attributes = data_of(triangles, np_rng)
     path = tmp_path / f"surface.{kind}"
     save(path, triangles, texcoords, attributes if kind == "ply" else None)
-    found = mi.traverse(mi.load_dict({"type": kind, "filename": str(path), **options}))
-    faces, corners = np.array(found["faces"]), triangles.triangles.ravel()
+    shape = mi.traverse(mi.load_dict({"type": kind, "filename": str(path), **options}))
+    faces, corners = np.array(shape["faces"]), triangles.triangles.ravel()
     assert kind == "obj" or np.array_equal(faces, corners)
     for name, values in (("positions", triangles.positions), ("normals", triangles.normals), ("texcoords", texcoords)):
-        read = np.array(found[f"vertex_{name}"]).reshape(-1, values.shape[1])[faces]
+        read = np.array(shape[f"vertex_{name}"]).reshape(-1, values.shape[1])[faces]
         np.testing.assert_allclose(read, values[corners], rtol=rtol, atol=atol)
 
 
@@ -50,11 +50,11 @@ def test_obj_files_keep_every_bit(tmp_path, triangles, np_rng, dtype, with_texco
     texcoords = np_rng.random((count, 2)).astype(dtype) if with_texcoords else None
     path = tmp_path / "surface.obj"
     write_triangles(path, positions, triangles.normals, triangles.triangles, texcoords)
-    found = ControlCage.from_file(path)
-    np.testing.assert_array_equal(found.positions.astype(dtype), positions)
-    np.testing.assert_array_equal(found.face_vertices, triangles.triangles.ravel())
+    cage = ControlCage.from_file(path)
+    np.testing.assert_array_equal(cage.positions.astype(dtype), positions)
+    np.testing.assert_array_equal(cage.face_vertices, triangles.triangles.ravel())
     if with_texcoords:
-        corners = found.texcoords.values[found.texcoords.indices]
+        corners = cage.texcoords.values[cage.texcoords.indices]
         np.testing.assert_array_equal(corners.astype(dtype), texcoords[triangles.triangles.ravel()])
     normals = np.loadtxt(line[3:] for line in path.read_text().splitlines() if line.startswith("vn "))
     np.testing.assert_array_equal(normals, triangles.normals)
@@ -103,10 +103,10 @@ def test_command(tmp_path, capsys):
     words = ["tessellate", str(tmp_path / "cube.obj"), "--rate", "2", "-o"]
     assert main([*words, str(tmp_path / "out.ply")]) == 0
     assert capsys.readouterr().out == f"{tmp_path / 'out.ply'}: 48 triangles, 26 vertices\n"
-    found = ControlCage.from_file(tmp_path / "out.ply")
+    cage = ControlCage.from_file(tmp_path / "out.ply")
     expected = LimitSurface(cube()).tessellate(2)
-    np.testing.assert_array_equal(found.positions, expected.positions.astype(np.float32))
-    np.testing.assert_array_equal(found.face_vertices, expected.triangles.ravel())
+    np.testing.assert_array_equal(cage.positions, expected.positions.astype(np.float32))
+    np.testing.assert_array_equal(cage.face_vertices, expected.triangles.ravel())
     # With every digit.
     assert main([*words, str(tmp_path / "out.obj")]) == 0
     np.testing.assert_array_equal(ControlCage.from_file(tmp_path / "out.obj").positions, expected.positions)
@@ -153,15 +153,15 @@ def test_materials_are_read_back(tmp_path):
     materials = {"": [0], "red 100%": [1, 4], "großes Glas": [2, 3, 5]}
     square = cube().face_vertices.reshape(-1, 4)
     ControlCage(cube().positions, square, materials=materials).save(tmp_path / "cage.obj")
-    found = ControlCage.from_file(tmp_path / "cage.obj")
-    np.testing.assert_array_equal(found.face_vertices, square.ravel())
-    assert [faces.tolist() for faces in found.materials.values()] == list(materials.values())
-    found.save(tmp_path / "again.obj")
-    assert ControlCage.from_file(tmp_path / "again.obj").materials.keys() == found.materials.keys()
+    again = ControlCage.from_file(tmp_path / "cage.obj")
+    np.testing.assert_array_equal(again.face_vertices, square.ravel())
+    assert [faces.tolist() for faces in again.materials.values()] == list(materials.values())
+    again.save(tmp_path / "again.obj")
+    assert ControlCage.from_file(tmp_path / "again.obj").materials.keys() == again.materials.keys()
     with pytest.warns(CageWarning, match='no place for material "a # b", further materials of a face of the cage'):
         ControlCage(cube().positions, square, materials={"a": [0, 1], "a # b": [1]}).save(tmp_path / "cage.obj")
-    found = ControlCage.from_file(tmp_path / "cage.obj").materials
-    assert {name: faces.tolist() for name, faces in found.items()} == {"": [1, 2, 3, 4, 5], "a": [0]}
+    again = ControlCage.from_file(tmp_path / "cage.obj").materials
+    assert {name: faces.tolist() for name, faces in again.items()} == {"": [1, 2, 3, 4, 5], "a": [0]}
 
 
 def test_existing_file_is_replaced_and_nothing_else_is_left_but_stays_where_that_fails(tmp_path, monkeypatch):

@@ -37,7 +37,7 @@ def views_of(cage, **shape):
     shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, **shape}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **SKY, **LIGHT, "shape": shape})
     sensors = [sensor(place) for place in PLACES]
-    return [View(each, mi.render(scene, sensor=mi.load_dict(each), spp=256)) for each in sensors]
+    return [View(camera, mi.render(scene, sensor=mi.load_dict(camera), spp=256)) for camera in sensors]
 
 
 def made(cage, views, **options):
@@ -60,7 +60,7 @@ def test_a_box_is_found_from_a_cube(views):
     # What is left is noise of four samples.
     assert np.mean(fit.losses[-5:]) < 0.5 * fit.losses[0]
     fitted, expected = (LimitSurface(cage).bounds() for cage in (fit.cage, scaled(cube(), FACTORS)))
-    sizes = [each.upper.max(axis=0) - each.lower.min(axis=0) for each in (fitted, expected)]
+    sizes = [bounds.upper.max(axis=0) - bounds.lower.min(axis=0) for bounds in (fitted, expected)]
     np.testing.assert_allclose(*sizes, rtol=0.03)
 
 
@@ -132,7 +132,7 @@ def test_other_parameters_are_found():
 def test_colours_at_the_cage_are_found_and_refined():
     """They become part of the cage, and go on when it is refined."""
     colours = np.random.default_rng(4).random((8, 3))
-    plain, target = (tagged(cube(), attributes={"colour": each}) for each in (np.full((8, 3), 0.5), colours))
+    plain, target = (tagged(cube(), attributes={"colour": values}) for values in (np.full((8, 3), 0.5), colours))
     shown = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
     options = {"shape": shown, "others": {"surface.cage_colour": 0.12}, "regularizers": {"anchor": 100.0}}
     fit = made(plain, views_of(target, **shown), **options).run(36)
@@ -179,7 +179,7 @@ def assert_resumed(make, steps, checkpoint):
 
 def test_unknown_sharpness_is_refined_with_the_cage(views, tmp_path):
     """The surface stays, and halves of an edge have what is left of its sharpness; also after a checkpoint."""
-    start = tagged(cube(), creases=[(*each, 1.6) for each in TOP])
+    start = tagged(cube(), creases=[(*edge, 1.6) for edge in TOP])
     options = {"sharp_edges": TOP, "crease_of": [0, 0, 1, 1], "refine": [3], "regularizers": {"anchor": 0.1}}
     fit = made(start, views, **options).run(3)
     before = fit.cage, fit.sharpness
@@ -218,9 +218,9 @@ def test_nothing_is_compiled_after_the_second_step(views):
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         fit.run(2)
-        kernels = [each for each in dr.kernel_history() if each["type"] == dr.KernelType.JIT]
+        kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
     assert kernels
-    assert all(each["cache_hit"] for each in kernels)
+    assert all(kernel["cache_hit"] for kernel in kernels)
 
 
 def test_callbacks_see_each_step_and_a_cage_keeps_its_tags(views, tmp_path):

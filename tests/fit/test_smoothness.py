@@ -62,7 +62,7 @@ def test_gradients_of_folds_are_differences(np_rng):
     gradient = np.array(dr.grad(flat))
     flat = points.ravel()
     moved = STEP * np.eye(points.size)
-    expected = [(value(cage, flat + each) - value(cage, flat - each)) / (2 * STEP) for each in moved]
+    expected = [(value(cage, flat + move) - value(cage, flat - move)) / (2 * STEP) for move in moved]
     assert np.abs(gradient).max() > 0.1
     np.testing.assert_allclose(gradient, expected, atol=DIFFERENCE)
 

@@ -130,7 +130,7 @@ _KINDS = (
 
 def _any(pattern: re.Pattern[bytes], content: bytes, random: Random) -> tuple[int, int]:
     """A place of the pattern, any where there is none."""
-    spans = [found.span() for found in pattern.finditer(content)]
+    spans = [match.span() for match in pattern.finditer(content)]
     if not spans:
         start = random.randint(0, len(content))
         return start, start

@@ -67,11 +67,11 @@ def test_what_breaks_the_law_is_found(tmp_path, monkeypatch, read, finding):
     path = tmp_path / "a.obj"
     path.write_bytes(b"v")
     monkeypatch.setattr(ControlCage, "from_file", lambda path, **_: read(path))
-    found = campaign.broken_law(path)
+    problem = campaign.broken_law(path)
     while kept:
         kept.pop().close()
-    assert (found or "").startswith(finding or "")
-    assert (found is None) == (finding is None)
+    assert (problem or "").startswith(finding or "")
+    assert (problem is None) == (finding is None)
 
 
 def test_hangs_and_crashes_are_found_and_the_rest_is_read(tmp_path, monkeypatch):

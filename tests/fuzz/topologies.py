@@ -304,13 +304,13 @@ def evaluate_at(surface, half_edge, uv):
     return surface._sampler.evaluate(corner[half_edge], uv)
 
 
-def is_convention(surface, half_edge, found):
+def is_convention(surface, half_edge, samples):
     """Whether each normal is one of the conventions that depend on the level: at tips of sharp vertices."""
     t = surface.patches.topology
     sharp = t.vertex_rules == VertexRule.CORNER
     if t.semi_sharpness is not None:
         sharp |= t.semi_sharpness.vertices > 0
-    return (found.level == AT_EXTRAORDINARY_POINT) & sharp[t.face_vertices[half_edge]]
+    return (samples.level == AT_EXTRAORDINARY_POINT) & sharp[t.face_vertices[half_edge]]
 
 
 def differences_to_refined(surface, rng, count=24):
@@ -369,11 +369,11 @@ def outcome(seed):
             return "refused as a cage", None
         except SchemeError:
             return "refused by the scheme", None
-        found = differences_to_refined(surface, rng)
-        problem = found.problem
+        differences = differences_to_refined(surface, rng)
+        problem = differences.problem
         if problem is None and rng.random() < TESSELLATED:
             problem = tessellation_problem(surface)
-    return problem or "ok", found
+    return problem or "ok", differences
 
 
 def main():
@@ -384,16 +384,16 @@ def main():
     counts, zeros, worst, begin = Counter(), 0, [0.0, 0.0], time.monotonic()
     for seed in range(arguments.first, arguments.first + arguments.count):
         try:
-            result, found = outcome(seed)
+            result, differences = outcome(seed)
         except Exception:
-            result, found = f"raises {traceback.format_exc().splitlines()[-1]}", None
+            result, differences = f"raises {traceback.format_exc().splitlines()[-1]}", None
         kind = result if result == "ok" or result.startswith("refused") else "wrong"
         counts[kind] += 1
         if kind == "wrong":
             print(f"seed {seed}: {result}", flush=True)
-        if found is not None:
-            zeros += found.zero > 0
-            worst = [max(worst[0], found.point), max(worst[1], found.normal)]
+        if differences is not None:
+            zeros += differences.zero > 0
+            worst = [max(worst[0], differences.point), max(worst[1], differences.normal)]
         if (seed + 1 - arguments.first) % 1000 == 0:
             print(f"{seed + 1 - arguments.first} in {time.monotonic() - begin:.0f} s: {dict(counts)}", flush=True)
     print(f"{dict(counts)}; {zeros} with a zero normal; points differ by {worst[0]:.1e}, normals by {worst[1]:.1e} "

@@ -120,7 +120,7 @@ def with_islands(cage: PeerCage, seams: Iterable[Edge], mode: str) -> PeerCage:
 def _catmull_clark() -> dict[str, PeerCage]:
     around = [*((i, i + 1, INFINITE) for i in range(4)), (4, 9, INFINITE), (5, 10, 2.5)]
     halves = grid(3, 3, triangles=True, creases=[(5, 6, 1.75), (6, 10, INFINITE)])
-    found = {
+    cages = {
         "cube": cube(),
         "piece": lathe(),
         "sheet": grid(3, 3),
@@ -135,19 +135,19 @@ def _catmull_clark() -> dict[str, PeerCage]:
         "smooth triangles, open and creased": replace(halves, triangles="smooth"),
     }
     for valence in (3, 4, 5, 6):
-        found[f"fan {valence}"] = fan(valence)
+        cages[f"fan {valence}"] = fan(valence)
         half = valence // 2
         for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
             for s in (1.75, 4, INFINITE) if valence > 3 else (2.5, INFINITE):
-                found[f"{name} of {s:g} at valence {valence}"] = spoked(valence, dict.fromkeys(spokes, s))
+                cages[f"{name} of {s:g} at valence {valence}"] = spoked(valence, dict.fromkeys(spokes, s))
     for s in LADDER:
-        found[f"cube, rim {s:.1f}"] = cube(creases=[(a, b, s) for a, b in TOP])
-        found[f"cube, edge {s:.1f}"] = cube(creases=[(4, 5, s)])
-        found[f"cube, corner {s:.1f}"] = cube(corners=[(7, s)])
-        found[f"piece, rings {s:.1f}"] = lathe([(1, s), (3, s)])
-        found[f"sheet, corner {s:.1f}"] = grid(3, 3, corners=[(5, s)])
-        found[f"sheet, border corner {s:.1f}"] = grid(3, 3, corners=[(1, s), (0, s)], boundary="edge_only")
-    found |= {
+        cages[f"cube, rim {s:.1f}"] = cube(creases=[(a, b, s) for a, b in TOP])
+        cages[f"cube, edge {s:.1f}"] = cube(creases=[(4, 5, s)])
+        cages[f"cube, corner {s:.1f}"] = cube(corners=[(7, s)])
+        cages[f"piece, rings {s:.1f}"] = lathe([(1, s), (3, s)])
+        cages[f"sheet, corner {s:.1f}"] = grid(3, 3, corners=[(5, s)])
+        cages[f"sheet, border corner {s:.1f}"] = grid(3, 3, corners=[(1, s), (0, s)], boundary="edge_only")
+    cages |= {
         "piece, rings and rims": lathe([(0, 2.5), (1, INFINITE), (2, 0.5), (4, INFINITE)]),
         "three semi-sharp edges": spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}),
         "five semi-sharp edges": spoked(5, {k + 1: 0.5 * k + 0.25 for k in range(5)}),
@@ -170,7 +170,7 @@ def _catmull_clark() -> dict[str, PeerCage]:
         "hole beside the border": grid(3, 3, holes=[1, 4], boundary="edge_only"),
         "holes, creased": cube(holes=[1], creases=[(a, b, 2.5) for a, b in TOP]),
     }
-    return found
+    return cages
 
 
 def _chaikin() -> dict[str, PeerCage]:
@@ -197,7 +197,7 @@ def _loop() -> dict[str, PeerCage]:
         return grid(3, 3, triangles=True, scheme="loop", **options)
 
     rising = [(4, 5, 1.5), (5, 6, 2.5), (6, 7, INFINITE)]
-    found = {
+    cages = {
         "sheet": sheet(),
         "sheet without corners": sheet(boundary="edge_only"),
         "sheet, nothing interpolated": grid(4, 4, triangles=True, scheme="loop", boundary="none"),
@@ -208,22 +208,22 @@ def _loop() -> dict[str, PeerCage]:
         "Chaikin": sheet(creases=[(4, 5, 0.5), (5, 6, 2.5), (6, 7, 1.0)], creasing="chaikin"),
     }
     for sides in (3, 4, 5, 6, 7):
-        found[f"bipyramid {sides}"] = bipyramid(sides, scheme="loop")
+        cages[f"bipyramid {sides}"] = bipyramid(sides, scheme="loop")
     for s in LADDER:
         ring = [(2 + i, 2 + (i + 1) % 5, s) for i in range(5)]
-        found[f"bipyramid, ring {s:.1f}"] = bipyramid(5, scheme="loop", creases=ring)
-        found[f"bipyramid, edge {s:.1f}"] = bipyramid(5, scheme="loop", creases=[(0, 2, s)])
-        found[f"bipyramid, corner {s:.1f}"] = bipyramid(5, scheme="loop", corners=[(0, s)])
+        cages[f"bipyramid, ring {s:.1f}"] = bipyramid(5, scheme="loop", creases=ring)
+        cages[f"bipyramid, edge {s:.1f}"] = bipyramid(5, scheme="loop", creases=[(0, 2, s)])
+        cages[f"bipyramid, corner {s:.1f}"] = bipyramid(5, scheme="loop", corners=[(0, s)])
     for valence in (3, 5, 6):
         half = valence // 2
         for name, spokes in (("dart", [1]), ("crease", [1, 1 + half]), ("corner", [1, 2, 1 + half])):
             for s in (1.75, INFINITE):
                 sharpness = dict.fromkeys(spokes, s)
-                found[f"{name} of {s:g} at valence {valence}"] = spoked(valence, sharpness, triangles=True)
+                cages[f"{name} of {s:g} at valence {valence}"] = spoked(valence, sharpness, triangles=True)
     beside = {1: INFINITE, 4: INFINITE, 2: 1.5, 5: 0.75}
-    found["semi-sharp beside a crease"] = spoked(6, beside, triangles=True)
-    found["three semi-sharp edges"] = spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}, triangles=True)
-    return {f"Loop, {name}": cage for name, cage in found.items()}
+    cages["semi-sharp beside a crease"] = spoked(6, beside, triangles=True)
+    cages["three semi-sharp edges"] = spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}, triangles=True)
+    return {f"Loop, {name}": cage for name, cage in cages.items()}
 
 
 def book(pages: int, triangles: bool = False, **options) -> PeerCage:
@@ -280,7 +280,7 @@ def _non_manifold() -> dict[str, PeerCage]:
     page = [1, 2, len(pages.positions), len(pages.positions) + 1]
     with_hair = [face if k != 12 else [face[0], 36, *face] for k, face in enumerate(squares.faces)]
     haired = PeerCage(np.vstack([squares.positions, [[2, 2, 3]]]), with_hair, boundary="none")
-    found = {
+    cages = {
         "book, a page from its spine to nowhere": PeerCage(np.vstack([pages.positions, far]), [*pages.faces, page]),
         "sheet with a hair, nothing interpolated": haired,
         "three quads at an edge": PeerCage(
@@ -315,7 +315,7 @@ def _non_manifold() -> dict[str, PeerCage]:
             scheme="loop",
         ),
     }
-    return {f"no manifold, {name}": cage for name, cage in found.items()}
+    return {f"no manifold, {name}": cage for name, cage in cages.items()}
 
 
 def with_random_values(cage: PeerCage, moved: Iterable[tuple[int, int]], mode: str) -> PeerCage:

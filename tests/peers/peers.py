@@ -157,12 +157,12 @@ def evaluate(
         done = subprocess.run([program, queries, answers, *words], capture_output=True, text=True, check=False)
         if done.returncode:
             raise PeerError(f"{program.name} fails: {done.stderr.strip() or done.returncode}")
-        found = read_records(answers)
-    p, du, dv = (found[name].reshape(-1, 3) for name in ("p", "du", "dv"))
+        answer = read_records(answers)
+    p, du, dv = (answer[name].reshape(-1, 3) for name in ("p", "du", "dv"))
     if method != "refine":
         du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))
-    fvar = found["fvar"].reshape(len(element), values.shape[1])
-    return PeerSamples(p, du, dv, fvar, found["vertex"], found["rule"])
+    fvar = answer["fvar"].reshape(len(element), values.shape[1])
+    return PeerSamples(p, du, dv, fvar, answer["vertex"], answer["rule"])
 
 
 def _from_corner_0(size: int, uv: NDArray, corner: NDArray) -> tuple[NDArray, NDArray]:

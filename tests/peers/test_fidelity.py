@@ -96,8 +96,8 @@ def _without_surface(cage):
     if not cage.holes and cage.boundary != "none":
         return []
     middle = np.tile([0.25, 0.25], (len(cage.faces), 1))
-    found = evaluate(cage, np.arange(len(cage.faces)), middle, method="far", level=1)
-    return np.flatnonzero(np.isnan(found.p[:, 0]))
+    samples = evaluate(cage, np.arange(len(cage.faces)), middle, method="far", level=1)
+    return np.flatnonzero(np.isnan(samples.p[:, 0]))
 
 
 def box(cage):
@@ -182,7 +182,7 @@ def test_refinement_approaches_the_surface_at_darts(cage):
     element, uv, corner = lattice(cage, 1)
     ours = surface_of(cage).evaluate(element, uv, corner).p
     coarse, fine = (evaluate(cage, element, uv, corner, method="refine", level=level) for level in (4, 6))
-    before, after = (distance(ours, each.p)[each.rule == DART].max() / box(cage) for each in (coarse, fine))
+    before, after = (distance(ours, samples.p)[samples.rule == DART].max() / box(cage) for samples in (coarse, fine))
     # The mask's error goes with a non-dominant eigenvalue a level, 0.63 and less at these valences.
     assert POINT < after <= APPROACH * before
 

@@ -59,13 +59,13 @@ def as_kept(cage: PeerCage) -> PeerCage:
 
 def has_fans_beside_a_crease(cage: msub.ControlCage) -> bool:
     """Whether a vertex is held that OpenSubdiv lets move along two edges of many faces; see `ControlCage`."""
-    found, t = cage.non_manifold, cage.topology
-    if found is None:
+    parts, t = cage.non_manifold, cage.topology
+    if parts is None:
         return False
     ends = np.stack([t.face_vertices, t.face_vertices[t.next]])
-    for vertex in np.flatnonzero(found.is_corner):
+    for vertex in np.flatnonzero(parts.is_corner):
         at = (ends == vertex).any(axis=0)
-        sharp, edges = np.unique(found.edge[at & found.is_edge]), np.unique(found.edge[at])
+        sharp, edges = np.unique(parts.edge[at & parts.is_edge]), np.unique(parts.edge[at])
         if len(sharp) == 2 and not (at & cage.is_boundary).any() and np.sum(ends[0] == vertex) > len(edges):
             return True
     return False

@@ -101,13 +101,13 @@ def angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
-def curvature_error(found: np.ndarray, exact: np.ndarray) -> np.ndarray:
+def curvature_error(computed: np.ndarray, exact: np.ndarray) -> np.ndarray:
     """Errors ``(2, s)`` of Gaussian and mean curvature relative to the principal curvatures k1, k2.
 
     The unit is ``k1^2 + k2^2 = 4 H^2 - 2 K`` and its root, as either curvature alone may be zero by chance.
     """
     unit = 4 * exact[1] ** 2 - 2 * exact[0]
-    return np.abs(found - exact) / np.stack([unit, np.sqrt(unit)])
+    return np.abs(computed - exact) / np.stack([unit, np.sqrt(unit)])
 
 
 def exact_curvature(sample: Sample) -> tuple[Decimal, Decimal]:
@@ -143,16 +143,16 @@ def samples_at(scheme: str, valence: int, levels: tuple[int, ...] = LEVELS) -> E
         # Its neighbours are extraordinary as well.
         uv = uv[uv.max(axis=1) < 1]
     reference = BruteForce(scheme, cage.positions, faces_of(cage))
-    found = [reference.evaluate(0, 0, u, v, derivatives=2) for u, v in uv]
+    samples = [reference.evaluate(0, 0, u, v, derivatives=2) for u, v in uv]
     if valence == 2:
         # No masks; but lambda_2 is 1/4, and so is the subdominant part after 60 levels less than 1e-36.
         limit = reference.evaluate(0, 0, 2.0**-60, 0)
     else:
         limit = reference.limit(**{"face" if scheme == "doo_sabin" else "vertex": 0})
     with precision(DIGITS):
-        values = [_floats([getattr(sample, name) for sample in found]) for name in ("p", "dp_du", "dp_dv", "n")]
-        second = _floats([[s.d2p_duu for s in found], [s.d2p_duv for s in found], [s.d2p_dvv for s in found]])
-        curvature = _floats([exact_curvature(sample) for sample in found]).T
+        values = [_floats([getattr(sample, name) for sample in samples]) for name in ("p", "dp_du", "dp_dv", "n")]
+        second = _floats([[s.d2p_duu for s in samples], [s.d2p_duv for s in samples], [s.d2p_dvv for s in samples]])
+        curvature = _floats([exact_curvature(sample) for sample in samples]).T
         limits = _floats(limit.p), _floats(limit.n)
     return ExactSamples(scheme, valence, cage, uv, *values, second, curvature, *limits)
 

@@ -157,16 +157,16 @@ class _Around:
 
     def _followed(self):
         """Where one of two values at a vertex, not sharp itself, has semi-sharp edges, the other follows it."""
-        found = {}
+        followed = {}
         if not self.c.mode.startswith("corners_plus"):
-            return found
+            return followed
         for vertex, faces in self.at_vertex.items():
             indices = {self.index_at(f, vertex) for f, _ in faces}
             if len(indices) == 2 and not self.vertex_sharpness(vertex):
                 sharp = {index for index in indices if self.semi_sharp_within(vertex, index)}
                 if len(sharp) == 1:
-                    found[vertex, min(indices - sharp)] = vertex, min(sharp)
-        return found
+                    followed[vertex, min(indices - sharp)] = vertex, min(sharp)
+        return followed
 
     def rule_at_mismatch(self, vertex, index):
         """Whether a value stays or is on a border, by OpenSubdiv's six modes."""
@@ -205,20 +205,20 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
 
     def edge_value(edge, f):
         i = next(i for g, i in around.at_edge[edge] if g == f)
-        own = (around.value(f, i) + around.value(f, i + 1)) / 2
+        middle = (around.value(f, i) + around.value(f, i + 1)) / 2
         key, cut, sharpness = ("edge", edge), around.is_seam(edge), around.sharpness(edge)
         side = f if cut else None
         if (key, side) in values:
             return key, side
         if c.mode == "all" or cut or sharpness >= INFINITE or all(around.left(edge, v) > 0 for v in edge):
-            return add(key, side, own)
+            return add(key, side, middle)
         sides = around.at_edge[edge]
         if scheme == "loop":
-            smooth = 0.75 * own + sum(around.value(g, j + 2) for g, j in sides) / 8
+            smooth = 0.75 * middle + sum(around.value(g, j + 2) for g, j in sides) / 8
         else:
             share = np.mean([0.47 if c.smooth_triangles and len(c.faces[g]) == 3 else 0.25 for g, _ in sides])
-            smooth = (1 - 2 * share) * own + share * sum(around.face_means[g] for g, _ in sides)
-        return add(key, side, sharpness * own + (1 - sharpness) * smooth)
+            smooth = (1 - 2 * share) * middle + share * sum(around.face_means[g] for g, _ in sides)
+        return add(key, side, sharpness * middle + (1 - sharpness) * smooth)
 
     def vertex_value(f, i):
         vertex, index = c.faces[f][i], c.indices[f][i]
@@ -246,9 +246,9 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
 
 
 def _moved(around, vertex, index, scheme):
-    c, own = around.c, around.c.values[vertex, index]
+    c, value = around.c, around.c.values[vertex, index]
     if c.mode == "all":
-        return own
+        return value
     edges = around.edges_at[vertex]
     if around.matches(vertex):
         at_vertex = around.vertex_sharpness(vertex)
@@ -258,10 +258,10 @@ def _moved(around, vertex, index, scheme):
         def by_rule(vertex_sharpness, sharpness):
             sharp = [edge for edge in edges if sharpness[edge] > 0]
             if vertex_sharpness > 0 or len(sharp) > 2:
-                return "corner", own
+                return "corner", value
             if len(sharp) == 2:
-                return "crease", _along(around, vertex, index, own, sharp)
-            return "smooth", _smooth(around, vertex, own, scheme)
+                return "crease", _along(around, vertex, index, value, sharp)
+            return "smooth", _smooth(around, vertex, value, scheme)
 
         rule, first = by_rule(at_vertex, before)
         next_rule, second = by_rule(less(at_vertex), after)
@@ -270,14 +270,14 @@ def _moved(around, vertex, index, scheme):
         pairs = [(at_vertex, less(at_vertex)), *((before[edge], after[edge]) for edge in edges)]
     else:
         if around.rule_at_mismatch(vertex, index) == "corner":
-            return own
+            return value
         # Until what is semi-sharp has decayed, the end of a border is a corner.
         place = c.followed.get((vertex, index), (vertex, index))
         pairs = [(around.sharpness(edge), around.left(edge, vertex)) for edge in around.semi_sharp_within(*place)]
         at_vertex = around.vertex_sharpness(vertex)
         pairs.append((at_vertex, less(at_vertex)))
         sharp = [edge for edge in edges if around.is_seam(edge) or around.is_boundary(edge)]
-        first, second = own, _along(around, vertex, index, own, sharp)
+        first, second = value, _along(around, vertex, index, value, sharp)
         if any(after > 0 for _, after in pairs):
             return first
     lost = [before for before, after in pairs if before > 0 and after == 0]
@@ -285,7 +285,7 @@ def _moved(around, vertex, index, scheme):
     return share * first + (1 - share) * second
 
 
-def _along(around, vertex, index, own, sharp):
+def _along(around, vertex, index, value, sharp):
     """The rule of a crease, along its two edges."""
     # The first edge of a face at the vertex ends in the next corner, the last in the one before.
     ends = []
@@ -296,15 +296,15 @@ def _along(around, vertex, index, own, sharp):
             ends += [(frozenset((vertex, face[i - 1])), around.value(f, i - 1))]
     beyond = [value for edge, value in ends if edge in sharp]
     # A crease without a seam is seen from the faces on both its sides.
-    return 0.75 * own + 0.25 * sum(beyond) / len(beyond)
+    return 0.75 * value + 0.25 * sum(beyond) / len(beyond)
 
 
-def _smooth(around, vertex, own, scheme):
+def _smooth(around, vertex, value, scheme):
     corners = around.at_vertex[vertex]
     n = len(corners)
     following = sum(around.value(f, i + 1) for f, i in corners) / n
     if scheme == "loop":
         beta = 5 / 8 - (3 / 8 + cos(2 * pi / n) / 4) ** 2
-        return (1 - beta) * own + beta * following
+        return (1 - beta) * value + beta * following
     middle = sum(around.face_means[f] for f, _ in corners) / n
-    return (middle + own + following + (n - 3) * own) / n
+    return (middle + value + following + (n - 3) * value) / n
