@@ -12,7 +12,7 @@ from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_tree, patc
 from mitsuba_subdivision.evaluation.refined_rings import refined_ring
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
-from mitsuba_subdivision.schemes.domain import AffineMap
+from mitsuba_subdivision.schemes.domain import ParameterMap
 from reference.refined_cages import tagged
 
 pytestmark = pytest.mark.core
@@ -32,7 +32,7 @@ def tips(surface):
 
 def outward(element):
     """Maps of all pieces, regular ones and tips, to the element's parameters."""
-    regular = [AffineMap(*each) for each in zip(*element.regular_domains, strict=True)]
+    regular = [ParameterMap(*each) for each in zip(*element.regular_domains, strict=True)]
     return regular, [tip.domain.inverse() for tip in element.tips]
 
 
@@ -50,7 +50,7 @@ def test_nodes_lead_to_pieces_by_copies_of_the_domain_and_pieces_cover_an_elemen
         pieces = dict(zip((PartKind.REGULAR, PartKind.TIP), outward(element), strict=True))
         # Halves of halves.
         assert sum(area(each) for kind in pieces.values() for each in kind) == 1
-        waiting, met, parts = [(0, AffineMap(np.eye(2), np.zeros(2)))], [], []
+        waiting, met, parts = [(0, ParameterMap(np.eye(2), np.zeros(2)))], [], []
         while waiting:
             node, inward = waiting.pop()
             parts.append(node)
@@ -141,7 +141,7 @@ class Skewed(CatmullClark):
 
     def children(self, topology, refined, half_edge):
         parts = super().children(topology, refined, half_edge)
-        return [(AffineMap(each.matrix, each.offset + 0.25), child) for each, child in parts]
+        return [(ParameterMap(each.matrix, each.offset + 0.25), child) for each, child in parts]
 
 
 def test_children_that_are_no_copies_of_the_domain_are_an_error():

@@ -93,8 +93,6 @@ class ControlCage:
 
     Attributes
     ----------
-    positions : (n_v, 3) float64
-        Read-only.
     structure : SharpMesh
         Everything that does not depend on positions. Cages with the same faces, tags and rules share it.
     topology : Topology
@@ -103,14 +101,10 @@ class ControlCage:
         Non-manifold edges and vertices; None if the cage is a manifold.
     tags : Sharpness
         Sharpness of edges and vertices, from creases and corners.
-    boundary, crease_method, triangle_rule, face_varying : str
-    holes : (n,) int64
-        In increasing order.
-    texcoords : Attribute or None
-    attributes : dict of str to Attribute
-    materials : dict of str to (n,) int64
-    scheme : str or None
-    source : CageSource
+    positions, holes, texcoords, attributes, materials
+        Read-only arrays of float64 and int64: data as `Attribute`, faces in increasing order.
+    boundary, crease_method, triangle_rule, face_varying, scheme, source
+        The parameters.
 
     Raises
     ------
@@ -324,12 +318,7 @@ class ControlCage:
     def refined(self, scheme: str | Scheme | None = None) -> ControlCage:
         """Refine once: a cage with the same limit surface, and about four times as many control points.
 
-        It also has the same texture coordinates and attributes on the surface. See `refinement`, also for errors.
-
-        Parameters
-        ----------
-        scheme : str or Scheme, optional
-            As for `LimitSurface`. If given, the refined cage names it.
+        It also has the same texture coordinates and attributes on the surface. `refinement` has parameters and errors.
         """
         return self.refinement(scheme).cage
 
@@ -475,7 +464,20 @@ class ControlCage:
         ValueError
             If ``mi`` is something else, the variant does not exist, or no variant is set.
         """
-        return shape_properties(self.contents, variant_module(mi))
+        variant, contents = variant_module(mi), self.contents
+        tables = {"creases": contents.creases, "corners": contents.corners}
+        indices = {"face_sizes": contents.face_sizes, "face_vertices": contents.face_vertices}
+        if len(contents.holes):
+            indices["holes"] = contents.holes
+        return {
+            # Double precision, as far from the origin single precision would change the normals visibly.
+            "positions": mapped(variant.TensorXd, contents.positions),
+            **{name: mapped(variant.TensorXu, array) for name, array in indices.items()},
+            **contents.rules,
+            **({"scheme": contents.scheme} if contents.scheme else {}),
+            **{name: mapped(variant.TensorXf, table) for name, table in tables.items() if len(table)},
+            **_attribute_properties(contents, variant),
+        }
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
@@ -486,23 +488,6 @@ class _FlatFaces(NamedTuple):
 
     sizes: NDArray
     vertices: NDArray
-
-
-def shape_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
-    """Return properties by name, with arrays as Mitsuba tensors; see `ControlCage.as_properties`."""
-    tables = {"creases": contents.creases, "corners": contents.corners}
-    indices = {"face_sizes": contents.face_sizes, "face_vertices": contents.face_vertices}
-    if len(contents.holes):
-        indices["holes"] = contents.holes
-    return {
-        # Double precision, as far from the origin single precision would change the normals visibly.
-        "positions": mapped(mi.TensorXd, contents.positions),
-        **{name: mapped(mi.TensorXu, array) for name, array in indices.items()},
-        **contents.rules,
-        **({"scheme": contents.scheme} if contents.scheme else {}),
-        **{name: mapped(mi.TensorXf, table) for name, table in tables.items() if len(table)},
-        **_attribute_properties(contents, mi),
-    }
 
 
 def _attribute_properties(contents: CageContents, mi: Any) -> dict[str, Any]:

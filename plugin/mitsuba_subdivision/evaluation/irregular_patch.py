@@ -13,7 +13,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
-from ..schemes.domain import AffineMap, FloatArray
+from ..schemes.domain import FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .equations import (
@@ -179,9 +179,9 @@ def level_rows(patch: IrregularPatch, level: int) -> FloatArray:
     return coefficients
 
 
-def level_domains(patch: IrregularPatch, level: int) -> list[AffineMap]:
+def level_domains(patch: IrregularPatch, level: int) -> list[ParameterMap]:
     """Return the maps from the parameters of a level's regular pieces to those of the tip."""
-    scaling = AffineMap(np.eye(2) * 2.0**-level, np.zeros(2))
+    scaling = ParameterMap(np.eye(2) * 2.0**-level, np.zeros(2))
     return [scaling @ child.inverse() for child in patch.scheme.domain.children[1:]]
 
 

@@ -25,7 +25,7 @@ from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.sharpness import INFINITE
 from ..mesh.signature import Fan, Signature
-from ..schemes.domain import IDENTITY, AffineMap, FloatArray
+from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch
 from .refined_rings import child_domains, child_signature, child_stencils
@@ -84,7 +84,7 @@ class PatchTree:
         return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(self.piece.domain))
 
     @cached_property
-    def domains(self) -> tuple[AffineMap, ...]:
+    def domains(self) -> tuple[ParameterMap, ...]:
         """Maps from the element's parameters to those of each child: `ParameterDomain.children`, or the identity.
 
         Raises SchemeError if the scheme divides domains differently.
@@ -234,7 +234,7 @@ def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeErr
 class Piece:
     """A part of an element that needs no further division: a regular patch, or one with an extraordinary point."""
 
-    domain: AffineMap  # From the element's parameters to the piece's, where an extraordinary point is at (0, 0)
+    domain: ParameterMap  # From the element's parameters to the piece's, where an extraordinary point is at (0, 0)
     stencils: FloatArray  # (K_piece, K) float64: the piece's control points over the element's one-ring
     # None for a regular piece; its control points are in the order of the scheme's lattice
     patch: IrregularPatch | None
@@ -259,7 +259,7 @@ class Piece:
 
     def inside(
         self,
-        domain: AffineMap,  # From the parent's parameters to the element's
+        domain: ParameterMap,  # From the parent's parameters to the element's
         stencils: FloatArray,  # (K, K_parent) float64: the element's control points over the parent's one-ring
     ) -> Piece:
         """Return the same piece as a part of the element's parent."""

@@ -22,7 +22,7 @@ from ..mesh.signature import (
     smooth_signature,
     with_sharpness,
 )
-from ..schemes.domain import AffineMap, FloatArray
+from ..schemes.domain import FloatArray, ParameterMap
 from ..schemes.scheme import Refinement, Scheme, SchemeError
 
 # Tolerance when comparing the sum of a stencil's weights with 1.
@@ -41,12 +41,12 @@ def refined_ring(scheme: Scheme, signature: Signature) -> Refinement:
 
 
 @lru_cache(maxsize=1024)
-def _children(scheme: Scheme, smooth: Signature) -> list[tuple[AffineMap, int]]:
+def _children(scheme: Scheme, smooth: Signature) -> list[tuple[ParameterMap, int]]:
     """Return the domain and the half-edge in the refined mesh of each child."""
     return scheme.children(one_ring(smooth).topology, refined_ring(scheme, smooth).topology, 0)
 
 
-def child_domains(scheme: Scheme, signature: Signature) -> tuple[AffineMap, ...]:
+def child_domains(scheme: Scheme, signature: Signature) -> tuple[ParameterMap, ...]:
     """Return the maps from an element's parameters to those of each child."""
     return tuple(domain for domain, _ in _children(scheme, signature.smoothed))
 
@@ -86,7 +86,7 @@ def child_stencils(scheme: Scheme, signature: Signature, number: int) -> FloatAr
     return stencils
 
 
-def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[AffineMap, Signature, FloatArray]]:
+def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[ParameterMap, Signature, FloatArray]]:
     """Return domain, signature and stencils of all children of an element."""
     return [
         (domain, child_signature(scheme, signature, number), child_stencils(scheme, signature, number))

@@ -20,7 +20,7 @@ from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature
 from ..schemes import Scheme, scheme_named
-from ..schemes.domain import AffineMap, FloatArray, ParameterDomain
+from ..schemes.domain import FloatArray, ParameterDomain, ParameterMap
 from .output import FigureOptions, hide_frame, panels, write_figure
 
 # Points along each side of a polygon, which the map bends.
@@ -187,8 +187,8 @@ def draw_tree(options: FigureOptions) -> list[Path]:
     signature = Signature("face", tuple(Fan((4,) * valence) for valence in VALENCES))
     tree, form, ring = patch_tree(scheme, signature), polynomial_basis(scheme), one_ring(signature)
     # From the parameters of each leaf to those of the face; the level, 0 for regular leaves; rows of weights.
-    leaves: list[tuple[AffineMap, int, FloatArray]] = [
-        (AffineMap(*domain), 0, rows)
+    leaves: list[tuple[ParameterMap, int, FloatArray]] = [
+        (ParameterMap(*domain), 0, rows)
         for *domain, rows in zip(*tree.regular_domains, tree.coefficients(form.of_controls), strict=True)
     ]
     rests = []
@@ -198,7 +198,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
             rows = level_rows(tip.irregular_patch, level) @ tip.coordinates
             domains = level_domains(tip.irregular_patch, level)
             leaves += [(outward @ domain, level + 1, leaf) for domain, leaf in zip(domains, rows, strict=True)]
-        rests.append(outward @ AffineMap(np.eye(2) * 2.0**-PIECE_LEVELS, np.zeros(2)))
+        rests.append(outward @ ParameterMap(np.eye(2) * 2.0**-PIECE_LEVELS, np.zeros(2)))
     count, size = ring.vertex_count, len(form.bernstein.indices)
     options.report(f"{count} control points, {len(leaves)} leaves of {size} coefficients")
     flat = _in_the_plane(ring.topology)

@@ -97,10 +97,9 @@ class SharpMesh:
     def shared(self) -> SharpMesh:
         """Return the shared mesh that equals this one, or this one if there is none yet."""
         t = self.topology
-        names = None if t.edge_names is None else Content(t.edge_names)
-        arrays = (t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)
+        arrays = (t.edge_names, t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)
         rules = (self.boundary, self.crease_method, self.triangle_rule, self.face_varying)
-        return _SHARED.get((t.vertex_count, names, *map(Content, arrays), *rules), lambda: self)
+        return _SHARED.get((t.vertex_count, *map(Content, arrays), *rules), lambda: self)
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:
@@ -124,8 +123,23 @@ class SharpMesh:
 
     @cached_property
     def cut(self) -> CutMesh:
-        """The mesh cut along its infinitely sharp edges, with the rules of its vertices."""
-        return cut_along_creases(self)
+        """The mesh cut along its infinitely sharp edges, and at vertices that several fans of faces share.
+
+        Refined points on a crease depend on points on the crease only, and points on one side never depend on points
+        on the other side. So each side can be refined separately, with the crease as its border.
+        """
+        t = self.topology
+        is_cut = self.tags.is_infinite & (t.twin >= 0)
+        is_border = is_cut | (t.twin < 0)
+        rules = _vertex_rules(self, is_cut, is_border)
+        if self.non_manifold is None and not is_cut.any():
+            cut = CutMesh(t.with_rules(rules, None), np.arange(t.vertex_count))
+        else:
+            face_vertices, vertex = _split_vertices(self, is_border)
+            edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
+            cut = CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
+        semi_sharpness = semi_sharpness_of_cut(self, cut, is_cut)
+        return CutMesh(cut.topology.with_rules(cut.topology.vertex_rules, semi_sharpness), cut.vertex)
 
     @cached_property
     def is_hole(self) -> NDArray[np.bool_]:
@@ -140,28 +154,6 @@ class SharpMesh:
 
 
 _SHARED: Shared[SharpMesh] = Shared()
-
-
-def cut_along_creases(mesh: SharpMesh) -> CutMesh:
-    """Cut a mesh along its infinitely sharp edges, and at vertices that several fans of faces share.
-
-    Refined points on a crease depend on points on the crease only, and points on one side never depend on points on the
-    other side. So each side can be refined separately, with the crease as its border.
-    """
-    t = mesh.topology
-    is_cut = mesh.tags.is_infinite & (t.twin >= 0)
-    is_border = is_cut | (t.twin < 0)
-    rules = _vertex_rules(mesh, is_cut, is_border)
-    if mesh.non_manifold is None and not is_cut.any():
-        cut = CutMesh(t.with_rules(rules, None), np.arange(t.vertex_count))
-    else:
-        face_vertices, vertex = _split_vertices(mesh, is_border)
-        edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
-        cut = CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
-    semi_sharpness = semi_sharpness_of_cut(mesh, cut, is_cut)
-    if semi_sharpness is None:
-        return cut
-    return CutMesh(cut.topology.with_rules(cut.topology.vertex_rules, semi_sharpness), cut.vertex)
 
 
 def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray[np.bool_]) -> NDArray[np.int8]:
@@ -297,7 +289,7 @@ def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
 def cut_along_seams(topology: Topology, seam: NDArray[np.bool_]) -> CutMesh:
     """Cut a mesh along seams, after it was cut along creases. The caller sets the rules of its vertices."""
     tags = Sharpness(np.where(seam, INFINITE, 0.0), np.zeros(topology.vertex_count))
-    return cut_along_creases(SharpMesh(topology, None, tags))
+    return SharpMesh(topology, None, tags).cut
 
 
 def value_mesh(

@@ -9,7 +9,7 @@ from ..mesh.connectivity import Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks, kept_sharpness
-from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
+from .domain import IDENTITY, SQUARE, FloatArray, ParameterMap
 from .scheme import PhantomPoint, Refinement, Scheme, StencilTable, TriangleRule, tensor_basis
 
 
@@ -99,7 +99,7 @@ class CatmullClark(Scheme):
         )
         return Refinement(refined, stencils)
 
-    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:  # noqa: ARG002
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[ParameterMap, int]]:  # noqa: ARG002
         """Return the four quads of a quad; for other faces, the one quad of the corner."""
         if topology.face_sizes[topology.face[half_edge]] != 4:
             return [(IDENTITY, 4 * half_edge)]

@@ -13,7 +13,7 @@ FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
 
 
-class AffineMap(NamedTuple):
+class ParameterMap(NamedTuple):
     """A map ``uv -> matrix @ uv + offset`` between parameter domains; exact, as its entries are small integers."""
 
     matrix: FloatArray
@@ -28,21 +28,21 @@ class AffineMap(NamedTuple):
             axis=-1,
         )
 
-    def __matmul__(self, first: AffineMap) -> AffineMap:
+    def __matmul__(self, first: ParameterMap) -> ParameterMap:
         """Return the map that applies ``first`` and then this one."""
-        return AffineMap(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
+        return ParameterMap(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
 
-    def inverse(self) -> AffineMap:
+    def inverse(self) -> ParameterMap:
         """Return the inverse map."""
         inverse = np.linalg.inv(self.matrix)
-        return AffineMap(inverse, -inverse @ self.offset)
+        return ParameterMap(inverse, -inverse @ self.offset)
 
-    def is_same(self, other: AffineMap) -> bool:
+    def is_same(self, other: ParameterMap) -> bool:
         """Return whether two maps are exactly equal."""
         return np.array_equal(self.matrix, other.matrix) and np.array_equal(self.offset, other.offset)
 
 
-IDENTITY = AffineMap(np.eye(2), np.zeros(2))
+IDENTITY = ParameterMap(np.eye(2), np.zeros(2))
 
 
 class ParameterDomain(ABC):
@@ -54,11 +54,11 @@ class ParameterDomain(ABC):
     ----------
     corners : (m, 2) float64
         Counter-clockwise from (0, 0). Edge i begins at corner i.
-    children : tuple of AffineMap
+    children : tuple of ParameterMap
         Maps from the parameters of the domain to those of each child. Child 0 contains the corner (0, 0).
     """
 
-    def __init__(self, name: str, area: float, corners: FloatArray, children: tuple[AffineMap, ...]) -> None:
+    def __init__(self, name: str, area: float, corners: FloatArray, children: tuple[ParameterMap, ...]) -> None:
         self.name, self.area, self.corners, self.children = name, area, corners, children
 
     @property
@@ -76,12 +76,12 @@ class ParameterDomain(ABC):
         (u, v), (u_next, v_next) = self.corners.T, np.roll(self.corners, -1, axis=0).T
         return np.stack([v - v_next, u_next - u], axis=1)
 
-    def rotation(self, corner: int) -> AffineMap:
+    def rotation(self, corner: int) -> ParameterMap:
         """Return the map from parameters with (0, 0) at corner ``corner`` to parameters with (0, 0) at corner 0."""
         start = self.corners[corner]
         along_u = self.corners[(corner + 1) % self.corner_count] - start
         along_v = self.corners[corner - 1] - start
-        return AffineMap(np.stack([along_u, along_v], axis=1), start)
+        return ParameterMap(np.stack([along_u, along_v], axis=1), start)
 
     def inside(self, uv: FloatArray) -> FloatArray:
         """Return ``(s,)`` depth of parameters: positive inside the domain, zero on its edges, negative outside."""
@@ -204,8 +204,8 @@ class _Triangle(ParameterDomain):
         return np.stack([u, v * (1 - u)], axis=1), weights * (1 - u)
 
 
-def _halved(sign: float, offset: tuple[float, float]) -> AffineMap:
-    return AffineMap(2 * sign * np.eye(2), np.array(offset, dtype=float))
+def _halved(sign: float, offset: tuple[float, float]) -> ParameterMap:
+    return ParameterMap(2 * sign * np.eye(2), np.array(offset, dtype=float))
 
 
 SQUARE: ParameterDomain = _Square(

@@ -7,7 +7,7 @@ import numpy as np
 from ..mesh import ragged
 from ..mesh.connectivity import Topology
 from ..mesh.signature import ElementKind
-from .domain import IDENTITY, SQUARE, AffineMap, FloatArray
+from .domain import IDENTITY, SQUARE, FloatArray, ParameterMap
 from .scheme import Refinement, Scheme, StencilTable, Unsupported, tensor_basis
 
 
@@ -68,7 +68,7 @@ class DooSabin(Scheme):
         member = t.face_vertices[np.where(steps < end, steps, steps - end + begin)]
         return Refinement(refined, StencilTable.of(t.half_edge_count, t.vertex_count, (corner, member, weight)))
 
-    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[ParameterMap, int]]:
         """Return the four refined vertices around a vertex of valence 4; else the one in the half-edge's face."""
         fan: list[int] = []
         current = half_edge

@@ -11,7 +11,7 @@ from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks, kept_sharpness
-from .domain import TRIANGLE, AffineMap, FloatArray
+from .domain import TRIANGLE, FloatArray, ParameterMap
 from .scheme import PhantomPoint, Refinement, Scheme, StencilTable, Unsupported
 
 # The three kinds of basis functions of the quartic box spline over a triangle, times 12, as coefficients of monomials
@@ -125,7 +125,7 @@ class Loop(Scheme):
         )
         return Refinement(refined, stencils)
 
-    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:  # noqa: ARG002
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[ParameterMap, int]]:  # noqa: ARG002
         """Return the four triangles; the last one is rotated by half a turn."""
         second = int(topology.next[half_edge])
         third = int(topology.next[second])

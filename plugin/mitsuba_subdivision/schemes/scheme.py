@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from abc import ABC, abstractmethod
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
-from .domain import AffineMap, FloatArray, ParameterDomain
+from .domain import FloatArray, ParameterDomain, ParameterMap
 
 if TYPE_CHECKING:
     # Importing SciPy's sparse arrays takes 0.1 s and 20 MB, and local meshes do not need them.
@@ -32,6 +33,7 @@ class SchemeError(ValueError):
     """A scheme cannot be used: it is unknown or invalid, or its rules do not support a cage."""
 
 
+@dataclass(frozen=True, eq=False)
 class StencilTable:
     """Stencils of refined vertices, as a sparse table of weights.
 
@@ -45,11 +47,11 @@ class StencilTable:
         Weight of each entry. The weights of a row sum to one.
     """
 
-    def __init__(
-        self, row_count: int, column_count: int, rows: IntArray, columns: IntArray, weights: FloatArray
-    ) -> None:
-        self.row_count, self.column_count = row_count, column_count
-        self.rows, self.columns, self.weights = rows, columns, weights
+    row_count: int
+    column_count: int
+    rows: IntArray
+    columns: IntArray
+    weights: FloatArray
 
     @classmethod
     def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:
@@ -235,7 +237,7 @@ class Scheme(ABC):
         """
 
     @abstractmethod
-    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[AffineMap, int]]:
+    def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[ParameterMap, int]]:
         """Return the children of an element, which is named by a half-edge, after one refinement.
 
         A child consists of the map from the element's parameters to the child's, and the half-edge of the refined mesh
