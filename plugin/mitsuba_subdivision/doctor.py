@@ -123,7 +123,9 @@ def try_variant(
         return VariantReport(False, f"did not end within {seconds:g} s", seconds=time.monotonic() - start)
     took = round(time.monotonic() - start, 2)
     if done.returncode < 0:
-        return VariantReport(False, f"the process crashed ({_signal_name(-done.returncode)})", seconds=took)
+        names = {number.value: number.name for number in signal.Signals}
+        name = names.get(-done.returncode, f"signal {-done.returncode}")
+        return VariantReport(False, f"the process crashed ({name})", seconds=took)
     try:
         report = json.loads(done.stdout.splitlines()[-1])
     except (IndexError, ValueError):
@@ -190,13 +192,6 @@ def _wrong_height(height: float) -> str | None:
     if abs(height - CUBE_HEIGHT) <= TOLERANCE:
         return None
     return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _version(package: str) -> str | None:

@@ -96,7 +96,7 @@ def inspect(
         name=cage.source.name,
         scheme=surface.scheme.name,
         vertex_count=cage.vertex_count,
-        edge_count=_edge_count(cage),
+        edge_count=len(cage.edges),
         face_count=cage.face_count,
         component_count=_piece_count(t, np.arange(t.half_edge_count)),
         bounding_box=(tuple(used.min(axis=0).tolist()), tuple(used.max(axis=0).tolist())),
@@ -115,15 +115,6 @@ def inspect(
         mesh_bytes=vertex_count * vertex_bytes + triangle_count * TRIANGLE_BYTES,
         warnings=tuple(_warnings(surface)),
     )
-
-
-def _edge_count(cage: ControlCage) -> int:
-    """Edges, of which non-manifold ones are several in the cage's topology."""
-    t, non_manifold = cage.topology, cage.non_manifold
-    if non_manifold is None:
-        return t.edge_count
-    sides = non_manifold.edge[non_manifold.is_edge & ~non_manifold.has_one_face]
-    return t.edge_count - len(sides) + len(np.unique(sides))
 
 
 def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:

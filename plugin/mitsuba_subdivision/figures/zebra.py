@@ -90,7 +90,11 @@ def draw(options: FigureOptions) -> list[Path]:
     figure, axes = panels(options, 2, len(shapes))
     for axis, name in zip(axes[0], shapes, strict=True):
         _draw_bands(axis, pixels[name], pixels["exact"], *titles[name])
-    shown = _draw_angles(axes[1, 1:], angles)
+    largest = max(angle.max() for angle in angles.values()) or 1
+    for axis, angle in zip(axes[1, 1:], angles.values(), strict=True):
+        shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest, interpolation="nearest")
+        axis.set_xlabel(f"up to {angle.max():.1f}°")
+        hide_frame(axis)
     _draw_overview(axes[1, 0], options, shapes["exact"])
     figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22, label="degrees")
     corner = project(stage.sensors()[0], tip, options.resolution)[0]
@@ -113,7 +117,11 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
     averaged = f"level {LEVEL},\naveraged normals"
     titles = {"exact": ("This package", "exact\nnormals"), "mesh": ("Refined mesh", averaged)}
     if program := osd_peer():
-        shapes["opensubdiv"] = _opensubdiv_mesh(program, cage, 2**level)
+        # A grid as fine as that of the exact surface, for each face alone
+        uv, shown = grid_points(np.linspace(0, 1, 2**level + 1)), np.flatnonzero(~cage.is_hole)
+        points, normals = osd_samples(program, cage, shown[:, None], uv, "bfr", OPENSUBDIV_LEVEL)
+        triangles = grid_triangles(2**level, len(shown))
+        shapes["opensubdiv"] = make_mesh(points, triangles, MIRROR, normals=normals)
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
     # Blender has no holes.
     if not len(cage.holes) and (program := blender()):
@@ -131,16 +139,6 @@ def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float
     show(axis, marked.round().astype(np.uint8), title, f"{caption}\n{share}")
 
 
-def _draw_angles(axes: Any, angles: dict[str, NDArray[np.float64]]) -> Any:
-    """Draw maps of angles in degrees, in one scale of colours; returns the last."""
-    largest = max(angle.max() for angle in angles.values()) or 1
-    for axis, angle in zip(axes, angles.values(), strict=True):
-        shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest, interpolation="nearest")
-        axis.set_xlabel(f"up to {angle.max():.1f}°")
-        hide_frame(axis)
-    return shown
-
-
 def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
     """Draw the whole surface, with a frame where the close-up is."""
     stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
@@ -151,13 +149,6 @@ def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
     half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * middle
     corner = (middle - half, middle - half)
     axis.add_patch(Rectangle(corner, 2 * half, 2 * half, facecolor="none", edgecolor=RING, linewidth=1))
-
-
-def _opensubdiv_mesh(program: Path, cage: ControlCage, rate: int) -> mi.Mesh:
-    """OpenSubdiv's points and normals, on a grid as fine as that of the exact surface, for each face alone."""
-    uv, shown = grid_points(np.linspace(0, 1, rate + 1)), np.flatnonzero(~cage.is_hole)
-    points, normals = osd_samples(program, cage, shown[:, None], uv, "bfr", OPENSUBDIV_LEVEL)
-    return make_mesh(points, grid_triangles(rate, len(shown)), MIRROR, normals=normals)
 
 
 def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:

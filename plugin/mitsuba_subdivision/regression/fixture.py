@@ -18,18 +18,18 @@ from ..variants import chosen_variant, variant_set
 from . import RegressionError
 from .compare import Comparison
 from .image import save_image
-from .passes import BATCH, Sampling
+from .passes import BATCH, Sampling, render_pass
 from .references import (
     REFERENCE_SPP,
     TEST_SPP,
     UnusableReference,
+    as_reference,
     compare_scene,
     load_reference,
-    render_reference,
     variant_for,
 )
 from .report import write_report
-from .scene import SceneSource
+from .scene import BOX, SceneSource, load_scene
 from .tiers import Status, Tolerances
 
 
@@ -96,8 +96,9 @@ class RenderRegression:
 
         def write() -> None:
             with variant_set(chosen_variant(variant)):
-                sampling = Sampling.of_spp(reference_spp, batch)
-                save_image(path, render_reference(scene, path, given, sampling, new_limits))
+                sampling, loaded = Sampling.of_spp(reference_spp, batch), load_scene(scene, given, BOX)
+                image = render_pass(loaded, sampling, with_probe=True)
+                save_image(path, as_reference(image, loaded.path, path, sampling, new_limits))
 
         if self.update == "all":
             write()

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from . import RegressionError
 from .compare import Comparison, compare
 from .image import Image, load_image, require_finite
 from .passes import Sampling, probe_scene, render_pass
-from .scene import BOX, SEEDS, SceneSource, load_scene
+from .scene import SEEDS, SceneSource, load_scene
 from .tiers import Status, Tolerances
 
 # Samples per pixel: four batches for a test, and 64 times as many for a reference.
@@ -31,29 +30,16 @@ SEED_STEP = 2**20
 RETRY_FACTOR = 4
 
 
-def render_reference(
-    source: SceneSource,
-    path: str | Path,
-    parameters: Mapping[str, Any],
-    sampling: Sampling,
-    tolerances: Tolerances | None = None,
-) -> Image:
-    """Render a reference in the current variant, with the box filter. `save_image` writes the file.
-
-    The metadata keep the command that makes the reference, as run in the folder of its file ``path``.
-    """
-    image = render_pass(load_scene(source, parameters, BOX), sampling, with_probe=True)
-    return as_reference(
-        image, source if isinstance(source, (str, Path)) else None, path, sampling, tolerances or Tolerances()
-    )
-
-
 def as_reference(
-    image: Image, scene: str | Path | None, path: str | Path, sampling: Sampling, tolerances: Tolerances
+    image: Image,
+    scene: Path | None,  # The scene's file, if it has one
+    path: str | Path,  # Of the reference, in whose folder the command runs
+    sampling: Sampling,
+    tolerances: Tolerances,
 ) -> Image:
     """Make a reference of an image: its metadata get tolerances, and the command that makes it.
 
-    Raises RegressionError if the image is not finite.
+    `save_image` writes the file. Raises RegressionError if the image is not finite.
     """
     require_finite(image)
     limits, made_by = tolerances.as_dict(), image.metadata
